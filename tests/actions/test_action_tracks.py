@@ -10,58 +10,11 @@ import torch
 
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.episode_tracks import collate_tracks
-from worldline_core.actions.tool_projection import project_tools
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import CalibrationError, DataError
 
 K = torch.tensor([[90.0, 0, 47.5], [0, 90.0, 31.5], [0, 0, 1.0]], dtype=torch.float64)
 EYE = torch.eye(4, dtype=torch.float64)
-
-
-def tool_at(x: float, y: float, z: float) -> torch.Tensor:
-    T = EYE.clone()
-    T[:3, 3] = torch.tensor([x, y, z])
-    return T[None, None]
-
-
-def project_one(x, y, z, *, gripper=0.5, intrinsics=K, camera=EYE):
-    opening = torch.tensor([[gripper]], dtype=torch.float64)
-    return project_tools(tool_at(x, y, z), opening, intrinsics[None], camera[None, None], (64, 96))
-
-
-@pytest.mark.parametrize(
-    ("point", "cause"),
-    [
-        ((0.0, 0.0, 1.0), 0),
-        ((0.0, 0.0, -1.0), 1),
-        ((0.0, 0.0, 0.0), 1),
-        ((0.0, 0.0, 0.005), 1),
-        ((0.6, 0.0, 1.0), 2),
-        ((0.0, -0.4, 1.0), 2),
-        ((np.nan, 0.0, 1.0), 3),
-    ],
-)
-def test_masked_samples_are_told_apart(point, cause):
-    seen = project_one(*point)
-    assert int(seen.cause) == cause
-    assert bool(seen.valid) == (cause == 0)
-    for values in (seen.uv, seen.depth, seen.rot6d, seen.gripper):
-        assert torch.isfinite(values).all()
-
-
-def test_invalid_calibration_masks_only_its_view():
-    cameras = torch.stack([EYE, EYE * torch.tensor([1.1, 1, 1, 1])])
-    seen = project_tools(tool_at(0, 0, 1), torch.ones(1, 1), torch.stack([K, K]), cameras[None], (64, 96))
-    assert seen.cause.flatten().tolist() == [0, 3]
-    singular = project_tools(
-        tool_at(0, 0, 1), torch.ones(1, 1), torch.stack([K * 0, K]), EYE.expand(1, 2, 4, 4), (64, 96)
-    )
-    assert singular.cause.flatten().tolist() == [3, 0]
-
-
-def test_gripper_overshoot_is_clipped():
-    assert float(project_one(0, 0, 1, gripper=1.04).gripper) == 1.0
-    assert float(project_one(0, 0, 1, gripper=-0.04).gripper) == 0.0
 
 
 def test_tracks_equal_a_plain_transcription(kinematics, episode):

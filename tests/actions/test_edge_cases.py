@@ -151,16 +151,6 @@ def test_gradient_of_a_masked_sample_is_finite():
     assert (tools.grad[0, 0] != 0).any()
 
 
-def test_arms_at_one_point_add():
-    tool = EYE.clone()
-    tool[2, 3] = 1.0
-    pair = project_tools(tool.expand(1, 2, 4, 4), torch.tensor([[0.25, 0.75]]), K[None], EYE[None, None], SIZE)
-    alone = project_tools(tool.expand(1, 1, 4, 4), torch.tensor([[1.0]]), K[None], EYE[None, None], SIZE)
-    torch.testing.assert_close(rendered(pair)[:, :8], 2 * rendered(alone)[:, :8])
-    # 0.25 + 0.75: the openings add too.
-    torch.testing.assert_close(rendered(pair)[:, 8], rendered(alone)[:, 8])
-
-
 def test_episodes_with_one_arm_and_with_two_share_a_batch(kinematics, episode):
     tracks, _ = compute_tracks(episode, kinematics)
     names = ("uv", "depth", "rot6d", "gripper", "valid")
@@ -169,15 +159,6 @@ def test_episodes_with_one_arm_and_with_two_share_a_batch(kinematics, episode):
     alone = render_action_maps(collate_tracks([single]), SIZE, (8, 12), 36.0)
     torch.testing.assert_close(maps[1], alone[0], atol=1e-7, rtol=0)
     assert (maps[0] - maps[1]).abs().max() > 0.5
-
-
-def test_missing_view_is_zero_and_has_no_samples(kinematics, episode):
-    cameras = {view: camera for view, camera in episode.cameras.items() if view != "right_wrist"}
-    tracks, counts = compute_tracks(replace(episode, cameras=cameras), kinematics)
-    maps = render_action_maps(collate_tracks([tracks]), SIZE, (8, 12), 36.0)[0]
-    assert (maps[2] == 0).all()
-    assert (maps[:2].flatten(1).abs().amax(1) > 0.5).all()
-    assert counts["samples"] == 2 * 2 * tracks.num_frames
 
 
 def test_gripper_overshoot_is_clipped_and_counted(kinematics, episode):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from worldline_core.actions.tool_projection import project_tools
-from worldline_core.geometry.cameras import project_points
+from worldline_core.geometry.cameras import inside_image, project_points
 from worldline_core.geometry.tensor_transforms import invert, is_rigid, rot6d_from_rotation, transform_points
 from worldline_core.geometry.transforms import (
     euler_fixed_xyz_from_rotation,
@@ -182,3 +182,15 @@ def test_functions_broadcast_keep_dtype_and_run_where_their_input_is():
     assert moved.device == points.device
     assert is_rigid(camera.expand(5, 7, 4, 4)).shape == (5, 7)
     assert rot6d_from_rotation(camera[:3, :3].expand(5, 7, 3, 3)).shape == (5, 7, 6)
+
+
+def test_image_border_lies_half_a_pixel_outside_the_outer_centres():
+    uv = torch.tensor([[-0.5, -0.5], [95.49, 63.49], [95.5, 10.0], [10.0, 63.5], [-0.51, 3.0]])
+    assert inside_image(uv, (64, 96)).tolist() == [True, True, False, False, False]
+    assert inside_image(uv.double().numpy(), (64, 96)).tolist() == [True, True, False, False, False]
+
+
+def test_a_point_in_the_camera_plane_gives_no_nan():
+    uv, depth = project_points(np.zeros((1, 3)), K, np.eye(4)[None])
+    assert np.isfinite(uv).all()
+    assert float(depth[0]) == 0.0

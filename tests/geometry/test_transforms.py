@@ -31,13 +31,6 @@ def pose(quaternion: tuple[float, ...], translation: tuple[float, ...]) -> torch
     return torch.from_numpy(pose_from_quaternion_wxyz(np.array(translation), np.array(quaternion)))
 
 
-@steady
-@given(quaternions)
-def test_rot6d_round_trip_is_exact(quaternion):
-    rotation = pose(quaternion, (0, 0, 0))[:3, :3]
-    np.testing.assert_allclose(rotation_from_rot6d(rot6d_from_rotation(rotation).numpy()), rotation, atol=1e-12)
-
-
 def test_rot6d_is_the_first_two_columns_one_after_the_other():
     rotation = torch.arange(9.0).reshape(3, 3)
     assert rot6d_from_rotation(rotation).tolist() == [0, 3, 6, 1, 4, 7]
@@ -73,12 +66,6 @@ def test_every_pose_is_rigid_and_its_scaled_copy_is_not(quaternion, translation)
 def test_rotation_angle_is_accurate_at_both_ends(angle):
     q = np.array([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0])
     assert float(rotation_angle(rotation_from_quaternion_wxyz(q))) == pytest.approx(angle, abs=1e-12)
-
-
-def test_quaternion_agrees_with_an_independent_formula():
-    # 90 degrees about z turns x into y.
-    q = np.array([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])
-    np.testing.assert_allclose(rotation_from_quaternion_wxyz(q), [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["mirrored", "nan", "last_row", "sheared"])

@@ -235,8 +235,9 @@ def find_joint_faults(signals: Signals, config: FilterConfig, _: Sequence[Findin
         detect_joint_jump(before, config.joint_motion),
         detect_joint_speed(before, fps, config.joint_motion),
     ):
-        verdict = replace(verdict, bad_frames=np.pad(verdict.bad_frames, (0, len(joints) - len(before))))
-        findings.append(Finding(verdict.reason, None, 1, verdict))
+        finding = Finding(verdict.reason, None, 1, verdict)
+        bad = np.pad(bad_frames([finding], len(before)), (0, len(joints) - len(before)))
+        findings.append(replace(finding, verdict=replace(verdict, bad_frames=bad)))
     return findings
 
 
