@@ -1,4 +1,4 @@
-"""What the three objectives of Stage III share: noise levels per block, the student's own rollout, held-out errors.
+"""Common parts of the three objectives of Stage III: noise levels per block, the student's own rollout, held-out errors.
 
 Axes: b clips, v views, c latent channels, t latent frames, h and w rows and columns.
 """

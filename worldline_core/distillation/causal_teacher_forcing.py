@@ -67,7 +67,7 @@ class TeacherForcingObjective(CausalObjective[Batch]):
         return loss, {}
 
     def target(self, batch: Batch, noise: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b v c t h w"]:
-        """What the blocks should become: the recording, in part what the teacher predicts in one step from this noise."""
+        """Target of the blocks: the recording, in part what the teacher predicts in one step from this noise."""
         latents, settings = batch.latents, self.settings
         longest = settings.teacher_frames
         if self.teacher is None or (longest is not None and latents.shape[3] > latent_frame_count(longest)):
@@ -90,7 +90,7 @@ class TeacherForcingObjective(CausalObjective[Batch]):
             return latents + self.disturbance(
                 with_observed_frame(torch.zeros_like(noise[..., :1, :, :]), noise[..., 1:, :, :]), generator
             )
-        size = self.spec.block_size  # the last block is nobody's history
+        size = self.spec.block_size  # no block follows the last one
         maps = maps_of(batch)[..., :-size, :, :]
         generated = self.rollout(batch, maps, noise[..., :-size, :, :], self.spec.steps - 1, with_gradient=False)
         return torch.cat((generated.to(latents), latents[..., -size:, :, :]), dim=3)
@@ -98,7 +98,7 @@ class TeacherForcingObjective(CausalObjective[Batch]):
     def disturbance(
         self, noise: Float[Tensor, "b v c t h w"], generator: torch.Generator
     ) -> Float[Tensor, "b v c t h w"]:
-        """What is added to recorded blocks, from noise that is 0 on the observed frame."""
+        """Perturbation of recorded blocks, from noise that is 0 on the observed frame."""
         del generator
         return self.settings.history_noise * noise
 

@@ -99,7 +99,7 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
 
 @dataclass(frozen=True)
 class DistillationRun:
-    """What the three steps share: the clips, the teacher, and how a step is trained and saved."""
+    """Clips, teacher, training and saving, shared by the three steps."""
 
     config: DistillConfig
     stage2: Path
@@ -156,11 +156,11 @@ class DistillationRun:
 
     @property
     def lpips(self) -> str:
-        """Whether the perceptual term is on, in words."""
+        """State of the perceptual term, in words."""
         return "on" if self.perceptual is not None else LPIPS_OFF
 
     def folder(self, step: str) -> Path:
-        """Where a step's checkpoint lies; the last step's is the result itself."""
+        """Folder of a step's checkpoint; the last step's is the result itself."""
         return self.output if step == STEPS[-1] else self.output / step
 
     def teacher_forcing(self) -> dict[str, float]:
@@ -213,7 +213,7 @@ class DistillationRun:
         )  # fmt: skip
 
     def _work(self, step: str) -> Path:
-        """Where a step keeps its training state and its log until it is finished, and where the offline trajectories lie."""
+        """Folder of a step's training state and log until it is finished, or of the offline trajectories."""
         return self.output / "run" / step
 
     def _make_trajectories(self, teacher_info: CheckpointInfo) -> None:
@@ -258,7 +258,7 @@ class DistillationRun:
         return loader.load
 
     def _trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
-        """What the clips show of the model's view slots; None: all, at stride 1."""
+        """Views and strides of the clips; None: all, at stride 1."""
         recorded = {view for row in self.rows if row.split in self.config.splits for view in row.views}
         views = tuple(view for view in slots if view in self.config.views and view in recorded)
         found = TrainedClips(views=views, strides=tuple(sorted(set(self.config.clips.strides))))

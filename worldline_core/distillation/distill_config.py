@@ -19,7 +19,7 @@ CYCLE = 6
 
 
 class PerceptualConfig(StrictModel):
-    """How frames are decoded for the perceptual term.
+    """Decoding of frames for the perceptual term.
 
     ``latent_frames``: how many latent frames, the last ones, are compared. ``bfloat16``: decode with weights in bfloat16
     (the Wan autoencoder alone), for half the memory.
@@ -185,7 +185,7 @@ class DistillConfig(StrictModel):
     def spec(self) -> CausalSpec:
         """Blocks, window and nodes of the distilled model.
 
-        Of recent blocks it keeps no more than the longest clip has: what lies further back, it has never seen.
+        Of recent blocks it keeps no more than the longest clip has: it has never seen what is further back.
         """
         return CausalSpec(
             block_size=self.block_size,
@@ -196,7 +196,7 @@ class DistillConfig(StrictModel):
 
     @property
     def training_spec(self) -> CausalSpec:
-        """What a block sees in the passes over whole clips; like ``spec``, unless the window says otherwise."""
+        """Blocks and window of the passes over whole clips; like ``spec``, unless the window says otherwise."""
         if self.window.trained_on == "window":
             return self.spec
         return self.spec.model_copy(update={"recent_blocks": self._earlier_blocks})

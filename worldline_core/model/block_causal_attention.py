@@ -1,4 +1,4 @@
-"""How video tokens attend to each other: all at once, block by block, or to a cache of finished blocks.
+"""Attention among video tokens: all at once, block by block, or to a cache of finished blocks.
 
 A block of latent frames sees itself and the clean blocks before it. Block 0 is the observed latent frame; block
 ``i >= 1`` holds ``block_size`` latent frames.
@@ -81,7 +81,7 @@ class TeacherForcingAttention:
     """
 
     by: Rotation
-    """Of positions from 0 on, as many as the longest window and the block after it have."""
+    """Rotation of positions from 0 on, as many as the longest window and the block after it have."""
     sizes: tuple[int, ...]
     """Tokens of each block, the observed frame first."""
     sink_blocks: int
@@ -157,7 +157,7 @@ def _joined(parts: Sequence[Tensor]) -> Tensor:
 
 
 def _of_clips(values: Tensor, clips: Sequence[int]) -> Tensor:
-    """Those of some clips; what all clips share (a batch of one) stays shared."""
+    """Keys or values of some clips; what all clips share (a batch of one) stays shared."""
     return values if len(values) == 1 or list(clips) == list(range(len(values))) else values[list(clips)]
 
 

@@ -34,7 +34,7 @@ UNUSED_PARAMETERS = (
 
 @dataclass(frozen=True)
 class Cosmos3Report:
-    """Which names of the pretrained folder were left out, and which parameters are new here."""
+    """Names of the pretrained folder that were left out, and parameters that are new here."""
 
     ignored: tuple[str, ...]
     new: tuple[str, ...]

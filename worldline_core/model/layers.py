@@ -65,7 +65,7 @@ def video_positions(
         grid: patch rows and columns of one view.
         views: names of the views, all sharing the temporal coordinates (docs/method.md section 3).
         temporal_offset: added to the temporal axis (text length plus margin when there is text).
-        fps: frames per second of each clip, as it is shown (a stride lowers the rate): latent frame ``j`` stands at
+        fps: frames per second of each clip, as it is shown (a stride lowers the rate): latent frame ``j`` is at
             ``j base_fps / fps``. None takes the config's; a model whose config has none counts latent frames.
 
     Returns:
@@ -127,7 +127,7 @@ def rotate(values: Float[Tensor, "*batch heads n d"], by: Rotation) -> Float[Ten
 
 
 class GenerationAttention(Protocol):
-    """How video tokens look at each other: everything at once, block by block, or through a cache.
+    """Attention among video tokens: everything at once, block by block, or through a cache.
 
     Called with normalised, not yet rotated queries and keys, ``(b heads n d)``.
     """
@@ -199,7 +199,7 @@ def _keep_attention() -> tuple[AbstractContextManager[object], AbstractContextMa
 
 
 def call_layer(layer: nn.Module, checkpointing: Literal["none", "block", "selective"], *arguments: object) -> Tensor:
-    """What ``layer`` returns; in training, what ``checkpointing`` does not keep is computed again on the way back."""
+    """Calls ``layer``; in training, what ``checkpointing`` does not keep is computed again on the way back."""
     if checkpointing == "none" or not torch.is_grad_enabled():
         return cast("Tensor", layer(*arguments))
     kept = _keep_attention if checkpointing == "selective" else noop_context_fn
@@ -342,7 +342,7 @@ TEXT_PARAMETERS = (
 
 
 def is_text_parameter(name: str) -> bool:
-    """Whether a parameter belongs to the understanding (text) tower."""
+    """True for parameters of the understanding (text) tower."""
     return name.startswith(TEXT_PARAMETERS[:2]) or any(part in name for part in TEXT_PARAMETERS[2:])
 
 
@@ -372,7 +372,7 @@ class TimeEmbedder(nn.Module):
 
 
 def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str], action_maps: Tensor | None) -> None:
-    """Refuse latents that are not those of ``views``, and action maps that do not lie on their grid (vectors: of 1 x 1).
+    """Refuse latents that are not those of ``views``, and action maps of another grid (vectors: of 1 x 1).
 
     Raises:
         DataError: a shape does not fit.

@@ -154,7 +154,7 @@ class SmallDecoder(nn.Module):
         """Latents, as the tokenizer makes them.
 
         Raises:
-            ConfigError: this decoder stands alone.
+            ConfigError: this decoder has no tokenizer.
         """
         if self._tokenizer[0] is None:
             raise ConfigError(
@@ -223,7 +223,7 @@ class SmallDecoder(nn.Module):
 def windows(
     latents: Float[Tensor, "b c t_l h_l w_l"], first: Tensor | None = None, before: Tensor | None = None
 ) -> Float[Tensor, "b t_l window h_l w_l"]:
-    """What each latent frame is decoded from: the clip's first one, the one before, itself, and a channel that is 1 at the
+    """Input that each latent frame is decoded from: the clip's first one, the one before, itself, and a channel that is 1 at the
     clip's first frame, which is all three.
 
     Args:

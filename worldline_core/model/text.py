@@ -19,13 +19,13 @@ from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
 from worldline_core.model.world_model_config import TextConfig
 
 SYSTEM_PROMPT = "You are a helpful assistant who will generate videos from a give prompt."
-"""As in training, the missing letter included."""
+"""Spelt as in training, the missing letter included."""
 VISION_START = "<|vision_start|>"
 
 
 @dataclass(frozen=True)
 class ClipFacts:
-    """What a prompt says of its clip: frames, frames per second as they are shown, (height, width) in pixels."""
+    """Facts about a clip that its prompt states: frames, frames per second as they are shown, (height, width) in pixels."""
 
     num_frames: int
     fps: float
@@ -88,7 +88,7 @@ class Cosmos3Text:
 
     @property
     def vocabulary_size(self) -> int:
-        """Ids lie below this."""
+        """Upper bound on ids, exclusive."""
         return max(self.tokenizer.get_vocab().values()) + 1
 
     def ids(self, instruction: str, clip: ClipFacts) -> list[int]:
@@ -141,7 +141,7 @@ class TextEncoder(Protocol):
 
 
 class ByteText:
-    """Ids 2..257 are bytes, 1 ends a text, 0 pads. Longer texts are cut; nothing is said of the clip."""
+    """Ids 2..257 are bytes, 1 ends a text, 0 pads. Longer texts are cut; the facts about the clip are left out."""
 
     vocabulary_size = 256 + BYTE_OFFSET
 

@@ -53,7 +53,7 @@ class VideoTokenizer(Protocol):
         ...
 
     def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> VideoDecoder:
-        """As :meth:`decode`, but for latents that arrive one after the other."""
+        """Returns a decoder like :meth:`decode` for latents that arrive one after the other."""
         ...
 
 
@@ -206,7 +206,7 @@ class Refinement(nn.Module):
         reference: Float[Tensor, "b 3 h w"],
         known: Tensor,
     ) -> Float[Tensor, "b g 3 h w"]:
-        """Refined frames; ``known``, ``(b)``, is 1 where ``reference`` is the observed frame, 0 where it only stands in."""
+        """Refined frames; ``known``, ``(b)``, is 1 where ``reference`` is the observed frame, 0 where it is a substitute."""
         stacked = torch.cat((rearrange(frames, "b g c h w -> b (g c) h w"), first, reference), dim=1)
         folded = F.pixel_unshuffle(stacked, 2)
         flag = rearrange(known, "b -> b 1 1 1").expand(-1, 1, *folded.shape[-2:]).to(folded.dtype)
@@ -297,7 +297,7 @@ class PatchTokenizer(nn.Module):
         return rearrange(codes, "b t h w c -> b c t h w")
 
     def decode_linear(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
-        """What the codes alone say (the orthogonal projection of the video)."""
+        """Decode the codes alone (the orthogonal projection of the video)."""
         check_latents(self, latents)
         with torch.autocast(device_type=latents.device.type, enabled=False):
             codes = rearrange(latents.float(), "b c t h w -> b t h w c") * self.scale
@@ -409,7 +409,7 @@ def fit_patch_tokenizer(
 ) -> PatchTokenizer:
     """Fit the linear part to clips of ``1 + k * temporal`` frames in [-1, 1]: principal components of patches.
 
-    Static and motion components lie in orthogonal subspaces, so the best ``channels`` of the two spectra together are
+    Static and motion components span orthogonal subspaces, so the best ``channels`` of the two spectra together are
     the best basis of this form; how many are static follows from the data.
 
     Args:
@@ -572,7 +572,7 @@ class WanTokenizer(nn.Module):
 
 class WanDecoder:
     """Decodes clips as their latents arrive. The autoencoder's convolutions are causal: what they need of earlier frames
-    lies in one cache per convolution, which `AutoencoderKLWan.decode` clears at its end and this keeps.
+    is held by one cache per convolution, which `AutoencoderKLWan.decode` clears at its end and this keeps.
     """
 
     def __init__(self, tokenizer: WanTokenizer) -> None:
@@ -614,7 +614,7 @@ WAN22_SHAPE = {
 
 
 def _wan_shape(root: Path) -> dict[str, Any]:
-    """What an autoencoder's ``config.json`` says.
+    """Content of an autoencoder's ``config.json``.
 
     Raises:
         CheckpointError: it is damaged, or of another autoencoder.

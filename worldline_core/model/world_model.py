@@ -76,7 +76,7 @@ class WorldModel(nn.Module):
             nn.Parameter(torch.zeros(len(config.views), config.hidden_size)) if config.view_embedding else None
         )
         self.checkpointing: Literal["none", "block", "selective"] = "none"
-        """What is computed again on the way back instead of being kept: see ``ShardingConfig``."""
+        """Activations that the backward pass recomputes instead of keeping: see ``ShardingConfig``."""
 
     def compile_blocks(self) -> None:
         """Compile what every block computes around its attention; weights and their names stay as they are."""
@@ -103,7 +103,7 @@ class WorldModel(nn.Module):
                 nn.init.normal_(parameter, 0.0, std, generator=generator)
 
     def generation_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
-        """What Stage II trains besides the action branch (docs/method.md section 4)."""
+        """Parameters that Stage II trains besides the action branch (docs/method.md section 4)."""
         for name, parameter in self.named_parameters():
             if not is_text_parameter(name) and not name.startswith("action_encoder."):
                 yield name, parameter

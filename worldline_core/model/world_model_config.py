@@ -76,8 +76,8 @@ class WorldModelConfig(StrictModel):
     action_conditioning: ActionConditioning = "maps"
     """``maps``: added to the tokens (the method). ``native_film``: control vectors by FiLM (the paper's ablation)."""
     prediction: Literal["velocity", "sample", "first_frame_residual"] = "velocity"
-    """What the head emits. ``sample``: the clean latents; the velocity follows as ``(x - x0) / sigma``.
-    ``first_frame_residual``: the clean latents less those of the clean first frame, so that what stands still is free
+    """Output of the head. ``sample``: the clean latents; the velocity follows as ``(x - x0) / sigma``.
+    ``first_frame_residual``: the clean latents less those of the clean first frame, so that still parts are free
     (for tokenizers that code a still group like its first frame)."""
     first_frame_std: float | None = Field(default=None, gt=0)
     """With ``first_frame_residual``: the expected deviation s of later latents from the first frame. The head then
@@ -157,7 +157,7 @@ class TextConfig(StrictModel):
 
 
 class ImportBackboneConfig(StrictModel):
-    """How the pretrained weights are read and stored."""
+    """Import of pretrained weights: their frame rate and the stored type."""
 
     fps: float = Field(default=30.0, gt=0, description="rate of clips that state none: positions advance by 24 / fps")
     dtype: Literal["bfloat16", "float16"] = "bfloat16"
@@ -226,7 +226,7 @@ class ActionContract(StrictModel):
 
 
 class TrainedClips(StrictModel):
-    """What the clips of a training showed, where it was less or more than all of the model's views at every frame.
+    """Views and strides of the clips of a training, where these were not all views at every frame.
 
     Attributes:
         views: that were trained, in the order of the model's slots; the first one is in every clip.
@@ -241,7 +241,7 @@ class CausalSpec(StrictModel):
     """Blocks of a block-causal model: the same in training and in a rollout.
 
     A block sees the sink and the recent blocks before it at positions counted from the start of that window, whether its
-    history lies in a cache (:meth:`new_cache`) or beside it in one pass (``WorldModel.forward_teacher_forcing``).
+    history is in a cache (:meth:`new_cache`) or beside it in one pass (``WorldModel.forward_teacher_forcing``).
 
     Attributes:
         block_size: latent frames per block.

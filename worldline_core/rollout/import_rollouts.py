@@ -1,6 +1,6 @@
-"""The step import_rollouts: any folder of videos as a RolloutSet, so that anyone's model stands in the same tables.
+"""The step import_rollouts: any folder of videos as a RolloutSet, so that any model appears in the same tables.
 
-The files are named by a template (``{episode}_{view}.mp4``) or listed in an index (CSV or JSON). Every file of the folder
+The files are named by a template (``{episode}_{view}.mp4``) or listed in an index (CSV). Every file of the folder
 and every video that is expected is accounted for in ``files.parquet``: matched, unknown or missing. Counts, rates and sizes
 are compared with the recordings before anything is written, and all that is wrong is said at once.
 """
@@ -25,7 +25,7 @@ from pydantic import Field
 
 from worldline_core.config import StrictModel, validate
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.guards.plain_files import read_json, read_text
+from worldline_core.data.guards.plain_files import read_text
 from worldline_core.data.guards.source_paths import find_files, inside, relative_name
 from worldline_core.data.video.clip import VideoClip, frame_times, read_clip, video_size
 from worldline_core.errors import DataError
@@ -43,7 +43,7 @@ _RATE_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class ImportedFile:
-    """What became of one file, or of one expected video without a file (``path`` is empty)."""
+    """Account of one file, or of one expected video without a file (``path`` is empty)."""
 
     path: str
     status: str
@@ -71,7 +71,7 @@ def import_rollouts(config: ImportRolloutsConfig, inputs: Mapping[str, Path], ou
         recorded one: low where files and episodes are confused.
 
     Raises:
-        ConfigError: the index is of an unknown form.
+        ConfigError: a row of the index lacks a field, or has an unknown one.
         DataError: files are unknown or missing, or their frame counts, rates or sizes are not those of the recordings.
     """
     folder, episodes = Path(inputs["videos"]), EpisodeSet.open(Path(inputs["episodes"]))
@@ -169,19 +169,12 @@ def _named(config: ImportRolloutsConfig, names: Sequence[str]) -> Iterator[tuple
 
 
 def _listed(config: ImportRolloutsConfig, folder: Path) -> Iterator[tuple[str, _IndexRow]]:
-    """Files of the index.
+    """Files of the index (CSV).
 
-    Raises: DataError for an index that is none, or lists a file twice; ConfigError for a row with unknown or missing fields.
+    Raises: DataError when it lists a file twice; ConfigError for a row with unknown or missing fields.
     """
     path = inside(folder, config.index or "")
-    if path.suffix.lower() == ".csv":
-        rows: Any = list(csv.DictReader(io.StringIO(read_text(path, encoding="utf-8-sig"), newline="")))
-    else:
-        rows = read_json(path)
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise DataError(
-            "The index is no list of rows", where=path, expected="CSV with a header, or a JSON list of objects"
-        )
+    rows = csv.DictReader(io.StringIO(read_text(path, encoding="utf-8-sig"), newline=""))
     seen: set[str] = set()
     for number, values in enumerate(rows, start=1):
         row = validate(

@@ -1,4 +1,4 @@
-"""What a user gives one prediction (first images, controls, cameras) as an episode and its action tracks."""
+"""First images, controls and cameras of one prediction as an episode and its action tracks."""
 
 from __future__ import annotations
 

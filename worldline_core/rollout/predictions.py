@@ -1,4 +1,4 @@
-"""Which videos a rollout makes: of which episodes, in which views, how long, under whose controls; and why not of others."""
+"""The plan of a rollout: its episodes, their views, lengths and controls, and a reason for every episode left out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from worldline_core.rollout.rollout_config import RolloutConfig
 
 
 class Predictor(Protocol):
-    """What a plan asks of whoever predicts.
+    """A model, server or baseline, as a plan sees it.
 
     Attributes:
         views: that it knows; the first one must be in every prediction.

@@ -34,7 +34,7 @@ MAX_DELAY_FRAMES = 4
 
 
 class ColumnResponse(StrictModel):
-    """How one column of the state follows its command: ``s' = s + (1 - exp(-dt / lag)) (command(t - delay) - s)``.
+    """Response of one column of the state to its command: ``s' = s + (1 - exp(-dt / lag)) (command(t - delay) - s)``.
 
     ``rmse``: of the states that the commands alone lead to, over the recordings it was fitted on, in the column's unit.
     """
@@ -46,7 +46,7 @@ class ColumnResponse(StrictModel):
 
 
 class Response(StrictModel):
-    """How a robot follows its commands, column by column of its state (:func:`fit_response`)."""
+    """Response of a robot to its commands, column by column of its state (:func:`fit_response`)."""
 
     embodiment: str
     columns: tuple[ColumnResponse, ...]

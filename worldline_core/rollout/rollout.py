@@ -45,7 +45,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     """Predict episodes of ``episodes`` with ``tracks``, ``tokenizer`` and, but for copying, ``checkpoint``.
 
     Writes a RolloutSet, video by video as it is predicted: memory does not grow with the length. Chosen episodes that
-    cannot be predicted lie in ``quarantine.parquet``, each with its reason. Predictions already there are kept; a batch is
+    cannot be predicted are listed in ``quarantine.parquet``, each with its reason. Predictions already there are kept; a batch is
     made again as a whole if one of its videos is missing, so the bytes do not depend on where an earlier call stopped.
     The times of a call that predicts anything go to ``run/speed.json``, those of ``timed_blocks`` as ``long_rollout``.
 
@@ -139,7 +139,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
 
 
 def _account(world: World, planned: Sequence[Prediction]) -> dict[str, Any]:
-    """What was not wholly predicted; nothing where all was."""
+    """Counts of missing views and cut frames; empty where there are none."""
     lacking = Counter(view for item in planned for view in world.views if view not in item.views)
     cut = sum(item.sampled - item.frames for item in planned)
     account = {"without_view": dict(lacking), "cut_frames": cut}

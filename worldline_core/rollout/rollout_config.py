@@ -115,11 +115,11 @@ Sampler = Annotated[
     Field(discriminator="kind"),
     BeforeValidator(_usual_kind),
 ]
-"""How videos are predicted; ``block_causal`` where no ``kind`` is given."""
+"""The sampler of a rollout; ``block_causal`` where no ``kind`` is given."""
 
 
 class RolloutConfig(StrictModel):
-    """Which episodes are predicted, and by which sampler.
+    """Selection of episodes, and the sampler that predicts them.
 
     Attributes:
         method: name of the predictions in scores and reports.
@@ -180,13 +180,13 @@ NAME_FIELD = re.compile(r"\{(\w+)\}|(\*)")
 
 
 class ImportRolloutsConfig(StrictModel):
-    """How the videos of a folder are named, what they show, and what may be missing.
+    """Names and content of the videos of a folder, and what may be missing.
 
     Attributes:
         method: name that the predictions carry in scores and reports.
         name: template of a file's path below the folder, with ``{episode}``, ``{view}``, ``{seed}``, and ``*`` for anything.
-        index: file in the folder that lists them instead: rows of path, episode, and perhaps view and seed (CSV with a header,
-            or a JSON list of objects).
+        index: file in the folder that lists them instead: CSV with the columns path, episode, and perhaps view and
+            seed.
         views: our view for each of the names that files or tiles use; default: our own names.
         tiles: rows and columns of the views that one video shows side by side; null for a part that is none.
         episode_prefix: what our episode ids have before theirs.
@@ -221,7 +221,7 @@ class ImportRolloutsConfig(StrictModel):
         if self.tiles is not None and (len({len(row) for row in self.tiles}) != 1 or not self.shown):
             raise ValueError("tiles: rows of equal length, with at least one view among them")
         if not set(self.shown) <= set(VIEWS) or len(set(self.shown)) != len(self.shown):
-            raise ValueError(f"views and tiles stand for some of {VIEWS}, each once, not {self.shown}")
+            raise ValueError(f"views and tiles name some of {VIEWS}, each once, not {self.shown}")
         return self
 
     @property

@@ -43,7 +43,7 @@ _SCHEMA = row_schema(RolloutRow)
 
 
 def video_path(episode_id: str, seed: int, view: str) -> str:
-    """Where a prediction lies in its set; odd characters of the id are replaced, long ones cut; a digest keeps names apart."""
+    """Path of a prediction in its set; odd characters of the id are replaced, long ones cut; a digest keeps names apart."""
     safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in episode_id)
     if safe != episode_id or safe.startswith(".") or not 0 < len(safe) <= _LONGEST_NAME:
         safe = f"{safe.lstrip('.')[:_LONGEST_NAME]}-{hashlib.sha256(episode_id.encode()).hexdigest()[:8]}"
@@ -61,7 +61,7 @@ class RolloutSetWriter:
         self._rows: list[RolloutRow] = []
 
     def has(self, episode_id: str, seed: int, views: tuple[str, ...]) -> bool:
-        """Whether every video of a prediction is already there (files appear only when whole)."""
+        """True when every video of a prediction is already there (files appear only when whole)."""
         return all((self.root / video_path(episode_id, seed, view)).is_file() for view in views)
 
     def add(self, episode_id: str, seed: int, frames: Mapping[str, np.ndarray]) -> None:
@@ -188,5 +188,5 @@ class RolloutSet:
                 got=f"episode {episode_id}, view {view}, seed {seed}",
             )
         if "\0" in row.path or not (path := (self.root / row.path).resolve()).is_relative_to(self.root.resolve()):
-            raise ArtifactError("A video of the set lies outside of it", where=self.root, got=row.path)
+            raise ArtifactError("A video of the set is outside of it", where=self.root, got=row.path)
         return VideoClip.whole_file(path, row.num_frames, row.fps)

@@ -39,7 +39,7 @@ from worldline_core.rollout.robot import CommandedRobot, Response
 from worldline_core.rollout.samplers import BlockCausalSimulator, FullClipSampler
 
 Frames = list[dict[str, np.ndarray]]
-"""Of every clip: ``uint8 (n, H, W, 3)`` RGB by view."""
+"""Videos of every clip: ``uint8 (n, H, W, 3)`` RGB by view."""
 
 
 class Session:
@@ -173,14 +173,14 @@ def encode_images(tokenizer: VideoTokenizer, images: Float[Tensor, "b v 3 h w"])
 
 
 START_TOLERANCE_RAD, START_OPENING_RANGES = 0.5, 1.5
-"""A recorded start may lie a little beyond the limits; one that is further out, or a gripper that is further than one range
+"""A recorded start may be a little beyond the limits; one that is further out, or a gripper that is further than one range
 outside of its own, is in another unit or of another robot."""
 USUAL_CLIP_FRAMES = 33
-"""Of a Stage II model that is stepped, where ``clip_frames`` does not say how long its clips are: as in the paper."""
+"""Clip length of a stepped Stage II model without ``clip_frames``: the paper's."""
 
 
 class Starts:
-    """What is seen and known where simulations of one robot begin, checked.
+    """Checked observations and states at which simulations of one robot begin.
 
     Args:
         images, cameras: by view, of one start or of each; a wrist camera has its pose at the start, or a known mount.
@@ -253,7 +253,7 @@ class Starts:
         return project_controls(self.cameras[clip], self.image_size, self.kinematics, controls=controls, fps=fps)
 
     def select(self, clips: Sequence[int]) -> Starts:
-        """Those of some clips."""
+        """The starts of some clips."""
         other = copy(self)
         for name in ("images", "cameras", "seeds"):
             setattr(other, name, [getattr(self, name)[clip] for clip in clips])
@@ -263,7 +263,7 @@ class Starts:
 
 @dataclass(frozen=True)
 class Stepping:
-    """How a model is stepped.
+    """Rate, views and action maps with which a model is stepped.
 
     Attributes:
         frames: that a step predicts.
@@ -319,7 +319,7 @@ class Simulation:
 
     @property
     def tracks(self) -> list[EpisodeTracks]:
-        """Of each clip, what was drawn into the maps of the last step's frames: for overlays."""
+        """Controls of each clip as drawn into the maps of the last step's frames: for overlays."""
         return [tracks.clip(range(2, tracks.num_frames), start=0) for tracks in self._tracks]
 
     @property
