@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from worldline_core.shipped import shipped_folder
 
 Colour = tuple[float, float, float]
@@ -73,6 +75,16 @@ class Robot:
     def side(self, arm: int) -> float:
         """-1 for an arm whose half of the table is y < 0, +1 otherwise; a single arm uses the whole width."""
         return -1.0 if len(self.arms) == 2 and self.arms[arm].name == "right" else 1.0
+
+    def fingers(self, opening: np.ndarray) -> np.ndarray:
+        """Finger joint positions [m] for an opening 0 (closed) .. 1 (open)."""
+        closed, opened = self.finger_travel
+        return closed + np.asarray(opening) * (opened - closed)
+
+    def opening(self, fingers: np.ndarray) -> np.ndarray:
+        """Opening 0..1 (clipped) from finger joints (..., F)."""
+        closed, opened = self.finger_travel
+        return np.clip((np.mean(fingers, axis=-1) - closed) / (opened - closed), 0.0, 1.0)
 
 
 _VIPERX_HOME = (0.0, -0.75, 0.95, 0.0, 1.2, 0.0)

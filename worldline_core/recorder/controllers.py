@@ -18,7 +18,6 @@ from worldline_core.recorder.bodies import REACH_X, Robot
 from worldline_core.recorder.scene import (
     BUTTON_CAP_HALF,
     DRAWER_TRAVEL,
-    FRAME_RATE,
     HANDLE_APART,
     PLATE_TOP,
     STANDING,
@@ -397,22 +396,3 @@ class ArmSolver:
                 step += pull - jacobian.T @ np.linalg.solve(gram, jacobian @ pull)
             joints = np.clip(joints + step, low, high)
         return joints, error_pos
-
-
-def plan_actions(
-    scene: SceneModel, solver: ArmSolver, plans: list[list[Waypoint]], num_frames: int
-) -> tuple[np.ndarray, float]:
-    """Joint targets and gripper openings (N, J) of all arms, and the solver's largest position error [m]."""
-    times = np.arange(num_frames) / FRAME_RATE
-    columns, worst = [], 0.0
-    for arm, points in enumerate(plans):
-        positions, yaws, openings = sample_waypoints(points, times)
-        joints = np.asarray(scene.robot.arms[arm].home, dtype=np.float64)
-        targets = []
-        for frame in range(num_frames):
-            rotation = tool_rotation(yaws[frame])
-            joints, error = solver.solve(arm, joints, positions[frame], rotation, 300 if frame == 0 else 80)
-            worst = max(worst, error)
-            targets.append(joints)
-        columns += [np.array(targets), openings[:, None]]
-    return np.concatenate(columns, axis=1).astype(np.float32), worst

@@ -91,7 +91,10 @@ def _carried(scene: SceneModel, layout: Layout, qpos: np.ndarray, address: int) 
     # Still up, but not high enough; or one arm lifted its end alone.
     if lower[-1] > 0.01 or lower.max() < 0.03:
         return "failure", "incomplete"
-    opened = max(_opening(scene, arm, qpos)[int(np.argmax(lower)) :].max() for arm in layout.acting())
+    opened = max(
+        scene.robot.opening(qpos[:, scene.arms[arm].finger_qpos])[int(np.argmax(lower)) :].max()
+        for arm in layout.acting()
+    )
     return "failure", "dropped" if opened > RELEASED else "slipped"
 
 
@@ -105,7 +108,7 @@ def _released_at(
     scene: SceneModel, layout: Layout, qpos: np.ndarray, position: np.ndarray, tool: np.ndarray
 ) -> int | None:
     """The frame at which a raised thing left the hand because the gripper opened wide; None when it left otherwise."""
-    opening = _opening(scene, layout.arm, qpos)
+    opening = scene.robot.opening(qpos[:, scene.arms[layout.arm].finger_qpos])
     raised = int(np.argmax(position[:, 2] - STANDING[layout.target.kind] > 0.015))
     away = np.linalg.norm(position - tool, axis=1)
     left = np.flatnonzero(away[raised:] > away[raised] + 0.02)
@@ -114,9 +117,3 @@ def _released_at(
     frame = raised + int(left[0])
     # A quarter of a second: an opening gripper has opened by then, a relaxed one stays where it is.
     return frame if opening[frame : frame + 3].max() > RELEASED else None
-
-
-def _opening(scene: SceneModel, arm: int, qpos: np.ndarray) -> np.ndarray:
-    """(N,) how far a gripper is open."""
-    closed, opened = scene.robot.finger_travel
-    return (qpos[:, scene.arms[arm].finger_qpos].mean(axis=1) - closed) / (opened - closed)

@@ -18,15 +18,16 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
-from worldline_core.recorder.bodies import BODIES, CENTRE, Robot
+from worldline_core.recorder.bodies import BODIES, CENTRE
 from worldline_core.recorder.controllers import (
     ArmSolver,
     ScriptedPolicy,
     Waypoint,
     late,
-    plan_actions,
     plan_waypoints,
+    sample_waypoints,
     shifted,
+    tool_rotation,
 )
 from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES, SceneRenderer
@@ -100,18 +101,6 @@ class Recording:
     thing_labels: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-def opening_to_fingers(robot: Robot, opening: np.ndarray) -> np.ndarray:
-    """Finger joint positions for an opening 0 (closed) .. 1 (open)."""
-    closed, opened = robot.finger_travel
-    return closed + np.asarray(opening) * (opened - closed)
-
-
-def fingers_to_opening(robot: Robot, fingers: np.ndarray) -> np.ndarray:
-    """Opening 0..1 (clipped) from finger joints (..., F)."""
-    closed, opened = robot.finger_travel
-    return np.clip((np.mean(fingers, axis=-1) - closed) / (opened - closed), 0.0, 1.0)
-
-
 def motor_targets(scene: SceneModel, action: np.ndarray) -> np.ndarray:
     """(N, nu) targets of all servos for actions (N, J)."""
     control, column = np.zeros((len(action), scene.model.nu)), 0
@@ -119,7 +108,7 @@ def motor_targets(scene: SceneModel, action: np.ndarray) -> np.ndarray:
         count = len(arm.joint_names)
         # Actions are stored as float32; the simulator is driven by exactly what is stored.
         control[:, arm.actuators] = action[:, column : column + count].astype(np.float64)
-        fingers = opening_to_fingers(scene.robot, action[:, column + count].astype(np.float64))
+        fingers = scene.robot.fingers(action[:, column + count].astype(np.float64))
         control[:, arm.finger_actuators] = fingers[:, None]
         column += count + 1
     return control
@@ -133,7 +122,7 @@ def place_arms(scene: SceneModel, data: Any, command: np.ndarray) -> None:
     for arm in scene.arms:
         count = len(arm.joint_names)
         data.qpos[arm.qpos] = command[column : column + count]
-        data.qpos[arm.finger_qpos] = opening_to_fingers(scene.robot, command[column + count].astype(np.float64))
+        data.qpos[arm.finger_qpos] = scene.robot.fingers(command[column + count].astype(np.float64))
         column += count + 1
     mujoco.mj_forward(scene.model, data)
 
@@ -168,7 +157,7 @@ def read_state(scene: SceneModel, data: Any) -> np.ndarray:
     parts: list[np.ndarray] = []
     for arm in scene.arms:
         parts.append(data.qpos[arm.qpos])
-        parts.append(np.atleast_1d(fingers_to_opening(scene.robot, data.qpos[arm.finger_qpos])))
+        parts.append(np.atleast_1d(scene.robot.opening(data.qpos[arm.finger_qpos])))
     return np.concatenate(parts)
 
 
@@ -222,8 +211,19 @@ class EpisodeRecorder:
 
     def follow(self, plans: list[list[Waypoint]], num_frames: int) -> np.ndarray | None:
         """Actions (N, J) that lead every arm along its waypoints; None when these leave what the arms can reach."""
-        action, worst = plan_actions(self.scene, self._solver, plans, num_frames)
-        return None if worst > REACH_TOLERANCE_M else action
+        times, columns = np.arange(num_frames) / FRAME_RATE, []
+        for arm, points in enumerate(plans):
+            positions, yaws, openings = sample_waypoints(points, times)
+            joints, targets = np.asarray(self.scene.robot.arms[arm].home, dtype=np.float64), []
+            for frame, position in enumerate(positions):
+                joints, error = self._solver.solve(
+                    arm, joints, position, tool_rotation(yaws[frame]), 300 if frame == 0 else 80
+                )
+                if error > REACH_TOLERANCE_M:
+                    return None
+                targets.append(joints)
+            columns += [np.array(targets), openings[:, None]]
+        return np.concatenate(columns, axis=1).astype(np.float32)
 
     def replay(self, layout: Layout, action: np.ndarray) -> Motion:
         """Execute recorded actions (N, J) from the layout's initial state."""
