@@ -157,14 +157,6 @@ def test_a_dataset_that_was_written_in_part_is_unreadable(tmp_path: Path) -> Non
             assert caught.value.reason == "unreadable"
 
 
-def test_a_state_of_thousands_of_columns_is_refused(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["state"] = np.zeros((3, 1001))
-    with open_hdf5(tmp_path / "a.h5") as file, pytest.raises(RejectedInputError, match="1001") as caught:
-        file.array("state", (None, None))
-    assert caught.value.reason == "too_large"
-
-
 def encoded(kind: str, **settings: object) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(PICTURE).save(stream, kind, **settings)

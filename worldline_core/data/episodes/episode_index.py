@@ -57,8 +57,6 @@ _ORDER = (
 )  # fmt: skip
 _INDEX = pa.schema([row_schema(EpisodeRow).field(name) for name in _ORDER])
 _NULLABLE = ("bank", "candidate", "stage2_reason")
-# Sets of earlier versions lack these.
-_OPTIONAL = ("stage1_ok", "stage2_ok", "stage2_reason", "conventions")
 
 
 @dataclass(frozen=True)
@@ -91,38 +89,23 @@ def read_index(root: Path) -> list[EpisodeRow]:
     Raises: DataError when the file or a column is missing, or holds values of another kind.
     """
     path = root / INDEX_FILE
-    table = read_table(path)
-    missing = [name for name in _INDEX.names if name not in table.column_names and name not in _OPTIONAL]
-    if missing:
-        raise RejectedInputError(
-            "missing_column",
-            "Index lacks a column",
-            where=path,
-            expected=", ".join(missing),
-            got=", ".join(table.column_names),
-        )
-    names = [name for name in _INDEX.names if name in table.column_names]
+    table = read_table(path, _INDEX.names)
     with unreadable("Index holds values of another kind", path, (pa.ArrowException, ValueError)):
-        table = table.select(names).cast(pa.schema([_INDEX.field(name) for name in names]))
-    empty = [name for name in names if name not in _NULLABLE and table[name].null_count]
+        table = table.select(_INDEX.names).cast(_INDEX)
+    empty = [name for name in _INDEX.names if name not in _NULLABLE and table[name].null_count]
     if empty:
         raise RejectedInputError(
             "unreadable", "Index has empty fields", where=path, expected="a value", got=", ".join(empty)
         )
-    columns = {name: _shared_values(table[name]) for name in names}
-    return [EpisodeRow(**dict(zip(names, values, strict=True))) for values in zip(*columns.values(), strict=True)]
+    columns = map(_shared_values, table.columns)
+    return [EpisodeRow(**dict(zip(_INDEX.names, values, strict=True))) for values in zip(*columns, strict=True)]
 
 
 def _shared_values(column: pa.ChunkedArray) -> list[Any]:
-    """Python values of a column; equal texts, and equal lists of views, are one object each."""
-    if pa.types.is_string(column.type):
-        encoded = column.combine_chunks().dictionary_encode()
-        texts = encoded.dictionary.to_pylist()
-        return [None if index is None else texts[index] for index in encoded.indices.to_pylist()]
-    if pa.types.is_list(column.type):
-        known: dict[tuple[str, ...], tuple[str, ...]] = {}
-        return [known.setdefault(views, views) for views in map(tuple, column.to_pylist())]
-    return column.to_pylist()
+    """Python values of a column; equal ones are one object."""
+    values = (tuple(value) if isinstance(value, list) else value for value in column.to_pylist())
+    known: dict[Any, Any] = {}
+    return [known.setdefault(value, value) for value in values]
 
 
 def write_quarantine(root: Path, rows: Iterable[QuarantineRow]) -> None:

@@ -67,36 +67,21 @@ class Fingerprint:
     views: Mapping[str, ViewPrint]
 
     def as_json(self) -> dict[str, Any]:
-        return {
-            "digest": self.digest,
-            "seconds": self.seconds,
-            "layout": self.layout,
-            "motion": None if self.motion is None else self.motion.astype(">u4").tobytes().hex(),
-            "views": {
-                view: {
-                    name: getattr(seen, name).astype(">u8").tobytes().hex() for name in ("frames", "moving", "first")
-                }
-                for view, seen in sorted(self.views.items())
-            },
+        views = {
+            view: {name: words.tolist() for name, words in vars(seen).items()}
+            for view, seen in sorted(self.views.items())
         }
+        return vars(self) | {"motion": None if self.motion is None else self.motion.tolist(), "views": views}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Fingerprint:
-        motion = stored["motion"]
-        return cls(
-            stored["digest"],
-            float(stored["seconds"]),
-            stored["layout"],
-            None if motion is None else np.frombuffer(bytes.fromhex(motion), ">u4").astype(np.uint32),
-            {
-                view: ViewPrint(*(_words(seen[name]) for name in ("frames", "moving", "first")))
-                for view, seen in stored["views"].items()
-            },
-        )
-
-
-def _words(text: str) -> np.ndarray:
-    return np.frombuffer(bytes.fromhex(text), ">u8").astype(np.uint64)
+        """The reverse of `as_json`."""
+        views = {
+            view: ViewPrint(**{name: np.array(words, np.uint64) for name, words in seen.items()})
+            for view, seen in stored["views"].items()
+        }
+        motion = None if stored["motion"] is None else np.array(stored["motion"], np.uint32)
+        return cls(**{**stored, "motion": motion, "views": views})
 
 
 def fingerprint(episode: Episode, thumbnails: Mapping[str, ViewThumbnails]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack
 from worldline_core.data.guards.plain_files import expect_layout, read_json, read_table
-from worldline_core.data.guards.rejection import MAX_FRAMES, RejectedInputError, check_image_size, too_large
+from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
 from worldline_core.data.guards.source_paths import is_file
 from worldline_core.data.video.frames import PACKED, MadeFrames, unpacked_images
 from worldline_core.errors import DataError
@@ -182,8 +182,8 @@ class Sidecar:
         with expect_layout(where, PACKED):
             count, height, width = (int(size) for size in row["shape"])
             check_image_size(width, height, where)
-            if not 0 < count <= MAX_FRAMES:
-                raise too_large("Not so many masks", where=where, limit=MAX_FRAMES, got=count, unit="masks")
+            if count < 1:
+                raise ValueError(f"{count} images")
         shape = count, height, width
         return MadeFrames(lambda: unpacked_images(row["bits"], shape, dtype, where), shape, dtype)
 

@@ -21,7 +21,6 @@ from pydantic import BaseModel, ValidationError
 
 from worldline_core.data.guards.rejection import (
     MAX_PIXELS,
-    MAX_TEXT_BYTES,
     RejectedInputError,
     check_image_size,
     too_large,
@@ -33,7 +32,7 @@ from worldline_core.data.guards.source_paths import AnyPath, regular_file
 def read_json(path: AnyPath) -> Any:
     """JSON of a file.
 
-    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no UTF-8, no JSON, a key given twice,
+    Raises: RejectedInputError: missing_file, special_file, unreadable (no UTF-8, no JSON, a key given twice,
         nested too deeply, a number of thousands of digits).
     """
     return parse_json(read_text(path), path)
@@ -59,12 +58,12 @@ def read_json_lines(path: AnyPath) -> Iterator[Any]:
             yield parse_json(line, f"{path}, line {number}")
 
 
-def read_text(path: AnyPath, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "utf-8") -> str:
+def read_text(path: AnyPath, *, encoding: str = "utf-8") -> str:
     """The text of a file.
 
-    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no UTF-8).
+    Raises: RejectedInputError: missing_file, special_file, unreadable (no UTF-8).
     """
-    file = regular_file(path, "Text file", max_bytes=max_bytes)
+    file = regular_file(path, "Text file")
     with unreadable("File cannot be read as text", path, (OSError, UnicodeDecodeError)):
         return file.read_text(encoding=encoding)
 
@@ -166,8 +165,6 @@ _END_MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
 _LAST_BYTES = 256
 _SCAN = b"\xff\xda"
 _MAX_SCANS = 100
-_MAX_IMAGE_BYTES = 4 * MAX_PIXELS
-"""An encoded image is never much larger than its pixels."""
 
 
 def image_size(content: bytes, where: object) -> tuple[int, int]:
@@ -233,7 +230,7 @@ def read_image(path: AnyPath) -> np.ndarray:
 
     Raises: RejectedInputError: missing_file, special_file, too_large, unreadable.
     """
-    file = regular_file(path, "Image", max_bytes=_MAX_IMAGE_BYTES)
+    file = regular_file(path, "Image")
     with unreadable("Image cannot be read", path, (OSError,)):
         content = file.read_bytes()
     return decode_image(content, path)

@@ -58,10 +58,6 @@ RATE_TOLERANCE = 1e-2
 MAX_SIDE_PX = 16_384
 MAX_PIXELS = 40_000_000
 """One image; 8K video has 33 million pixels."""
-MAX_FRAMES = 4_000_000
-"""One video file: 18 hours at 60 Hz. LeRobot joins episodes into files of some 100 MB, far below."""
-MAX_TEXT_BYTES = 512 << 20
-"""One JSON or JSON lines file; 10^6 episodes of LeRobot v2.1 are about 150 MB."""
 MAX_CHUNK_BYTES = 256 << 20
 """One compressed chunk of an MCAP file once unpacked; recorders write 1 to 10 MB."""
 

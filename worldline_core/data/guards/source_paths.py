@@ -23,7 +23,7 @@ from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 from upath import UPath
 
 from worldline_core.data.guards.reader_process import still_reading
-from worldline_core.data.guards.rejection import RejectedInputError, too_large
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.remote import AnyPath, list_files, parse_location, process_cache, remote_kind
 
@@ -180,10 +180,10 @@ def local_file(path: AnyPath) -> Path:
         raise _not_allowed(path) from error
 
 
-def regular_file(path: AnyPath, what: str = "File", *, max_bytes: int | None = None) -> Path:
+def regular_file(path: AnyPath, what: str = "File") -> Path:
     """The file to open for `path` (see `local_file`), if it is regular: a pipe may block, a device does not end.
 
-    Raises: RejectedInputError: missing_file, special_file, too_large, and what `local_file` raises.
+    Raises: RejectedInputError: missing_file, special_file, and what `local_file` raises.
     """
     try:
         local = local_file(path)
@@ -204,8 +204,6 @@ def regular_file(path: AnyPath, what: str = "File", *, max_bytes: int | None = N
             expected="a regular file",
             got=_FILE_KINDS.get(stat.S_IFMT(found.st_mode), "something else"),
         )
-    if max_bytes is not None and found.st_size > max_bytes:
-        raise too_large(f"{what} is too large", where=path, limit=max_bytes, got=found.st_size, unit="bytes")
     return local
 
 

@@ -21,7 +21,7 @@ import pyarrow.json
 from pydantic import BaseModel, ConfigDict, Field
 
 from worldline_core.data.guards.plain_files import column_names, read_json, read_json_lines, read_table, validated
-from worldline_core.data.guards.rejection import MAX_TEXT_BYTES, RejectedInputError, check_length
+from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, note_file, regular_file
 from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.data.video.frame_decoder import decode_frames
@@ -130,9 +130,9 @@ class EpisodeTable:
     def from_json_lines(cls, path: AnyPath) -> EpisodeTable:
         """From LeRobot v2.1's meta/episodes.jsonl; of each line `episode_index` and `length`.
 
-        Raises: RejectedInputError: missing_file, special_file, too_large, unreadable.
+        Raises: RejectedInputError: missing_file, special_file, unreadable.
         """
-        file = regular_file(path, "Episode list", max_bytes=MAX_TEXT_BYTES)
+        file = regular_file(path, "Episode list")
         schema = pa.schema([(INDEX, pa.int64()), ("length", pa.int64())])
         try:
             table = pyarrow.json.read_json(

@@ -33,8 +33,6 @@ from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import CameraAxes, Extrinsics, ImageTransform
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
-MAX_YAML_BYTES = 16 << 20
-"""PyYAML takes about a hundred bytes of memory for each; calibrations per frame belong in JSON."""
 _ASPECT_TOLERANCE = 0.01
 
 
@@ -91,7 +89,7 @@ def read_calibration(path: AnyPath) -> CalibrationFile:
 
 
 def _yaml(path: AnyPath) -> Any:
-    file = regular_file(path, "Calibration file", max_bytes=MAX_YAML_BYTES)
+    file = regular_file(path, "Calibration file")
     try:
         return read_yaml(file)
     except (ConfigError, OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:

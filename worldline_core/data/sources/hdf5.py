@@ -28,7 +28,6 @@ from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.errors import UnavailableError, installing
 
 _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
-_MAX_COLUMNS = 1000
 # Images are read a block at a time: a compressed chunk is unpacked once, and little is in memory.
 _BLOCK_IMAGES = 16
 _BLOCK_BYTES = 64 << 20
@@ -101,8 +100,6 @@ class Hdf5File:
         if dataset.dtype.kind not in "fiu":
             raise self._rejected("unreadable", "Dataset is not numeric", key, "numbers", dataset.dtype)
         check_shape("Dataset", f"{self._path}, {key}", dataset.shape, shape)
-        if math.prod(dataset.shape[1:]) > _MAX_COLUMNS:
-            raise self._rejected("too_large", "Dataset has too many columns", key, _MAX_COLUMNS, dataset.shape)
         with self._reading(key):
             values = np.asarray(dataset[()], dtype=np.float64)
         check_finite(key, values, self._path)

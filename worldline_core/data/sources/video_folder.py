@@ -27,7 +27,6 @@ from worldline_core.data.sources.episode_files import EpisodeFiles, printable
 from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.errors import ConfigError, DataError
 
-MAX_CAPTION_BYTES = 1 << 16
 TABLE_SUFFIXES = (".json", ".jsonl", ".csv")
 
 
@@ -108,7 +107,6 @@ class VideoFolderSourceConfig(ForeignSourceConfig):
     captions: CaptionTable | None = Field(
         default=None, description="null: the text file beside each video, where there is one"
     )
-    require_caption: bool = Field(default=False, description="quarantine videos without a caption")
 
 
 class VideoFolderSource(EpisodeFiles[VideoFolderSourceConfig]):
@@ -137,7 +135,7 @@ class VideoFolderSource(EpisodeFiles[VideoFolderSourceConfig]):
             layout="video_folder",
             state=nothing,
             action=nothing,
-            instruction=self._caption(relative, path),
+            instruction=self._caption(relative),
             fps=rate,
             timestamps=times,
             primary_view=config.view,
@@ -146,19 +144,8 @@ class VideoFolderSource(EpisodeFiles[VideoFolderSourceConfig]):
         )
         return LoadedEpisode(episode, (config.view,), clips={config.view: VideoClip.whole_file(path, len(times), rate)})
 
-    def _caption(self, relative: PurePosixPath, path: AnyPath) -> str:
-        if self._captions is None:
-            text = inside(self.root, str(relative.with_suffix(".txt")))
-            found = read_text(text, max_bytes=MAX_CAPTION_BYTES, encoding="utf-8-sig") if is_file(text) else None
-            caption = None if found is None else " ".join(found.split())
-        else:
-            caption = self._captions.get(str(relative))
-        if not caption and self.config.require_caption:
-            raise RejectedInputError(
-                "missing_column",
-                "Video has no caption",
-                where=str(path),
-                expected="a text file of the video's name" if self._captions is None else "a row in the table",
-                got="none" if caption is None else "an empty one",
-            )
-        return caption or ""
+    def _caption(self, relative: PurePosixPath) -> str:
+        if self._captions is not None:
+            return self._captions.get(str(relative), "")
+        text = inside(self.root, str(relative.with_suffix(".txt")))
+        return " ".join(read_text(text, encoding="utf-8-sig").split()) if is_file(text) else ""

@@ -22,13 +22,15 @@ import numpy as np
 from av.container import InputContainer
 from av.video.stream import VideoStream
 
-from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
+from worldline_core.data.guards.rejection import check_image_size
 from worldline_core.data.guards.source_paths import AnyPath, local_file
 from worldline_core.data.video.clip import (
     FRAME_TOLERANCE,
     VideoClip,
     check_video_header,
+    frame_times,
     open_video,
+    read_clip,
     seek_before,
     undecodable,
     wrong_count,
@@ -288,17 +290,8 @@ def decode_video(path: AnyPath, expected_frames: int | None = None) -> np.ndarra
 
     Raises: RejectedInputError naming the file and the frame counts when it is truncated, undecodable or of another length.
     """
-    frames: list[np.ndarray] = []
-    try:
-        with open_video(path) as (container, stream):
-            frames += (f.to_ndarray(format="rgb24") for f in seek_before(container, stream, 0.0) if f.pts is not None)
-    except RejectedInputError as error:
-        if error.reason != "truncated_video":
-            raise
-        raise wrong_count(path, expected_frames, len(frames), str(error.got)) from error
-    if not frames or (expected_frames is not None and len(frames) != expected_frames):
-        raise wrong_count(path, expected_frames, len(frames))
-    return np.stack(frames)
+    count = len(frame_times(path)) if expected_frames is None else expected_frames
+    return np.stack([picture.rgb for picture in read_clip(VideoClip.whole_file(path, count, 1.0))])
 
 
 def decode_frames(clip: VideoClip, indices: Sequence[int] | None = None) -> np.ndarray:
