@@ -60,7 +60,7 @@ _NEEDS: dict[str, tuple[str, Callable[[Episode], bool]]] = {
 
 
 def applicable(episode: Episode, field: str) -> bool:
-    """Whether a field of `RecordedConventions` applies to the episode."""
+    """True if a field of `RecordedConventions` applies to the episode."""
     return _NEEDS[field][1](episode)
 
 

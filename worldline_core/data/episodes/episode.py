@@ -249,7 +249,7 @@ class Episode(EpisodeDescription):
 
     @property
     def commanded(self) -> bool:
-        """Whether commands are recorded; if not, the source says so in the conventions, and the action repeats the state."""
+        """True if commands are recorded; if not, the source says so in the conventions, and the action repeats the state."""
         noted = self.conventions.get("action", "")
         return self.state_kind != "none" and not str(noted).startswith(REPEATS_STATE)
 

@@ -94,7 +94,7 @@ class EpisodeSetWriter:
 
     @staticmethod
     def finished(root: Path) -> bool:
-        """Whether `close` has completed in this folder."""
+        """True if `close` has completed in this folder."""
         return (root / INDEX_FILE).exists() and not (root / "run" / "episodes").is_dir()
 
     def __enter__(self) -> Self:
@@ -107,7 +107,7 @@ class EpisodeSetWriter:
             self.close()
 
     def has(self, episode_id: str) -> bool:
-        """Whether the episode was already added or quarantined, for example before a kill."""
+        """True if the episode was already added or quarantined, for example before a kill."""
         name = part_name(episode_id)
         return (self._parts / name).is_dir() or (self._rejected / f"{name}.json").is_file()
 

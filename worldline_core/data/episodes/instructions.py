@@ -75,5 +75,5 @@ def with_instruction(episode: Episode) -> Episode:
 
 
 def mentions_outcome(instruction: str) -> bool:
-    """Whether a task text speaks of how the attempt ended: such a text would tell a model what it is to predict."""
+    """True if a task text speaks of how the attempt ended: such a text would tell a model what it is to predict."""
     return _OUTCOME_WORDS.search(instruction) is not None

@@ -301,7 +301,7 @@ class ImageSampler:
         """Counts (3, 256) of the 8-bit values of each channel."""
 
     def wants(self, number: int) -> bool:
-        """Whether a picture is one of those to be added."""
+        """True if a picture is one of those to be added."""
         return number in self._chosen
 
     def add(self, image: np.ndarray) -> None:

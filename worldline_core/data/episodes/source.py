@@ -152,7 +152,7 @@ class SourceConfigBase(StrictModel):
         return self.name or self.path.name
 
     def includes(self, episode_id: str) -> bool:
-        """Whether the configuration asks for this episode."""
+        """True if the configuration asks for this episode."""
         return self.include is None or any(fnmatchcase(episode_id, pattern) for pattern in self.include)
 
 
@@ -242,7 +242,7 @@ class GripperRange(StrictModel):
 
 
 def says_droid(*names: str) -> bool:
-    """Whether one of the names of a dataset, its folder or its robot says that it is DROID, which is for evaluation only."""
+    """True if one of the names of a dataset, its folder or its robot says that it is DROID, which is for evaluation only."""
     return any(_DROID.search(name) for name in names)
 
 

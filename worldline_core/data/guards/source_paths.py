@@ -208,7 +208,7 @@ def regular_file(path: AnyPath, what: str = "File") -> Path:
 
 
 def is_file(path: AnyPath) -> bool:
-    """Whether there is a file.
+    """True if there is a file.
 
     Raises: RejectedInputError (unreadable) where the store does not say; UnreachableInputError when it does not answer.
     """
@@ -218,7 +218,7 @@ def is_file(path: AnyPath) -> bool:
 
 
 def exists(path: AnyPath) -> bool:
-    """Whether there is a file or a folder.
+    """True if there is a file or a folder.
 
     Raises: RejectedInputError (unreadable) where the store does not say; UnreachableInputError when it does not answer.
     """

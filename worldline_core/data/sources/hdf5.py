@@ -48,7 +48,12 @@ def require_h5py() -> Any:
 
 
 class Hdf5File:
-    """An open file; made by `open_hdf5`."""
+    """An open file; made by `open_hdf5`.
+
+    Raises: RejectedInputError from every method: missing_column (no such dataset), length_mismatch (another shape),
+        nan_state (values that are not finite), path_traversal (data outside of the file), unreadable (damaged, of another
+        type, or never written), too_large, out_of_memory.
+    """
 
     def __init__(self, path: AnyPath, handle: Any) -> None:
         self._h5py = require_h5py()
@@ -56,10 +61,7 @@ class Hdf5File:
         self._handle = handle
 
     def names(self, group: str) -> list[str]:
-        """Names in a group, sorted; empty where there is no such group.
-
-        Raises: RejectedInputError (unreadable, path_traversal).
-        """
+        """Names in a group, sorted; empty where there is no such group."""
         with self._reading(group):
             node = self._node(group)
             return sorted(node) if isinstance(node, self._h5py.Group) else []
@@ -79,10 +81,7 @@ class Hdf5File:
             )
 
     def has(self, key: str) -> bool:
-        """Whether `key` is a dataset that holds something: recorders write unused fields as empty ones.
-
-        Raises: RejectedInputError (unreadable, path_traversal).
-        """
+        """True if `key` is a dataset that holds something: recorders write unused fields as empty ones."""
         with self._reading(key):
             node = self._node(key)
             return isinstance(node, self._h5py.Dataset) and bool(node.size)
@@ -92,9 +91,6 @@ class Hdf5File:
 
         Args:
             shape: wanted sizes; None for any (but not 0).
-
-        Raises: RejectedInputError: missing_column (no such dataset), length_mismatch (another shape), nan_state (values
-            that are not finite), unreadable (damaged, not numeric, or never written), out_of_memory, path_traversal.
         """
         dataset = self._dataset(key)
         if dataset.dtype.kind not in "fiu":
@@ -109,8 +105,6 @@ class Hdf5File:
         """A dataset (length,) of nanoseconds as seconds from its first entry.
 
         The difference is taken before the conversion: float64 rounds nanoseconds since 1970 to 256.
-
-        Raises: as `array`.
         """
         seconds = 1e-9 * self.array(key, (length,))
         raw = self._dataset(key)[()]
@@ -118,19 +112,13 @@ class Hdf5File:
         return 1e-9 * (raw.astype(np.int64) - np.int64(raw[0])) if exact else seconds - seconds[0]
 
     def columns(self, key: str, length: int | None) -> np.ndarray:
-        """A numeric dataset (length, D), or (length,) with D = 1, as float64 (length, D).
-
-        Raises: as `array`.
-        """
+        """A numeric dataset (length, D), or (length,) with D = 1, as float64 (length, D)."""
         flat = self._dataset(key).ndim == 1
         values = self.array(key, (length,) if flat else (length, None))
         return values.reshape(len(values), -1)
 
     def text(self, key: str) -> str | None:
-        """A text stored as a dataset of one entry; None where there is none.
-
-        Raises: RejectedInputError: unreadable (no text), out_of_memory, path_traversal.
-        """
+        """A text stored as a dataset of one entry; None where there is none."""
         if not self.has(key):
             return None
         dataset = self._dataset(key)
@@ -141,10 +129,7 @@ class Hdf5File:
         return self._as_text(value, key)
 
     def attribute(self, group: str, name: str) -> str | None:
-        """An attribute of a group ("/" for the file's own) as text; None where there is none.
-
-        Raises: RejectedInputError: unreadable, out_of_memory, path_traversal.
-        """
+        """An attribute of a group ("/" for the file's own) as text; None where there is none."""
         with self._reading(f"{group}, attribute {name}"):
             node = self._handle if group == "/" else self._node(group)
             value = None if node is None else node.attrs.get(name)
@@ -160,10 +145,7 @@ class Hdf5File:
         return str(value)
 
     def image_files(self, key: str, length: int) -> Iterator[bytes]:
-        """A dataset (length,) of encoded images, as bytes each, a few in memory at a time.
-
-        Raises: RejectedInputError: missing_column, length_mismatch, unreadable, out_of_memory, path_traversal.
-        """
+        """A dataset (length,) of encoded images, as bytes each, a few in memory at a time."""
         dataset = self._dataset(key)
         fixed = dataset.dtype.kind == "S"
         variable = self._h5py.check_vlen_dtype(dataset.dtype) == np.dtype(np.uint8)
@@ -175,10 +157,7 @@ class Hdf5File:
         return map(bytes, self._rows(dataset, key))
 
     def pixels(self, key: str, length: int) -> Iterator[np.ndarray]:
-        """A dataset (length, H, W, 3) of uint8 pixels, as images (H, W, 3) with their channels as stored.
-
-        Raises: RejectedInputError: missing_column, length_mismatch, unreadable, too_large, path_traversal.
-        """
+        """A dataset (length, H, W, 3) of uint8 pixels, as images (H, W, 3) with their channels as stored."""
         dataset = self._dataset(key)
         if dataset.dtype != np.uint8 or dataset.ndim != 4 or dataset.shape[-1] != 3:
             got = f"{dataset.shape} of {dataset.dtype}"

@@ -426,7 +426,7 @@ class LeRobotSource:
 
 
 def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: DatasetInfo) -> bool:
-    """Whether a dataset is DROID by its name, its robot's name or its cameras' names (its port calls the robot Franka)."""
+    """True if a dataset is DROID by its name, its robot's name or its cameras' names (its port calls the robot Franka)."""
     names = (config.label, config.embodiment, root.name, str(info.robot_type), str(info.repo_id))
     return says_droid(*names) or set(info.features) >= _DROID_VIDEOS
 

@@ -81,7 +81,7 @@ class Picture:
 
     @property
     def full_range(self) -> bool:
-        """Whether black is 0 and white 255 in `luma`, instead of 16 and 235."""
+        """True if black is 0 and white 255 in `luma`, instead of 16 and 235."""
         return self._frame.format.name in _FULL_RANGE or self._frame.color_range == ColorRange.JPEG
 
     @property
@@ -101,7 +101,7 @@ class Picture:
 
     @property
     def damaged(self) -> bool:
-        """Whether the decoder had to make up parts of it."""
+        """True if the decoder had to make up parts of it."""
         return bool(self._frame.is_corrupt)
 
 
