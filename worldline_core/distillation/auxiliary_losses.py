@@ -23,7 +23,7 @@ from einops import rearrange, reduce
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
 from worldline_core.actions.robot_masks import kinematic_robot_masks
 from worldline_core.distillation.distill_config import AuxiliaryWeights
 from worldline_core.errors import ConfigError
@@ -98,9 +98,6 @@ class _ViewByView(torch.autograd.Function):
         return gradients[0] * ctx.saved_tensors[0], None, None
 
 
-HEAD_VIEW = "head"
-
-
 def view_weights(views: Sequence[str], wrist_weight: float = 2.0) -> Float[Tensor, " v"]:
     """Weight of each view: 1 for the head, `wrist_weight` for every other one (appendix, 2 in the paper)."""
     if not views:
@@ -173,12 +170,6 @@ def boundary_loss(
     step_predicted = (predicted[:, :, :, 1:] - predicted[:, :, :, :-1])[:, :, :, ::block_size]
     step_target = (target[:, :, :, 1:] - target[:, :, :, :-1])[:, :, :, ::block_size]
     return ((step_predicted - step_target) ** 2).mean()
-
-
-def enabled_terms(weights: AuxiliaryWeights, *, perceptual: bool) -> tuple[str, ...]:
-    """Names of the terms that :func:`auxiliary_losses` reports under these weights."""
-    names = ("anchor", "boundary", "lpips", "robot", "robot_motion")
-    return tuple(name for name in names if getattr(weights, name) and (perceptual or name != "lpips"))
 
 
 def auxiliary_losses(

@@ -20,7 +20,7 @@ from einops import repeat
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.distillation.auxiliary_losses import PerceptualDistance, auxiliary_losses, enabled_terms
+from worldline_core.distillation.auxiliary_losses import PerceptualDistance, auxiliary_losses
 from worldline_core.distillation.causal_objective import (
     CausalObjective,
     block_sigmas,
@@ -94,8 +94,7 @@ class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
             weights=self.settings.auxiliary,
             perceptual=self.perceptual,
         )
-        enabled = enabled_terms(self.settings.auxiliary, perceptual=self.perceptual is not None)
-        measured = {"distribution_matching": matching, **{name: values[name] for name in enabled}}
+        measured = {"distribution_matching": matching, **values}
         return matching + auxiliary, {name: value.item() for name, value in measured.items()}
 
     def trained_group(self, step: int) -> str:

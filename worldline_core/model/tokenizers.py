@@ -130,11 +130,16 @@ def resize_frame(frame: np.ndarray, size: tuple[int, int], *, out: np.ndarray) -
 
 
 def resized_video(frames: Frames, size: tuple[int, int]) -> UInt8[Tensor, "3 t h w"]:
-    """RGB frames ``(N, H, W, 3)``, gone through one by one, at ``size`` (H, W)."""
+    """RGB frames ``(N, H, W, 3)`` at ``size`` (H, W) as a video."""
+    return rearrange(torch.from_numpy(resized_frames(frames, size)), "t h w c -> c t h w").contiguous()
+
+
+def resized_frames(frames: Frames, size: tuple[int, int]) -> np.ndarray:
+    """RGB frames ``(N, H, W, 3)`` at ``size`` (H, W), resized one by one."""
     resized = np.empty((len(frames), *size, 3), np.uint8)
     for frame, target in zip(frames, resized, strict=True):
         resize_frame(frame, size, out=target)
-    return rearrange(torch.from_numpy(resized), "t h w c -> c t h w").contiguous()
+    return resized
 
 
 def frames_to_video(frames: np.ndarray, size: tuple[int, int] | None = None) -> Float[Tensor, "3 t h w"]:
@@ -146,10 +151,7 @@ def frames_to_video(frames: np.ndarray, size: tuple[int, int] | None = None) -> 
     if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
         raise DataError("Not RGB frames", expected="uint8 (N, H, W, 3)", got=f"{frames.dtype} {frames.shape}")
     if size is not None and frames.shape[1:3] != tuple(size):
-        resized = np.empty((len(frames), *size, 3), np.uint8)
-        for frame, target in zip(frames, resized, strict=True):
-            resize_frame(frame, size, out=target)
-        frames = resized
+        frames = resized_frames(frames, size)
     return rearrange(torch.from_numpy(np.ascontiguousarray(frames)), "t h w c -> c t h w").float() / 127.5 - 1.0
 
 

@@ -32,6 +32,12 @@ from worldline_core.rollout.simulation import Frames, encode_images
 _COPIED_AT_ONCE = 64
 
 
+def recorded_size(episodes: EpisodeSet) -> tuple[int, int]:
+    """(H, W) of the recordings' pictures."""
+    height, width = episodes.frames(0, episodes.rows[0].views[0], [0]).shape[1:3]
+    return height, width
+
+
 class FirstFrameCopy:
     """Every predicted frame is the observed one, at the size of the recordings."""
 
@@ -41,8 +47,7 @@ class FirstFrameCopy:
     needs_cameras = False
 
     def __init__(self, episodes: EpisodeSet) -> None:
-        height, width = episodes.frames(0, episodes.rows[0].views[0], [0]).shape[1:3]
-        self.image_size = (height, width)
+        self.image_size = recorded_size(episodes)
 
     def unit(self, frames: int) -> int:
         """Frames are copied one by one."""
@@ -100,10 +105,9 @@ class TextToVideo:
         self.views = tuple(self.info.config.views)
         self.steps = sampler.steps
         self.frames_per_unit = self.tokenizer.temporal_compression
-        height, width = episodes.frames(0, episodes.rows[0].views[0], [0]).shape[1:3]
-        self.image_size = (height, width)
+        self.image_size = recorded_size(episodes)
         cell = self.tokenizer.spatial_compression * self.info.config.patch_size
-        if height % cell or width % cell:
+        if any(side % cell for side in self.image_size):
             raise ConfigError(
                 "The recordings' pictures do not divide into the model's patches",
                 where=episodes.root,

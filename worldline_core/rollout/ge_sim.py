@@ -34,7 +34,8 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.geometry.cameras import ImageTransform
 from worldline_core.http_exchange import IncompleteResponseError, UnreachableError, exchange
-from worldline_core.model.tokenizers import resize_frame
+from worldline_core.model.tokenizers import resized_frames
+from worldline_core.rollout.baselines import recorded_size
 from worldline_core.rollout.predictions import Prediction
 from worldline_core.rollout.rollout_config import GeSimConfig
 from worldline_core.rollout.simulation import Frames
@@ -86,8 +87,7 @@ class GeSim:
     needs_cameras = True
 
     def __init__(self, config: GeSimConfig, episodes: EpisodeSet, tracks: ActionTracks, stride: int) -> None:
-        height, width = episodes.frames(0, episodes.rows[0].views[0], [0]).shape[1:3]
-        self.image_size = (height, width)
+        self.image_size = recorded_size(episodes)
         self._config, self._episodes, self._tracks, self._stride = config, episodes, tracks, stride
         self._url = config.url.rstrip("/")
         self._refused = 0
@@ -132,7 +132,7 @@ class GeSim:
         self._tell("/reset")
         self._tell("/set_task", task=self._episodes.rows[item.position].instruction)
         self._tell("/set_camera_params", intrinsic=K.tolist(), extrinsic=cameras.tolist())
-        picture = _jpeg(_resized(observed, size))
+        picture = _jpeg(resized_frames(observed, size))
         self._post("/set_episode_data", self._body([picture], frame_shape=[3, len(observed), *size]))
         shown = controls.clip(range(stride, item.frames * stride, stride))
         if whole := item.frames - 1 >= REPLAYED:
@@ -142,7 +142,12 @@ class GeSim:
             if not whole:
                 self._condition(chunk, K)
             found = self._step(actions_of(chunk))
-            yield [{view: _resized(found[:, v], self.image_size) for v, view in enumerate(item.views)}]
+            yield [
+                {
+                    view: resized_frames(np.ascontiguousarray(found[:, v]), self.image_size)
+                    for v, view in enumerate(item.views)
+                }
+            ]
 
     def _condition(self, tracks: EpisodeTracks, K: np.ndarray) -> None:
         """Send the pictures of the tools and the camera poses of the coming frames."""
@@ -254,13 +259,6 @@ def _point(pixel: np.ndarray) -> tuple[int, int]:
     """Whole pixels; those far outside, where an axis points at the camera, are brought near."""
     x, y = np.clip(pixel, -1e4, 1e4)
     return int(x), int(y)
-
-
-def _resized(pictures: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    resized = np.empty((len(pictures), *size, 3), np.uint8)
-    for picture, target in zip(pictures, resized, strict=True):
-        resize_frame(np.ascontiguousarray(picture), size, out=target)
-    return resized
 
 
 def _floats(values: np.ndarray) -> bytes:
