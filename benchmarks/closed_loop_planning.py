@@ -56,7 +56,7 @@ from worldline_core.recorder.controllers import (
 from worldline_core.recorder.record import SPLIT_STREAM
 from worldline_core.recorder.rendering import TEST_SCENES, prepare_rendering
 from worldline_core.recorder.scene import FRAME_RATE, Layout, sample_layout
-from worldline_core.recorder.simulate import REACH_TOLERANCE_M, EpisodeRecorder, Motion
+from worldline_core.recorder.simulate import REACH_TOLERANCE_M, EpisodeRecorder, ExecutedMotion
 from worldline_core.training.video_teacher import VideoTeacher, load_teacher
 
 SHIPPED = Path("artifacts/shipped")
@@ -93,7 +93,7 @@ class World:
         """The same start once more."""
         return World(self.recorder, self.kinematics, self.layout, self.spec)
 
-    def ended(self, controls: np.ndarray) -> Motion:
+    def ended(self, controls: np.ndarray) -> ExecutedMotion:
         """What comes of more controls."""
         return self.recorder.replay(self.layout, np.concatenate((self.actions, controls)).astype(np.float32))
 

@@ -20,7 +20,7 @@ from worldline_core.recorder.attempts import SEALED_FILE, BankSpec, RecordBanksC
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, record
 from worldline_core.recorder.scene import sample_layout
-from worldline_core.recorder.simulate import EpisodeRecorder, Job, Motion, Recording
+from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, Job, Recording
 
 JOB = Job("one", "viperx_graphite", "train", "place", (1, 2, 3))
 
@@ -57,7 +57,7 @@ def test_cameras_are_exact(recorder: EpisodeRecorder) -> None:
     layout = next(layout for layout in layouts if layout.target.kind == "block" and not layout.others)
     motion = recorder.move(layout, np.random.default_rng(4), 17)
     assert motion is not None
-    still = Motion(motion.state[:1], motion.action[:1], motion.qpos[:1], motion.outcome)
+    still = ExecutedMotion(motion.state[:1], motion.action[:1], motion.qpos[:1], motion.outcome)
     # With the arms moved out of the way below the floor, nothing hides the block.
     for arm in recorder.scene.arms:
         still.qpos[0, arm.qpos[1]] = np.pi

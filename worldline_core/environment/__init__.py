@@ -9,11 +9,9 @@ import gymnasium
 ENVIRONMENT = "worldline/Simulator-v0"
 MUJOCO_ENVIRONMENT = "worldline/Mujoco-v0"
 
-if ENVIRONMENT not in gymnasium.registry:
-    gymnasium.register(
-        ENVIRONMENT,
-        entry_point="worldline_core.environment.environment:WorldLineEnv",
-        vector_entry_point="worldline_core.environment.environment:WorldLineVectorEnv",
-    )
-if MUJOCO_ENVIRONMENT not in gymnasium.registry:
-    gymnasium.register(MUJOCO_ENVIRONMENT, entry_point="worldline_core.environment.mujoco_world:MujocoEnv")
+gymnasium.register(
+    ENVIRONMENT,
+    entry_point="worldline_core.environment.environment:WorldLineEnv",
+    vector_entry_point="worldline_core.environment.environment:WorldLineVectorEnv",
+)
+gymnasium.register(MUJOCO_ENVIRONMENT, entry_point="worldline_core.environment.mujoco_world:MujocoEnv")

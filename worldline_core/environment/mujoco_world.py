@@ -1,7 +1,7 @@
 """The recorder's MuJoCo world as an environment: what the simulator predicts is here computed by physics.
 
 Starts, observations, actions, rate and length are those of ``WorldLineEnv`` with the same recordings, so that a policy can be
-tried in both from the same starts (``benchmarks/policies_inside.py``). Pictures are new at every step unless told otherwise, and
+tried in both from the same starts (``benchmarks/policies_inside.py``). Pictures are new at every step by default, and
 success is read from the simulated things. Recordings do not hold where things stand: each start is drawn again by the configuration in their
 manifest. Needs the extras ``sim`` and ``gym``.
 """
@@ -31,7 +31,14 @@ from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.record import RecordConfig, plan_jobs
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene import FRAME_RATE, Layout, apply_layout
-from worldline_core.recorder.simulate import EpisodeRecorder, Motion, drive, motor_targets, place_arms, read_state
+from worldline_core.recorder.simulate import (
+    EpisodeRecorder,
+    ExecutedMotion,
+    drive,
+    motor_targets,
+    place_arms,
+    read_state,
+)
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.artifact_files import MANIFEST_NAME, read_manifest
 
@@ -139,7 +146,7 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return np.concatenate([self._pictures[view] for view in self.views], axis=1) if self.render_mode else None
 
     def target(self) -> np.ndarray:
-        """Where the thing that the task moves is now: ``(3)`` its place [m], or ``(1)`` how far a drawer is open or a button down [m]."""
+        """Current position ``(3)`` of the thing that the task moves, or travel ``(1)`` of a drawer or button [m]."""
         address = self._recorder.scene.model.joint(f"{self._layout.target.kind}_0").qposadr[0]
         count = 1 if self._layout.family in ("close", "press") else 3
         return self._qpos[-1][address : address + count].copy()
@@ -151,7 +158,7 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return {"pixels": {view: picture.copy() for view, picture in self._pictures.items()}, "agent_pos": state}
 
     def _film(self, state: np.ndarray) -> None:
-        now = Motion(state[None], state[None], self._data.qpos[None].copy(), "unknown")
+        now = ExecutedMotion(state[None], state[None], self._data.qpos[None].copy(), "unknown")
         frames = self._recorder.film(
             self._layout, now, episode_id=self._start.episode_id, scene_id=self._scene, split="test",
             jitter=deepcopy(self._jitter),
@@ -173,7 +180,7 @@ Drawn = tuple[Layout, str, np.random.Generator, np.ndarray]
 
 
 def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
-    """How the recorder drew what stands where in a recording: things, scene, draws of the camera, first command."""
+    """Returns a function that draws a recording again: its things, scene, camera draws and first command."""
     manifest = read_manifest(recordings)
     step, where = manifest.get("step"), recordings / MANIFEST_NAME
     if step == "record_policies":

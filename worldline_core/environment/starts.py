@@ -1,4 +1,4 @@
-"""Where simulated episodes begin: the first observation of recorded ones, or one that is given as files."""
+"""Starts of simulated episodes: first observations of recordings, or one given as files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from worldline_core.rollout.observation import Camera
 
 @dataclass(frozen=True)
 class Start:
-    """What is known at the first frame of a recording, and what was to be done.
+    """The first frame of a recording, with its instruction.
 
     Attributes:
         images: ``uint8 (H, W, 3)`` by view, with a camera each.

@@ -27,7 +27,7 @@ from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.record import SPLIT_STREAM, Embodiment, check_recorded, run_in_processes
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene import Family, Layout, sample_layout
-from worldline_core.recorder.simulate import EpisodeRecorder, Motion
+from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion
 from worldline_core.store.atomic import atomic_path
 
 SEALED_FILE = "sealed_outcomes.parquet"
@@ -115,14 +115,14 @@ class RecordBanksConfig(_AttemptsConfig):
         """Every bank to record."""
         return self.banks.specs() if isinstance(self.banks, BankGrid) else list(self.banks)
 
-    def draw(self, recorder: EpisodeRecorder, spec: BankSpec) -> tuple[Layout, dict[str, Motion]]:
+    def draw(self, recorder: EpisodeRecorder, spec: BankSpec) -> tuple[Layout, dict[str, ExecutedMotion]]:
         """Layout and executed candidates of a bank.
 
         Raises: DataError when none of 20 initial states gives a success rate in the wanted range.
         """
         low, high = self.success_range
         for entropy, layout in self.layouts(recorder.scene.robot, spec, "bank"):
-            motions: list[Motion] = []
+            motions: list[ExecutedMotion] = []
             for draw in range(4 * self.candidates):
                 motion = recorder.move(layout, np.random.default_rng((*entropy, draw + 1)), self.num_frames)
                 if motion is not None:
@@ -152,13 +152,13 @@ class RecordPoliciesConfig(_AttemptsConfig):
         """Every start."""
         return self.starts.specs()
 
-    def draw(self, recorder: EpisodeRecorder, start: BankSpec) -> tuple[Layout, dict[str, Motion]]:
+    def draw(self, recorder: EpisodeRecorder, start: BankSpec) -> tuple[Layout, dict[str, ExecutedMotion]]:
         """The first initial state that every policy can attempt, and the attempts by policy.
 
         Raises: DataError when 20 initial states hold none.
         """
         for entropy, layout in self.layouts(recorder.scene.robot, start, "test"):
-            motions: dict[str, Motion] = {}
+            motions: dict[str, ExecutedMotion] = {}
             for number, (name, policy) in enumerate(self.policies.items()):
                 for draw in range(5):
                     random = np.random.default_rng((*entropy, number, draw))

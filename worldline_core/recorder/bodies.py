@@ -34,7 +34,7 @@ class ArmPlacement:
 
 @dataclass(frozen=True)
 class CameraMount:
-    """Where a wrist camera stands and what it looks at [m], with its vertical field of view.
+    """Position and target of a wrist camera [m], with its vertical field of view.
 
     Tool frame: x back towards the robot, y the direction in which the fingers open, z out of the gripper.
     """

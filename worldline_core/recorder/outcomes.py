@@ -1,4 +1,4 @@
-"""How an episode ended, read from the simulated motion, never from what the controller meant to do."""
+"""Outcomes of episodes, measured on the simulated motion, never taken from the controller's intent."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ class Variety(StrictModel):
         return self
 
     def draw(self, random: np.random.Generator) -> ScriptedPolicy | None:
-        """How one episode is carried out; None as planned."""
+        """Draw the faults of one episode; None where it is carried out as planned."""
         if random.uniform() >= self.share:
             return None
         noisy, late, gripper_off = random.uniform(size=3) < 0.5
@@ -111,7 +111,7 @@ class Variety(StrictModel):
 
 
 class RecordConfig(StrictModel):
-    """What to record.
+    """Episodes to record.
 
     Attributes:
         seed: every seed gives other episodes (and other episode ids).

@@ -190,7 +190,7 @@ class SceneRenderer:
     def render(
         self, qpos: np.ndarray, paint: Callable[[np.ndarray], None], labels: np.ndarray
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], dict[str, CameraTrack]]:
-        """What the cameras see of positions (N, nq), per view.
+        """Render positions (N, nq) from every camera.
 
         Args:
             paint: changes the model's colours before each frame, by its positions (nq,).

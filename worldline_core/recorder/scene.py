@@ -27,7 +27,7 @@ FINGER_JOINTS = ("finger_a", "finger_b")
 
 @dataclass(frozen=True)
 class ArmIndices:
-    """Where one arm's joints, fingers and tool lie in the compiled model; ``limits`` (J, 2) of the joints [rad]."""
+    """Indices of one arm's joints, fingers and tool in the compiled model; ``limits`` (J, 2) of the joints [rad]."""
 
     joint_names: tuple[str, ...]
     finger_names: tuple[str, ...]

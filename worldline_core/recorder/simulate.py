@@ -73,8 +73,8 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Motion:
-    """What happened: ``state`` and ``action`` (N, J), full positions ``qpos`` (N, nq), and the measured outcome.
+class ExecutedMotion:
+    """``state`` and ``action`` (N, J), full positions ``qpos`` (N, nq), and the measured outcome.
 
     ``failure`` says what went wrong.
     """
@@ -193,7 +193,7 @@ class EpisodeRecorder:
 
     def move(
         self, layout: Layout, random: np.random.Generator, num_frames: int, policy: ScriptedPolicy | None = None
-    ) -> Motion | None:
+    ) -> ExecutedMotion | None:
         """Plan and execute, as well or badly as ``policy`` does; None when the plan leaves what the arms can reach."""
         duration, mistakes = (num_frames - 1) / FRAME_RATE, None if policy is None else policy.mistakes
         plans = plan_waypoints(self.scene.robot, layout, random, duration, mistakes=mistakes)
@@ -225,17 +225,17 @@ class EpisodeRecorder:
             columns += [np.array(targets), openings[:, None]]
         return np.concatenate(columns, axis=1).astype(np.float32)
 
-    def replay(self, layout: Layout, action: np.ndarray) -> Motion:
+    def replay(self, layout: Layout, action: np.ndarray) -> ExecutedMotion:
         """Execute recorded actions (N, J) from the layout's initial state."""
         apply_layout(self.scene, self._data, layout)
         state, qpos = execute(self.scene, self._data, action)
         tool = self.tool_positions(layout.arm, qpos)
-        return Motion(state, action, qpos, *outcome(self.scene, self._data, layout, qpos, tool))
+        return ExecutedMotion(state, action, qpos, *outcome(self.scene, self._data, layout, qpos, tool))
 
     def film(
         self,
         layout: Layout,
-        motion: Motion,
+        motion: ExecutedMotion,
         *,
         episode_id: str,
         scene_id: str,
@@ -274,7 +274,7 @@ class EpisodeRecorder:
         )
         return Recording(episode, frames, masks, motion.failure, things)
 
-    def draw(self, job: Job, num_frames: int) -> tuple[Layout, Motion, str, np.random.Generator]:
+    def draw(self, job: Job, num_frames: int) -> tuple[Layout, ExecutedMotion, str, np.random.Generator]:
         """Layout, executed motion and scene id of one episode, and the generator to continue with for its cameras.
 
         Raises: DataError when no reachable plan is found in 50 draws.

@@ -24,7 +24,7 @@ class SimulatorClient(MessageSocket):
         metadata: what the server says of itself: views, fps, frames_per_step, image_size, episodes.
 
     Raises:
-        UnavailableError: nobody answers there, or the token is refused.
+        UnavailableError: no server answers, or the token is refused.
         DataError: a server of another kind answers.
     """
 

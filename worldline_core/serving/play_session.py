@@ -196,7 +196,7 @@ class PlaySession:
         await self._send(json.dumps({"type": "marks", "pending": len(self._pending), **hand.marks()}))
 
     def _work(self, work: Awaitable[None]) -> None:
-        async def told() -> None:
+        async def reported() -> None:
             try:
                 await work
             except WorldLineError as error:
@@ -211,7 +211,7 @@ class PlaySession:
             ):
                 task.get_loop().call_exception_handler({"message": "a block failed", "exception": task.exception()})
 
-        self._working = asyncio.create_task(told())
+        self._working = asyncio.create_task(reported())
         self._working.add_done_callback(ended)
 
     async def _settled(self) -> None:

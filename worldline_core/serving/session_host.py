@@ -124,7 +124,7 @@ class SessionHost:
             self.starts.simulate(self.starts.read(row["id"]), [0])
 
     def metadata(self) -> dict[str, Any]:
-        """What a client needs to know."""
+        """Facts that a client needs: views, rate, size of pictures, recordings, policies."""
         world = self.world
         return {
             "protocol": PROTOCOL,
@@ -279,5 +279,5 @@ def _pictures_of(simulation: Simulation) -> dict[str, np.ndarray]:
 
 def error_message(error: WorldLineError) -> dict[str, Any]:
     """An error as a client gets it."""
-    said = {name: getattr(error, name) for name in ("what", "where", "expected", "got", "next_step")}
-    return {"kind": type(error).__name__, **{name: shown(value) for name, value in said.items() if value is not None}}
+    facts = {name: getattr(error, name) for name in ("what", "where", "expected", "got", "next_step")}
+    return {"kind": type(error).__name__, **{name: shown(value) for name, value in facts.items() if value is not None}}

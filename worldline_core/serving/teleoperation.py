@@ -75,7 +75,7 @@ class Teleoperation:
         return np.stack([np.cross(away, up), away, up], axis=1)
 
     def _tracks(self, rows: np.ndarray) -> EpisodeTracks:
-        """Of the start and of these commands, without the start."""
+        """Tracks of these commands, which follow the start."""
         tracks = project_controls(
             self._start.cameras, self._start.image_size, self._start.kinematics,
             controls=np.concatenate((self._first[None], rows)), fps=self._fps,
@@ -133,7 +133,7 @@ class Teleoperation:
         return way * min(1.0, SPEED_M_S / self._fps / max(float(np.linalg.norm(way)), 1e-9))
 
     def marks(self) -> dict[str, Any]:
-        """Where the commanded tools are: `views` as of `frame_marks`, and `position` [m] by arm."""
+        """Places of the commanded tools: `views` as of `frame_marks`, and `position` [m] by arm."""
         return {
             "views": frame_marks(self._seen, 0, list(self._start.images)),
             "position": self._poses()[:, :3, 3].tolist(),

@@ -1,4 +1,4 @@
-"""What LeRobot has no place for, written beside what it records: the cameras of each episode, and how the dataset is curated."""
+"""Cameras of each episode and the curation config, written beside the files that LeRobot records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the robot and the teleoperator share: the recordings, LeRobot's names and units, and its announcements of episodes."""
+"""Common parts of the robot and the teleoperator: the recordings, LeRobot's names and units, and its announcements of episodes."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Columns:
         return dict.fromkeys(self.names, float)
 
     def named(self, values: np.ndarray) -> dict[str, float]:
-        """Of one row ``(state size)`` in the embodiment's units."""
+        """LeRobot's values by name for one row ``(state size)`` in the embodiment's units."""
         return dict(zip(self.names, ((values - self._zero) * self._scale).tolist(), strict=True))
 
     def values(self, action: Mapping[str, Any]) -> np.ndarray:

@@ -161,7 +161,7 @@ class WorldLineRobot(Robot):
         return Together(simulation, [0])
 
     def _going_on(self) -> Together:
-        """What is running, begun anew where LeRobot has announced an episode."""
+        """The running episode, begun anew where LeRobot has announced one."""
         if self._running is None:
             raise DeviceNotConnectedError
         announced = self._announced.take()
