@@ -71,7 +71,6 @@ def embodiment_yaml(scene: SceneModel) -> str:
                     "rotation_wxyz": [round(float(v), 9) for v in model.site_quat[site]],
                 },
                 "gripper": {
-                    "index_after_joints": True,
                     "closed": 0.0,
                     "open": 1.0,
                     "finger_joints": [

@@ -117,16 +117,6 @@ def test_frames_outside_of_the_episode_are_refused(kinematics, episode):
         tracks.clip([0, 9])
 
 
-def test_collate_pads_a_single_arm(kinematics, episode):
-    tracks, _ = compute_tracks(episode, kinematics)
-    names = ("uv", "depth", "rot6d", "gripper", "valid")
-    single = replace(tracks, arms=("right",), **{name: getattr(tracks, name)[:, :, 1:] for name in names})
-    batch = collate_tracks([tracks, single], views=("head",))
-    assert batch.uv.shape == (2, 9, 1, 2, 2)
-    assert not batch.valid[1, ..., 1].any()
-    np.testing.assert_array_equal(batch.uv[1, :, 0, 0], tracks.uv[:, 0, 1])
-
-
 def test_collate_refuses_clips_of_different_length(kinematics, episode):
     tracks, _ = compute_tracks(episode, kinematics)
     with pytest.raises(DataError, match="do not fit together"):

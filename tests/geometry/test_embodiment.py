@@ -14,7 +14,7 @@ ARM = {
     "joints": ["pan", "lift"],
     "limits": [[-1.0, 1.0], [-2.0, 2.0]],
     "end_effector_link": "hand",
-    "gripper": {"index_after_joints": True, "closed": 0.0, "open": 0.04},
+    "gripper": {"closed": 0.0, "open": 0.04},
 }
 BODY = {"name": "toy", "description": {"format": "mjcf", "file": "toy.xml"}, "base_link": "world", "arms": [ARM]}
 
@@ -142,15 +142,3 @@ def test_limits_in_degrees_have_a_tolerance_in_degrees(tmp_path):
     assert embodiment.outside_limits(state)[:, 0].tolist() == [False, True]
     with pytest.raises(DataError, match=r"-60 to 60 deg[\s\S]*62 deg; 1 of 2 frames are outside"):
         embodiment.check_limits(state, "episode 3")
-
-
-def test_missing_description_says_how_to_get_it(monkeypatch, tmp_path):
-    monkeypatch.delenv("WORLDLINE_DESCRIPTION_AGIBOT_G1", raising=False)
-    embodiment = load_embodiment("agibot_g1")
-    with pytest.raises(UnavailableError, match=r"cosmos-framework[\s\S]*WORLDLINE_DESCRIPTION_AGIBOT_G1"):
-        read_description(embodiment)
-    monkeypatch.setenv("WORLDLINE_DESCRIPTION_AGIBOT_G1", str(tmp_path / "here.urdf"))
-    (tmp_path / "here.urdf").write_text("<robot/>")
-    assert read_description(load_embodiment("agibot_g1")) == "<robot/>"
-    (tmp_path / "there.urdf").write_text("<robot name='there'/>")
-    assert "there" in read_description(load_embodiment("agibot_g1", tmp_path / "there.urdf"))

@@ -229,11 +229,6 @@ def test_unknown_joint_lists_the_joints(tmp_path):
         toy(tmp_path, posture={"waist": 0.1})
 
 
-def test_wrong_number_of_joints_is_refused(tmp_path):
-    with pytest.raises(DataError, match="Joint vector has a wrong length"):
-        toy(tmp_path).tool_poses(np.zeros((2, 6)))
-
-
 @pytest.mark.parametrize(
     ("body", "message"),
     [

@@ -119,7 +119,7 @@ def tracks_of_projection(
     controls: str,
     camera_motion: Sequence[str],
 ) -> EpisodeTracks:
-    """What was projected, in the types that tracks are stored in (float32, uv float64); unknown poses become zeros."""
+    """Tracks of a projection in the types that tracks are stored in (float32, uv float64); unknown poses become zeros."""
     return EpisodeTracks(
         episode_id=episode.episode_id,
         embodiment=episode.embodiment,

@@ -1,4 +1,4 @@
-"""What action tracks and their previews are made with, and numbers that all action maps share. No torch in here."""
+"""Configuration of action tracks and previews, and constants of all action maps; free of torch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WristProjection = Literal["current_camera", "clip_start_camera"]
 
 
 class RenderActionsConfig(StrictModel):
-    """What is projected, and how much is drawn.
+    """Choice of the projected controls, and size of the previews.
 
     Attributes:
         source: `action` projects the commands (what a simulator is driven by) through kinematics, and refuses an episode

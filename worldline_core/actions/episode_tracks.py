@@ -215,7 +215,7 @@ def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> lis
 
 
 class TracksDescription(StrictModel):
-    """What holds for all tracks of an artifact: sigma of their Gaussian, pixels on the 384 x 512 reference canvas."""
+    """Contents of `tracks.json`: sigma of the Gaussian, pixels on the 384 x 512 reference canvas."""
 
     sigma_px_ref: float = Field(gt=0)
 
@@ -288,7 +288,7 @@ class ActionTracks:
         return (self.tracks(episode_id) for episode_id in self._rows)
 
     def controls(self, episode_id: str) -> str:
-        """What was projected for an episode that has tracks: commands, measured joints, or recorded tool poses."""
+        """Kind of controls behind an episode's tracks: commands, measured joints, or recorded tool poses."""
         return self._rows[episode_id]["controls"]
 
     def tracks(self, episode_id: str) -> EpisodeTracks:

@@ -68,7 +68,7 @@ _FRACTION_BITS = 4
 
 @dataclass(frozen=True)
 class OverlayStyle:
-    """How much is drawn.
+    """Choice of the drawn layers.
 
     Attributes:
         sigma_px_ref: of the heat, pixels on the 384 x 512 reference canvas.
@@ -211,7 +211,7 @@ def _draw_ring(picture: Picture, centre: NDArray[np.float64], opening: float, co
 
 
 def arm_mask(tracks: EpisodeTracks, n: int, view: str, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where the robot's capsules fall in a view: bool `h w` of `size`."""
+    """Mask of the robot's capsules in a view: bool `h w` of `size`."""
     v = _view_index(tracks, n, view)
     covered = project_capsules(
         torch.from_numpy(tracks.capsules[None, [n]]),

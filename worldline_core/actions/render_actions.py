@@ -43,7 +43,7 @@ _ACCOUNT = ("episode_id", "source", "status", "reason", "stored_bytes")
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectedEpisode(InputRow):
-    """What became of one episode.
+    """Outcome for one episode.
 
     Attributes:
         tracks, counts: of an episode that is kept.
@@ -73,7 +73,7 @@ class RenderWork(ShardFilesWork[ProjectedEpisode]):
     def _kinematics_of(self, embodiment: str) -> ArmKinematics:
         if embodiment == NO_EMBODIMENT:
             raise ConfigError(
-                "Nobody describes the robot of the recording", got=f"embodiment: {NO_EMBODIMENT}",
+                "The robot of the recording has no description", got=f"embodiment: {NO_EMBODIMENT}",
                 expected="a robot of `worldline embodiment list`",
                 next_step="declare the robot and its arms in the source; without, Stage I alone learns from it",
             )  # fmt: skip

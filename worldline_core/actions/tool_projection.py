@@ -28,7 +28,7 @@ from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image
 from worldline_core.geometry.tensor_transforms import is_rigid, rot6d_from_rotation, valid_intrinsics
 
 CAUSES = ("valid", "behind_camera", "outside_image", "invalid_calibration")
-"""What the numbers of `Projection.cause` mean; 0 is valid."""
+"""Names of the values of `Projection.cause`; 0 is valid."""
 FRAMES_AT_ONCE = 2048
 """On a CPU, longer recordings are projected in pieces whose temporary arrays stay in the cache; the bits are the same."""
 _VALID, _BEHIND, _OUTSIDE, _INVALID = range(len(CAUSES))

@@ -84,7 +84,7 @@ def _largest_lag(count: int, fps: float, config: TimeAlignmentConfig) -> int:
 
 
 def detect_image_lag(motion: np.ndarray, change: np.ndarray, fps: float, config: TimeAlignmentConfig) -> Verdict:
-    """Whether images lag or lead the states.
+    """Checks that images neither lag nor lead the states.
 
     Args:
         motion: (n, s) speed of what moves view s's image, entry i for the step to frame i + 1.
@@ -127,7 +127,7 @@ def pose_lag(T_base_tool: np.ndarray, T_base_camera: np.ndarray, max_lag: int) -
 def detect_pose_lag(
     T_base_tool: np.ndarray, T_base_camera: np.ndarray, fps: float, config: TimeAlignmentConfig
 ) -> Verdict:
-    """Whether recorded camera poses lag or lead the states."""
+    """Checks that recorded camera poses neither lag nor lead the states."""
     lag, best, at_zero = pose_lag(T_base_tool, T_base_camera, _largest_lag(len(T_base_tool), fps, config))
     # Where no shift makes the pair rigid, the calibration is wrong and says nothing about clocks.
     significant = at_zero - best >= config.min_pose_gain_m and best <= config.max_rigid_residual_m
@@ -173,7 +173,7 @@ def local_change(
 
 
 def detect_projection(gray: np.ndarray, uv: np.ndarray, inside: np.ndarray, config: ProjectionConfig) -> Verdict:
-    """Whether tools project where the picture shows motion.
+    """Checks that tools project to where the picture shows motion.
 
     Two measures, of which one suffices. The ratio finds a small tool before a resting scene; where large arms and what
     they carry fill half of the picture it cannot be large, but the change near the tool still ranks high.
@@ -228,7 +228,7 @@ def find_lags(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> l
 
 
 def find_projection(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
-    """In the episode's primary view, where its camera is known."""
+    """Checks the projection in the primary view, where its camera is known."""
     view = signals.episode.primary_view
     camera = signals.episode.cameras.get(view)
     tools = signals.calibrated_tools
@@ -249,7 +249,7 @@ def find_projection(signals: Signals, config: FilterConfig, _: Sequence[Finding]
 def detect_camera(
     K: np.ndarray, T_base_camera: np.ndarray, width: int, height: int, config: CalibrationConfig
 ) -> Verdict:
-    """Whether K and the poses (n, 4, 4) are plausible for a camera with this image size."""
+    """Checks that K and the poses (n, 4, 4) are plausible for a camera with this image size."""
     numbers: Numbers = {}
     sane = bool(np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 and abs(np.linalg.det(K)) > 1e-9)
     if sane:
@@ -271,7 +271,7 @@ def detect_camera(
 def detect_hand_eye(
     T_base_tool: np.ndarray, T_base_camera: np.ndarray, T_tool_mount: np.ndarray | None, config: CalibrationConfig
 ) -> Verdict:
-    """Whether a wrist camera is rigidly fixed to its tool, and where the embodiment says.
+    """Checks that a wrist camera is rigidly fixed to its tool, at the mount that the embodiment states.
 
     Args:
         T_base_tool, T_base_camera: (n, 4, 4).
@@ -293,7 +293,7 @@ def detect_hand_eye(
 
 
 def detect_fixed_camera(T_base_camera: np.ndarray, config: CalibrationConfig) -> Verdict:
-    """Whether a camera that should stand still in the base frame does."""
+    """Checks that a camera stays at one place in the base frame."""
     _, metres_95, degrees_95 = _residual_95(np.eye(4)[None].repeat(len(T_base_camera), axis=0), T_base_camera)
     return Verdict(
         "calibration",
@@ -316,7 +316,7 @@ _MIN_FRAMES = 4
 def detect_mistake(
     episode: Episode, gray: Mapping[str, np.ndarray], bad_frames: np.ndarray, config: FilterDoctorConfig
 ) -> Verdict:
-    """Whether the recording's calibration is consistent; if not, the explanation and the line that repairs it.
+    """Checks that the calibration is consistent; if not, gives the explanation and the line that repairs it.
 
     Args:
         gray: by view, uint8 (n, h, w).
@@ -348,7 +348,7 @@ def detect_mistake(
 
 
 def _liveliest(episode: Episode, start: int, stop: int, length: int) -> tuple[int, int]:
-    """Of frames start..stop the `length` consecutive ones whose states change most; all of a shorter stretch."""
+    """The `length` consecutive frames of start..stop whose states change most; all of a shorter stretch."""
     if stop - start <= length:
         return start, stop
     change = np.abs(np.diff(episode.state[start:stop].astype(np.float64), axis=0)).sum(axis=1)
@@ -384,7 +384,7 @@ def _numbers(diagnosis: Diagnosis, config: FilterDoctorConfig, step: int) -> Num
 
 
 def kinematics_of(episode: Episode) -> ArmKinematics | None:
-    """Of the episode's embodiment; None where it or its description is not known, or the recording has another layout."""
+    """Kinematics of the embodiment; None where its description is missing or the recording has another layout."""
     kinematics = known_kinematics(episode.embodiment)
     if kinematics is None:
         return None
@@ -396,7 +396,7 @@ def kinematics_of(episode: Episode) -> ArmKinematics | None:
 
 
 def find_calibration_faults(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
-    """Of each camera alone, then of wrist cameras against their tools, then of cameras that should stand still."""
+    """Checks each camera alone, then wrist cameras against their tools, then cameras that should not move."""
     tools = signals.calibrated_tools
     if tools is None:
         return []
@@ -420,7 +420,7 @@ def find_calibration_faults(signals: Signals, config: FilterConfig, _: Sequence[
 
 
 def find_mistake(signals: Signals, config: FilterConfig, found: Sequence[Finding]) -> list[Finding]:
-    """Of an episode that Stage I keeps; of any other the calibration does not matter."""
+    """Runs the doctor on an episode that Stage I keeps; for others the calibration does not matter."""
     if signals.calibrated_tools is None or any(f.stage == 1 and not f.verdict.passed for f in found):
         return []
     bad = bad_frames(found, len(signals.gray[signals.primary_view]))

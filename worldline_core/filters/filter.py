@@ -70,7 +70,7 @@ type Detector = Callable[[Signals, FilterConfig, Sequence[Finding]], list[Findin
 
 
 def find_missing_inputs(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
-    """What Stage II needs besides clean frames: actions, required views with calibration, known tool poses."""
+    """Checks for what Stage II needs besides clean frames: actions, required views with calibration, known tool poses."""
     if signals.episode.state_kind == "none":
         return [Finding("required_views", None, 2, Verdict("missing_actions", False))]
     arms = [arm.wrist_view for arm in signals.arms] or ["right_wrist"]
@@ -111,7 +111,7 @@ def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:
 
 
 class EpisodeVerdict(StrictModel):
-    """What the filters say of one episode.
+    """Decision of the filters on one episode.
 
     Attributes:
         reason: code, with detail and evidence, of an episode that is dropped whole; None of one that is kept.
@@ -273,7 +273,7 @@ class FilterWork(EpisodeSetWork[InputRow]):
         return self._keep(episode, EpisodeVerdict(reason="crashed", detail=detail, evidence=dict(evidence)))
 
     def verdict(self, position: int) -> EpisodeVerdict:
-        """What `examine` said of an episode."""
+        """Returns the stored verdict on an episode."""
         return EpisodeVerdict.model_validate(json.loads(self._path(position).read_text()))
 
     def row(self, position: int, verdict: EpisodeVerdict) -> InputRow:
@@ -292,7 +292,7 @@ class FilterWork(EpisodeSetWork[InputRow]):
         return self.row(position, verdict)
 
     def _path(self, position: int) -> Path:
-        """Where the verdict on an episode is kept until the index is written."""
+        """Path of the verdict on an episode until the index is written."""
         return self.output / "run" / "verdicts" / f"{part_name(self.episodes.rows[position].episode_id)}.json"
 
 

@@ -106,7 +106,7 @@ _STILL_RAD = 0.03
 
 
 def _one_reading_alone(joints: np.ndarray) -> bool:
-    """Whether no other joint goes home with the one that was furthest away: a broken reading, not the robot.
+    """True when no other joint goes home with the one that was furthest away: a broken reading, not the robot.
 
     Args:
         joints: (3, j) [rad] at the first frame, before the return and after it.
@@ -242,7 +242,7 @@ def find_joint_faults(signals: Signals, config: FilterConfig, _: Sequence[Findin
 
 
 def find_static(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
-    """In the primary view."""
+    """Looks for static stretches in the primary view."""
     view = signals.primary_view
     change = signals.pictures[view].coarse_change
     verdict = detect_static(signals.joint_speed, signals.gripper_speed, change, signals.episode.fps, config.static)
@@ -316,7 +316,7 @@ def detect_base_motion(area: np.ndarray, fps: float, config: BaseMotionConfig) -
 
 
 def find_base_motion(signals: Signals, config: FilterConfig, found: Sequence[Finding]) -> list[Finding]:
-    """In the primary view, unless its camera is known to move."""
+    """Looks for base motion in the primary view, unless its camera is known to move."""
     view = signals.primary_view
     camera = signals.episode.cameras.get(view)
     if camera is not None and camera.moving:

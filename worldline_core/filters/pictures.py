@@ -1,4 +1,4 @@
-"""What is wrong with the images of a view: too dark, overexposed, blurred, or corrupted.
+"""Faults of the images of a view: too dark, overexposed, blurred, or corrupted.
 
 Blur: the variance of the Laplacian (Pech-Pacheco et al. 2000) depends on the scene. Divided by the contrast of adjacent
 pixels of the small image, which blur of a few pixels leaves as it is, scene and gain cancel. Corrupted: blank, noise,
@@ -232,7 +232,7 @@ def detect_corrupted(
 
 
 def find_picture_faults(signals: Signals, config: FilterConfig, found: Sequence[Finding]) -> list[Finding]:
-    """In every view, the primary one first; only that one decides for Stage I. A frame counts for the first fault only."""
+    """Checks every view, the primary one first, which alone decides for Stage I. A frame counts for its first fault."""
     primary, fps = signals.primary_view, signals.episode.fps
     unreliable = bad_frames(found, len(signals.gray[primary]), "joint_jump", "joint_speed")
     findings: list[Finding] = []

@@ -1,4 +1,4 @@
-"""What the detectors look at: tool poses and speeds of an episode, its small grey images, and statistics of each image.
+"""Inputs of the detectors: tool poses and speeds of an episode, its small grey images, and statistics of each image.
 
 The statistics take about 0.05 ms per image.
 """
@@ -55,7 +55,7 @@ class PictureStatistics:
 
 
 def picture_statistics(gray: np.ndarray) -> PictureStatistics:
-    """Of uint8 (n, h, w)."""
+    """Per-frame statistics of grey images uint8 (n, h, w)."""
     count, height, width = gray.shape
     histograms = np.stack([np.bincount(image.reshape(-1), minlength=256) for image in gray]).astype(np.float64)
     levels = np.arange(256)
@@ -88,7 +88,7 @@ def picture_statistics(gray: np.ndarray) -> PictureStatistics:
 
 
 def _differences(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of uint8 (n, h, w), three (n,): summed squared differences of adjacent pixels across and down, and summed absolute
+    """For uint8 (n, h, w) three (n,): summed squared differences of adjacent pixels across and down, and summed absolute
     differences from the picture before (0 for the first).
 
     A row's sum of squares is a whole number below 2^24 (for w <= 258), so float32 holds it exactly in whatever order BLAS
@@ -130,7 +130,7 @@ def _flat_edge(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 
 _METRES_PER_RADIAN = 0.3
-"""How far the tool of an unknown arm moves per radian of a joint: half the reach of a small arm."""
+"""Motion of an unknown arm's tool per radian of a joint: half the reach of a small arm."""
 
 
 def range_speed(values: np.ndarray, fps: float) -> np.ndarray:

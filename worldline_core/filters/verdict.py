@@ -1,4 +1,4 @@
-"""What a detector says about an episode, and the reason codes, each in one sentence; docs/filters.md says more."""
+"""Verdicts of detectors, and the reason codes, each in one sentence; docs/filters.md explains them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Numbers = dict[str, float | int | str | None]
 
 @dataclass(frozen=True)
 class Curve:
-    """What a detector measured frame by frame, (n,), and the value that it was held against."""
+    """Measured values of a detector by frame, (n,), and their threshold."""
 
     values: np.ndarray
     threshold: float
@@ -38,7 +38,7 @@ class Verdict:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing at all was found."""
+        """True when the episode passed and no frame is bad."""
         return self.passed and (self.bad_frames is None or not self.bad_frames.any())
 
 

@@ -55,7 +55,7 @@ Fit = Literal["stretch", "letterbox", "crop"]
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """Where a camera is, made by `of` from matrices that state their convention.
+    """Pose of a camera, made by `of` from matrices that state their convention.
 
     Attributes:
         T_base_camera: (N, 4, 4) float64, N = 1 for a fixed camera; maps camera points (OpenCV axes, metres) to base.
@@ -67,7 +67,7 @@ class CameraPose:
 
     @classmethod
     def of(cls, matrices: np.ndarray, *, extrinsics: Extrinsics, axes: CameraAxes, where: object) -> CameraPose:
-        """From matrices (N or 1, 4, 4) or (4, 4).
+        """Pose from matrices (N or 1, 4, 4) or (4, 4).
 
         Args:
             extrinsics: whether they map camera points to base, or base points to camera (OpenCV's rvec and tvec, COLMAP).
@@ -123,7 +123,7 @@ class Window:
         return np.array([[1.0, 0.0, -self.left], [0.0, 1.0, -self.top], [0.0, 0.0, 1.0]])
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """What the image covers of the window, zeros elsewhere."""
+        """Returns the part of the image inside the window, zeros elsewhere."""
         height, width = self.to_size
         result = np.zeros((height, width, *image.shape[2:]), dtype=image.dtype)
         rows = slice(max(self.top, 0), min(self.top + height, image.shape[0]))
@@ -231,7 +231,7 @@ class ImageTransform:
         return self.affine @ K
 
     def pixels(self, uv: np.ndarray) -> np.ndarray:
-        """Where pixels (..., 2) of the source image lie in the result."""
+        """Pixels (..., 2) of the source image in the coordinates of the result."""
         affine = self.affine
         return uv * np.diagonal(affine)[:2] + affine[:2, 2]
 

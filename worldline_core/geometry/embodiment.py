@@ -1,4 +1,4 @@
-"""What a robot is made of, as far as this project needs: arms, joint order, tools, grippers, wrist cameras.
+"""Robots as data: arms, joint order, tools, grippers, wrist cameras.
 
 One YAML file per embodiment in `configs/embodiments/`. Its kinematic description (an MJCF or URDF file) is looked for in
 this order: a path given by the caller, the environment variable `WORLDLINE_DESCRIPTION_<NAME>`, a file of an installed
@@ -69,7 +69,7 @@ class Description(StrictModel):
         obtain: how to get the file, in words. With `package` this is `pip install` unless given.
         source: where the file comes from, with version and licence.
         mounts: the description is one arm and is placed once per entry, `T_world_root` each; its links and joints
-            bear the entry's name, a slash, and their own name (`left/joint1`), under a common link `world`.
+            are named by the entry, a slash, and their own name (`left/joint1`), under a common link `world`.
     """
 
     format: Literal["mjcf", "urdf"]
@@ -97,7 +97,7 @@ class Description(StrictModel):
 
     @property
     def how_to_get(self) -> str | None:
-        """What a user without the file can do."""
+        """Instructions for a user without the file."""
         if self.obtain is None and self.package is not None:
             return f"pip install '{self.package}{self.version or ''}'"
         return self.obtain
@@ -112,9 +112,8 @@ class FingerJoint(StrictModel):
 
 
 class Gripper(StrictModel):
-    """How the gripper is written in the state: right after the arm's joints, linear from closed to open."""
+    """Layout of a gripper in the state: right after the arm's joints, linear from closed to open."""
 
-    index_after_joints: Literal[True] = True
     closed: float = 0.0
     open: float = 1.0
     finger_joints: tuple[FingerJoint, ...] = ()
@@ -133,7 +132,7 @@ _MOUNT_TOLERANCE = 1.1e-4  # largest entry of |R R^T - I| of a wrist camera's mo
 
 
 class WristCamera(StrictModel):
-    """Where the arm's camera is mounted; `T_link_camera` maps camera points (OpenCV axes) to the link."""
+    """Mount of an arm's camera; `T_link_camera` maps camera points (OpenCV axes) to the link."""
 
     link: str
     T_link_camera: tuple[tuple[float, ...], ...]
@@ -355,7 +354,7 @@ def description_variable(name: str) -> str:
 
 
 def locate_description(name: str, description: Description, folder: Path, override: Path | str | None) -> Path:
-    """Where the description of an embodiment is, or would be; nothing is opened.
+    """Returns the path at which the description of an embodiment is expected; nothing is opened.
 
     Args:
         folder: of the embodiment's YAML.
@@ -406,7 +405,7 @@ def _in_package(description: Description, package: str) -> Path | None:
 
 
 def how_to_get(embodiment: Embodiment) -> str:
-    """What a user without the kinematic description can do."""
+    """Instructions for a user without the kinematic description."""
     description = embodiment.description
     steps = [description.how_to_get or "restore the file beside the embodiment's YAML"]
     if description.package is None:

@@ -1,4 +1,4 @@
-"""What `worldline embodiment` prints: the list of robots, one robot, and its forward kinematics against MuJoCo.
+"""Output of `worldline embodiment`: the list of robots, one robot, and its forward kinematics against MuJoCo.
 
 MuJoCo is an independent engine here: nothing of this project's readers is used on its side. The description's text goes
 to MuJoCo's own MJCF or URDF compiler, after meshes and all else that decides no pose were taken out (they are often not

@@ -22,14 +22,14 @@ from worldline_core.geometry.kinematics import ArmKinematics
 ROTATION_WEIGHT_M = 0.3
 """A rotation error of 1 rad counts as much as a position error of this many metres."""
 LARGEST_STEP_M, LARGEST_TURN_RAD = 0.1, 0.5
-"""What a step tries to correct at most: beyond it the linear model of the arm says little."""
+"""Largest correction of one step: beyond it the linear model of the arm says little."""
 POSITION_TOLERANCE_M, ROTATION_TOLERANCE_RAD = 1e-4, 1e-3
 _DAMPING = 1e-5
 
 
 @dataclass(frozen=True)
 class Reached:
-    """How far the solver came.
+    """Result of the solver.
 
     Attributes:
         state: (j,) within the limits; gripper columns as they were given.
@@ -64,7 +64,7 @@ class InverseKinematics:
         ]
 
     def jacobians(self, state: Float[np.ndarray, " j"]) -> list[Float[np.ndarray, "6 d"]]:
-        """Of each arm: metres (first three rows) and radians of its tool in the base frame per unit of each of its joints."""
+        """By arm: metres (first three rows) and radians of its tool in the base frame per unit of each of its joints."""
         return self._at(state)[1]
 
     def _at(self, state: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:

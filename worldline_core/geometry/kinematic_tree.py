@@ -113,10 +113,10 @@ def _check_size[T](root: T, children: Callable[[T], Iterable[T]], where: object)
 
 
 def _check_names(tree: TreeBody, where: object) -> None:
-    """Raises: DataError when two joints bear one name: a column of the state would turn both."""
+    """Raises: DataError when two joints have one name: a column of the state would turn both."""
     joints = Counter(joint.name for body in tree.walk() for joint in body.joints)
     if doubled := [name for name, count in joints.items() if count > 1]:
-        raise DataError("Joints bear the same name", where=where, got=", ".join(doubled[:8]))
+        raise DataError("Joints have the same name", where=where, got=", ".join(doubled[:8]))
 
 
 def _numbers(text: str, count: int, where: object) -> np.ndarray:
@@ -168,7 +168,7 @@ def read_mjcf(text: str, where: object) -> TreeBody:
 
 
 class _MjcfReader:
-    """Holds what bodies inherit: the compiler's settings and the joint defaults by class."""
+    """Reader of an MJCF; holds what bodies inherit: the compiler's settings and the joint defaults by class."""
 
     def __init__(self, root: ET.Element, where: object) -> None:
         compiler = root.find("compiler")
@@ -206,7 +206,7 @@ class _MjcfReader:
             if child.tag == "body":
                 body.children.append(self.body(child, child_name, childclass))
             else:
-                # A site may bear the name of a body; link names are unique.
+                # A site may have the name of a body; link names are unique.
                 unique = f"site:{child_name}" if child_name in self.body_names else child_name
                 body.children.append(TreeBody(unique, self._pose(child)))
         return body

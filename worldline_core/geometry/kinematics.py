@@ -141,7 +141,7 @@ class ArmKinematics:
 
     @cached_property
     def _base_is_root(self) -> bool:
-        """Whether poses in the root are poses in the base."""
+        """True where poses in the root are poses in the base."""
         root = self.tree
         return (
             self.embodiment.base_link == root.name and not root.joints and bool((root.T_parent_body == np.eye(4)).all())
@@ -228,7 +228,7 @@ def chain_from_tree(tree: TreeBody) -> Chain:
 
     MuJoCo turns a body about each of its joints in order, at the joint's position: T_body J1 J2 ..., with
     J = Trans(p) R(axis, q) Trans(-p). A chain frame has one joint, so a body gets one frame per joint, and a last
-    fixed one where a joint lies off the body's origin; the last frame bears the body's name.
+    fixed one where a joint lies off the body's origin; the last frame has the body's name.
     """
     from pytorch_kinematics.chain import Chain
 

@@ -148,7 +148,7 @@ def distortion_from_ros(model: str, coefficients: Sequence[float]) -> Distortion
 
 
 def distort_points(points: np.ndarray, distortion: Distortion) -> np.ndarray:
-    """Where rays through points (n, 2) of the plane at depth 1 arrive: (x, y) -> (x', y'), by OpenCV."""
+    """Distorts points (n, 2) of the plane at depth 1, (x, y) -> (x', y'), by OpenCV."""
     if distortion.model == "fisheye":
         return cv2.fisheye.distortPoints(points[None], np.eye(3), np.array(distortion.coefficients))[0]
     return _radtan(points, distortion)[0]
@@ -217,7 +217,7 @@ def _radial_inverse(radius: np.ndarray, distortion: Distortion) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """From a lens to a pinhole at the same image size.
+    """Maps from a lens to a pinhole at the same image size.
 
     Attributes:
         K: (3, 3) of the undistorted image, pixels.

@@ -29,7 +29,7 @@ def transform_points(T: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b 3"]
 
 
 def is_rigid(T: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
-    """Whether transforms are finite, orthonormal and right-handed, with last row 0 0 0 1."""
+    """True for transforms that are finite, orthonormal and right-handed, with last row 0 0 0 1."""
     rotation = T[..., :3, :3]
     eye = torch.eye(3, dtype=T.dtype, device=T.device)
     last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=T.dtype, device=T.device)

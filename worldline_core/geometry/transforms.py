@@ -237,14 +237,14 @@ def rigid_inverse(pose: np.ndarray) -> np.ndarray:
 
 
 def lengths(vectors: np.ndarray) -> np.ndarray:
-    """Of vectors (..., k): (...). np.linalg.norm adds along this short axis: up to ten times as long, for the same bits."""
+    """Lengths (...) of vectors (..., k): np.linalg.norm takes up to ten times as long for the same bits."""
     first, *others = np.moveaxis(vectors * vectors, -1, 0)
     return np.sqrt(sum(others, first))
 
 
 @dataclass(frozen=True)
 class RotationRepair:
-    """How many of the poses were given the nearest rotation, and the largest deviation among them."""
+    """Number of poses that were given the nearest rotation, and the largest deviation among them."""
 
     count: int
     largest: float
@@ -283,7 +283,7 @@ def mean_pose(poses: np.ndarray) -> np.ndarray:
 
 
 def hand_eye_residual(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How far a wrist camera is from being fixed to its tool.
+    """Deviation of a wrist camera from a fixed mount on its tool.
 
     Returns: mean T_tool_camera (4, 4); deviations (n,) [m] and (n,) [deg] from it.
     """
