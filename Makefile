@@ -39,7 +39,7 @@ install-scale: install
 	python3 -m venv .bootstrap || { echo "Install Python's venv (Debian: apt-get install python3-venv), or uv (https://docs.astral.sh/uv)"; rm -rf .bootstrap; exit 1; }
 	.bootstrap/bin/pip install --quiet uv
 
-# The recordings that the demo uses, made again from their seeds (needs software GL, see README).
+# The recordings that the demo uses, made again from their seeds (needs software GL, see docs/recorded_worlds.md).
 record: install
 	$(RUN) worldline record --config configs/recording/sample.yaml --output artifacts/recorded
 
