@@ -38,7 +38,8 @@ from worldline_core.calibration.camera_errors import (
     moved_camera,
     significant,
 )
-from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Conclusion, Diagnosis, diagnose_source
+from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, diagnose_source
+from worldline_core.calibration.doctor_config import CalibrationDoctorConfig
 from worldline_core.calibration.evidence import MIN_IMAGE_PAIRS
 from worldline_core.calibration.observation import Observation, observe, read, small_gray
 from worldline_core.data.episodes.conventions import RecordedConventions, applicable

@@ -24,7 +24,8 @@ from worldline_core.calibration.camera_errors import (
     significant,
 )
 from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck, conclusion_lines, verdict_text
-from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis, diagnose_source
+from worldline_core.calibration.diagnosis import Diagnosis, diagnose_source
+from worldline_core.calibration.doctor_config import CalibrationDoctorConfig
 from worldline_core.calibration.observation import Motion
 from worldline_core.calibration.pictures import diagnosis_picture, headline
 from worldline_core.data.episodes.episode import CameraTrack, Episode

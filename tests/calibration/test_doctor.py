@@ -12,7 +12,8 @@ import pytest
 
 from tools.corrupted.conventions import corrupt
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.diagnosis import MAX_GAIN, CalibrationDoctorConfig, Diagnosis, diagnose_source
+from worldline_core.calibration.diagnosis import MAX_GAIN, Diagnosis, diagnose_source
+from worldline_core.calibration.doctor_config import CalibrationDoctorConfig
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError

@@ -16,7 +16,8 @@ from worldline_core.calibration import calibration_doctor
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.check import ListedEpisode, check_command, repairing_lines
 from worldline_core.calibration.check_report import table_text
-from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis, diagnose_source
+from worldline_core.calibration.diagnosis import Diagnosis, diagnose_source
+from worldline_core.calibration.doctor_config import CalibrationDoctorConfig
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import LoadedEpisode

@@ -15,11 +15,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from pydantic import Field
 
+from worldline_core.calibration.doctor_config import ErrorLimits
 from worldline_core.calibration.evidence import MIN_CHANGE, MIN_TEXTURE, observable_views
 from worldline_core.calibration.observation import CELL_PX, Motion, Observation, Reading, cell_centres, cell_means
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import project_points
 from worldline_core.geometry.transforms import lengths, rigid_inverse
@@ -51,17 +50,6 @@ SIMILAR_GAIN = 0.5
 """Kinds of error with at least this share of the best gain are indistinguishable."""
 OUTLIER_DEVIATIONS = 3.0
 """An episode this many standard deviations from the others has half its weight."""
-
-
-class ErrorLimits(StrictModel):
-    """Smallest size of a camera error, and its standard deviations from zero, to be reported."""
-
-    deviations: float = Field(gt=0)
-    rotation: float = Field(gt=0, description="degrees")
-    translation: float = Field(gt=0, description="millimetres")
-    focal_length: float = Field(gt=0, description="percent")
-    principal_point: float = Field(gt=0, description="percent of the image side")
-    lag: float = Field(gt=0, description="frames")
 
 
 @dataclass(frozen=True, eq=False)

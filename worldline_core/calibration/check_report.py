@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
 from collections import Counter
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from pydantic_core import to_jsonable_python
+from pydantic import ConfigDict, TypeAdapter
 
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, SourceDiagnosis
 from worldline_core.pages.page import Table, render, words
@@ -204,7 +205,8 @@ def as_json(check: CalibrationCheck) -> dict[str, Any]:
         for found in check.sources
     ]
     content = {"consistent": check.consistent, "episodes": episodes, "sources": sources}
-    return to_jsonable_python(content, inf_nan_mode="null", fallback=lambda value: np.asarray(value).tolist())
+    numbers = TypeAdapter(Any, config=ConfigDict(ser_json_inf_nan="null"))
+    return json.loads(numbers.dump_json(content, fallback=lambda value: np.asarray(value).tolist()))
 
 
 def _conclusion_json(found: Conclusion) -> dict[str, Any]:

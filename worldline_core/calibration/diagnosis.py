@@ -11,16 +11,15 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
-from worldline_core.calibration.camera_errors import CameraError, ErrorLimits, combine, significant
+from worldline_core.calibration.camera_errors import CameraError, combine, significant
+from worldline_core.calibration.doctor_config import CalibrationDoctorConfig, ErrorLimits
 from worldline_core.calibration.evidence import (
     ARM_FLOW,
     correlation_log_likelihood,
     hand_eye_log_likelihood,
     turn_log_likelihood,
 )
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
 
 VerdictName = Literal["consistent", "off", "explained", "unexplained", "mixed", "too_little_evidence"]
@@ -44,30 +43,6 @@ FEWEST_TOGETHER = 5
 ESTIMATED = {"intrinsics_size", "tool_offset_z_m", "embodiment"}
 """Tried only where an episode suggests them: one that fits as written and does not is evidence against them."""
 NEAREST_SHOWN, TERMS_SHOWN = 3, 3
-
-
-class CalibrationDoctorConfig(StrictModel):
-    """Limits of the calibration doctor's decisions."""
-
-    search: Literal["always", "when_suspicious"] = Field(
-        default="always", description="when_suspicious: try other readings only if the recorded one looks bad"
-    )
-    min_margin: float = Field(
-        default=2.5, gt=0, description="log-likelihood by which a mistake must beat the recording as written"
-    )
-    max_hand_eye_m: float = Field(default=0.012, gt=0, description="a larger hand-eye residual is bad in any reading")
-    off_alone: ErrorLimits = Field(
-        default=ErrorLimits(
-            deviations=5.0, rotation=3.5, translation=80.0, focal_length=9.0, principal_point=7.0, lag=0.6
-        ),
-        description="for one episode",
-    )
-    off_together: ErrorLimits = Field(
-        default=ErrorLimits(
-            deviations=3.0, rotation=1.25, translation=25.0, focal_length=2.2, principal_point=2.0, lag=0.3
-        ),
-        description="for all episodes of a source",
-    )
 
 
 DEFAULT_CONFIG = CalibrationDoctorConfig()

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
@@ -30,7 +31,7 @@ class Pictures(Protocol):
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, indices: list[int]) -> np.ndarray: ...
+    def __getitem__(self, indices: list[int]) -> NDArray[Any]: ...
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Trajectory:
     instruction: str
     frames: Mapping[str, Pictures]
     fps: float
-    points: np.ndarray | None = None
+    points: NDArray[Any] | None = None
 
     @property
     def num_frames(self) -> int:

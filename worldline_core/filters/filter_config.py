@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, JsonValue, model_validator
 
-from worldline_core.calibration.diagnosis import CalibrationDoctorConfig
+from worldline_core.calibration.doctor_config import CalibrationDoctorConfig
 from worldline_core.config import StrictModel, validate
 from worldline_core.errors import ConfigError
 

@@ -162,17 +162,15 @@ def model_card(info: CheckpointInfo, manifest: Mapping[str, Any], license_name: 
     from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
     metrics = _metrics(info, manifest)
-    dataset = {
-        "task_type": "image-to-video",
-        "dataset_type": "robotics",
-        "dataset_name": "the recordings that it was trained on",
-    }
     data = ModelCardData(
         library_name="worldline",
         license=license_name,
         tags=["robotics", "world-model", "image-to-video"],
         model_name=f"WorldLine {info.kind}" if metrics else None,
-        eval_results=[EvalResult(**dataset, metric_type=name, metric_value=value) for name, value in metrics.items()]
+        eval_results=[
+            EvalResult("image-to-video", "robotics", "the recordings that it was trained on", name, value)
+            for name, value in metrics.items()
+        ]
         or None,
     )
     sections = [

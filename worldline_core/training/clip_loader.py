@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -161,7 +162,8 @@ def _memory(size: int) -> Tensor:
     worker = get_worker_info()
     if worker is None:
         return torch.empty(size, dtype=torch.uint8)
-    number = next(_turn) % (worker.dataset.reading.prefetch + 2)
+    clips: Any = worker.dataset
+    number = next(_turn) % (clips.reading.prefetch + 2)
     if number not in _shared or len(_shared[number]) < size:
         _shared[number] = torch.empty(size, dtype=torch.uint8).share_memory_()
     return _shared[number][:size]

@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import ClassVar, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import StrictBool, StrictInt
 
 from worldline_core.errors import DataError
@@ -39,11 +40,11 @@ class CandidateVideo:
         points: (n, arms, 2) projected tool centres at these frames in the head view [px], to start a segmenter.
     """
 
-    frames: Mapping[str, np.ndarray]
+    frames: Mapping[str, NDArray[np.uint8]]
     indices: tuple[int, ...]
     fps: float
     total_frames: int
-    points: np.ndarray | None = None
+    points: NDArray[np.floating] | None = None
 
     @cached_property
     def digest(self) -> str:

@@ -11,10 +11,11 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from worldline_core.evaluation.policy.evidence import (
     SCHEMAS,
@@ -340,8 +341,8 @@ def measure(
     segmenter: Segmenter,
     instruction: str,
     family: EvidenceFamily,
-    frames: Mapping[str, np.ndarray],
-    points: np.ndarray | None,
+    frames: Mapping[str, NDArray[Any]],
+    points: NDArray[Any] | None,
 ) -> Measurement | None:
     """Measure the family's facts on chosen frames (n, h, w, 3) of each view.
 

@@ -218,9 +218,9 @@ class EpisodeMeasurement:
             frames = next(true.pieces)[: count - begin]
             own_points, moved = points[begin : begin + len(frames)], None
             if label_pieces is not None:
-                thing = next(label_pieces)[: len(frames)] == 1
+                thing = np.asarray(next(label_pieces)[: len(frames)] == 1)
                 first_thing = thing[:1] if first_thing is None else first_thing
-                stays = frame_iou(thing, first_thing.repeat(len(thing), 0))
+                stays = frame_iou(thing, np.repeat(first_thing, len(thing), axis=0))
                 moved = thing, (stays < MOVED_IOU) & thing.any(axis=(1, 2))
             robot = None if exact_pieces is None else next(exact_pieces)[: len(frames)]
             masks = true.masks(frames, own_points)
@@ -257,10 +257,8 @@ class EpisodeMeasurement:
         robots = true.masks[""][part]
         if self.finds_tools:
             video.places.append(video.finder.find(robots, found[""], points))
-        video.first = predicted[0] if video.first is None else video.first
-        scene = SceneFrames(
-            true.frames[part], predicted, true.first[0], video.first, robots | found[""] | true.first[1]
-        )
+        first = video.first = np.asarray(predicted[0]) if video.first is None else video.first
+        scene = SceneFrames(true.frames[part], predicted, true.first[0], first, robots | found[""] | true.first[1])
         for name, metric in self.metrics.items():
             if metric.needs == "frames":
                 video.add(**{name: metric.load()(scene)})
