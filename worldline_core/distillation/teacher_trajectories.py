@@ -36,7 +36,7 @@ from worldline_core.distillation.auxiliary_losses import clip_robot_masks
 from worldline_core.distillation.causal_objective import maps_of, with_observed_frame
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ArtifactError, ConfigError
-from worldline_core.model.block_causal_attention import block_bounds
+from worldline_core.model.block_causal_attention import KVCache, block_bounds
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CAUSAL_SHIFT, CausalSpec
 from worldline_core.progress import Progress
@@ -118,7 +118,7 @@ def teacher_trajectories(
         DataError: the clip does not divide into blocks.
     """
     bounds = block_bounds(latents.shape[3], spec.block_size)
-    cache = spec.new_cache(fps)
+    cache = KVCache(spec.sink_blocks, spec.recent_blocks, fps)
     teacher.write_block(latents[..., :1, :, :], cache, action_maps=action_maps[..., :1, :, :], views=views)
     blocks: list[Tensor] = []
     for start, stop in bounds[1:]:

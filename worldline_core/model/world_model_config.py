@@ -17,10 +17,7 @@ from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from worldline_core.actions.episode_tracks import ActionTracks
-    from worldline_core.model.block_causal_attention import KVCache
 
 
 VIEWS = ("head", "left_wrist", "right_wrist")
@@ -266,9 +263,3 @@ class CausalSpec(StrictModel):
     def steps(self) -> int:
         """Euler steps per block."""
         return len(self.sigmas) - 1
-
-    def new_cache(self, fps: Tensor | None = None) -> KVCache:
-        """An empty cache with this window, for clips of ``fps`` frames per second ``(b)``."""
-        from worldline_core.model.block_causal_attention import KVCache
-
-        return KVCache(self.sink_blocks, self.recent_blocks, fps)

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.model.world_model_config import CAUSAL_SHIFT, FULL_STEPS, VIEWS, CausalSpec
 
@@ -197,14 +198,14 @@ class BlockCausalSimulator:
         self.fps = fps
         self.bfloat16 = bfloat16
         self.noise = noise
-        self.cache = spec.new_cache()
+        self.cache = KVCache(spec.sink_blocks, spec.recent_blocks)
         self._unwritten: tuple[Tensor, Tensor | None] | None = None
 
     def start(
         self, first_latents: Float[Tensor, "b v c h w"], action_maps: Float[Tensor, "b v a 1 #h #w"] | None = None
     ) -> None:
         """Begin a rollout at observed latents, with the controls of that frame; forgets any rollout before it."""
-        self.cache = self.spec.new_cache(_rates(self.fps, first_latents))
+        self.cache = KVCache(self.spec.sink_blocks, self.spec.recent_blocks, _rates(self.fps, first_latents))
         self._unwritten = (rearrange(first_latents.float(), "b v c h w -> b v c 1 h w"), action_maps)
 
     @torch.no_grad()
