@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -48,12 +48,13 @@ _TRAJECTORIES = pa.schema(
 
 
 class StoredEpisode(Protocol):
-    """An episode that waits to become a part of a set: its description by key, its arrays, its packed masks."""
+    """An episode that waits to become a part of a set: its arrays, its videos by view, its packed masks."""
 
     @property
     def episode(self) -> Episode: ...
 
-    def __getitem__(self, key: str) -> Any: ...
+    @property
+    def videos(self) -> Mapping[str, Any]: ...
 
     def packed(self, kind: Literal["masks", "things"]) -> dict[str, tuple[list[int], bytes]]: ...
 
