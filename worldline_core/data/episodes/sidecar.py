@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, Episode
+from worldline_core.data.episodes.episode import ARRAYS, CameraTrack
 from worldline_core.data.guards.plain_files import expect_layout, read_json, read_table
 from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
 from worldline_core.data.guards.source_paths import is_file
 from worldline_core.data.video.frames import PACKED, MadeFrames, unpacked_images
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
+
+if TYPE_CHECKING:
+    from worldline_core.data.episodes.episode_parts import Part
 
 FOLDER = Path("meta") / "worldline"
 
@@ -47,19 +50,7 @@ _TRAJECTORIES = pa.schema(
 )
 
 
-class StoredEpisode(Protocol):
-    """An episode that waits to become a part of a set: its arrays, its videos by view, its packed masks."""
-
-    @property
-    def episode(self) -> Episode: ...
-
-    @property
-    def videos(self) -> Mapping[str, Any]: ...
-
-    def packed(self, kind: Literal["masks", "things"]) -> dict[str, tuple[list[int], bytes]]: ...
-
-
-def write_sidecar(root: Path, parts: Sequence[StoredEpisode]) -> None:
+def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
     """Write the sidecar of a dataset whose episode i is parts[i]."""
     folder = root / FOLDER
     cameras, masks, things, trajectories = [], [], [], []
@@ -94,7 +85,7 @@ def write_sidecar(root: Path, parts: Sequence[StoredEpisode]) -> None:
     write_json_atomic(folder / "contract.json", contract(parts[0]))
 
 
-def contract(part: StoredEpisode) -> dict[str, Any]:
+def contract(part: Part) -> dict[str, Any]:
     """Units and conventions of a dataset, stated once."""
     episode = part.episode
     return {
