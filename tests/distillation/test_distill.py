@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from tests.distillation.conftest import write_inputs  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.distillation import teacher_trajectories
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill import distill
 from worldline_core.distillation.distill_config import DistillConfig
