@@ -219,12 +219,13 @@ class EpisodeMeasurement:
             own_points, moved = points[begin : begin + len(frames)], None
             if label_pieces is not None:
                 thing = np.asarray(next(label_pieces)[: len(frames)] == 1)
-                first_thing = thing[:1] if first_thing is None else first_thing
+                first_thing = thing[:1].copy() if first_thing is None else first_thing
                 stays = frame_iou(thing, np.repeat(first_thing, len(thing), axis=0))
                 moved = thing, (stays < MOVED_IOU) & thing.any(axis=(1, 2))
             robot = None if exact_pieces is None else next(exact_pieces)[: len(frames)]
             masks = true.masks(frames, own_points)
-            first = (frames[0], masks[""][0]) if first is None else first
+            if first is None:  # copies: views would keep the whole first piece
+                first = frames[0].copy(), masks[""][0].copy()
             true.add_object(frames, moved)
             if robot is not None:
                 accuracy = {f"robot_iou_exact{suffix}": frame_iou(robot, own) for suffix, own in masks.items()}
@@ -257,7 +258,7 @@ class EpisodeMeasurement:
         robots = true.masks[""][part]
         if self.finds_tools:
             video.places.append(video.finder.find(robots, found[""], points))
-        first = video.first = np.asarray(predicted[0]) if video.first is None else video.first
+        first = video.first = predicted[0].copy() if video.first is None else video.first
         scene = SceneFrames(true.frames[part], predicted, true.first[0], first, robots | found[""] | true.first[1])
         for name, metric in self.metrics.items():
             if metric.needs == "frames":
