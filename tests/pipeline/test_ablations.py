@@ -180,7 +180,9 @@ def test_all_five_run_on_the_smallest_preset(project_root: Path, tmp_path: Path)
         cwd=project_root, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stdout + run.stderr
-    assert sum(line.startswith("| ") for line in run.stdout.splitlines()) == 1 + 1 + len(VARIANTS)  # with the heading
+    assert sum(line.startswith("| ") for line in run.stdout.splitlines()) == 3 + len(
+        VARIANTS
+    )  # heading, rule and the full model
     assert len(list((tmp_path / "train_stage2").glob("*/checkpoint.json"))) == 1 + len(VARIANTS)
     assert len(list((tmp_path / "train_stage1").glob("*/checkpoint.json"))) == 1
     (table,) = (tmp_path / "ablation_table").glob("*/table.parquet")
