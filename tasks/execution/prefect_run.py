@@ -87,7 +87,7 @@ class PrefectRun(Outline):
 
     @property
     def page_folder(self) -> Path:
-        """Where the page of the run, and in the end its report, is found."""
+        """Folder of the page of the run, which becomes its report."""
         return self._store.root / LATEST_REPORT
 
     def __enter__(self) -> Self:
@@ -275,8 +275,7 @@ def _cache_key(_context: TaskRunContext, parameters: dict[str, Any]) -> str:
 
 
 def _is_recorded(key: str, reference: ArtifactReference) -> bool:
-    """Whether Prefect's record of a task is, to the word, what this module has it write: a record names the code that
-    reads it."""
+    """Returns whether Prefect's record of a task is exactly what this module writes: a record names the code that reads it."""
     path = PREFECT_LOCAL_STORAGE_PATH.value() / key
     try:
         record = json.loads(path.read_text())
