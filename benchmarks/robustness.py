@@ -1,12 +1,10 @@
 """Damaged input: is every recording accounted for by its true reason, and does blind damage ever cause an unexpected error?
 
-    python benchmarks/robustness.py accounting [--episodes 2000] [--kills 10]
-    python benchmarks/robustness.py mutations [--cases 2000] [--seed 0] [--layout NAME ...]
+    python benchmarks/robustness.py accounting [--episodes 2000]
+    python benchmarks/robustness.py mutations [--cases 2000] [--seed 0]
 
-- `accounting`: a seeded corpus (LeRobot v2.1, AgiBot World, DROID annotations, MCAP, and the project's own recordings, each in
-  many states of damage) is curated and filtered: kept + quarantined = found, each kind with its true reason. `--kills`
-  does the same work in a process that is killed (SIGKILL) at random moments and started again; its digests must be
-  those of the undisturbed run. Processor time.
+- `accounting`: a seeded corpus (LeRobot v2.1, DROID annotations, MCAP, each in many states of damage) is curated and filtered:
+  kept + quarantined = found, each kind with its true reason. Processor time.
 - `mutations`: each case damages one small file (bytes changed, zeroed, repeated, cut; JSON values exchanged for odd ones), reads
   everything, and puts the file back. Any error that is not the project's own is a bug. A decoder crash ends the
   process: the last line printed names layout and seed.
@@ -14,13 +12,6 @@
 
 from __future__ import annotations
 
-import argparse
-import os
-import random
-import shutil
-import signal
-import subprocess
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -28,13 +19,12 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from benchmarks.harness import RECORDINGS, command_line, print_table, timed
+from benchmarks.harness import command_line, print_table, timed
 from tools.corrupted.corpus import (
+    LAYOUTS,
     Outcome,
     confusion,
-    kinds_per_layout,
     outcomes,
-    read_corpus,
     shares_right,
     write_corpus,
 )
@@ -45,24 +35,6 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.sources.open import SourceConfig
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.store.artifact_files import digest_folder
-from worldline_core.store.atomic import remove_unfinished
-
-
-def work(folder: Path, output: Path) -> None:
-    """Curates and filters after removing what a killed process left unfinished, as the store does."""
-    _, config = read_corpus(folder)
-    remove_unfinished(output)
-    for counts in (
-        curate(config, {}, output / "curated"),
-        filter_episodes(FilterConfig(), {"episodes": output / "curated"}, output / "filtered"),
-    ):
-        if counts["kept"] + counts["quarantined"] != counts["found"]:
-            raise SystemExit(f"the account does not add up: {counts}")
-
-
-def digests(output: Path) -> dict[str, str]:
-    return {step: digest_folder(output / step) for step in ("curated", "filtered")}
 
 
 def report(labels: Sequence[Label], found: Mapping[str, Outcome]) -> bool:
@@ -80,54 +52,22 @@ def report(labels: Sequence[Label], found: Mapping[str, Outcome]) -> bool:
     return not wrong
 
 
-def killed_run(folder: Path, output: Path, kills: int, seconds: float, seed: int) -> None:
-    """Starts the work again and again, killed at a random moment the first `kills` times.
-
-    Args:
-        seconds: wall time of the undisturbed work; each try gets a random share of it.
-    """
-    moments = random.Random(seed)  # noqa: S311
-    command = [sys.executable, __file__, "accounting", "--folder", str(folder), "--work", str(output)]
-    done = 0
-    while done < kills:
-        process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
-        wait = moments.uniform(0.1, 2.0) * seconds / (kills / 2 + 1)
-        try:
-            if process.wait(timeout=wait) != 0:
-                raise SystemExit(f"the work failed by itself after {done} kills")
-            print(f"finished before kill {done + 1}: digests {digests(output)}; once more from the beginning")
-            shutil.rmtree(output)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-            done += 1
-            parts = sum(1 for _ in (output / "curated/run/episodes/parts").glob("[!.]*"))
-            verdicts = sum(1 for _ in (output / "filtered/run/verdicts").glob("*.json"))
-            print(f"kill {done} after {wait:.1f} s: {parts} parts waiting, {verdicts} verdicts", flush=True)
-    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
-    print(f"{done} kills, then through")
-
-
-def measure_accounting(folder: Path, episodes: int, seed: int, kills: int) -> bool:
+def measure_accounting(folder: Path, episodes: int, seed: int) -> bool:
     # As many clean recordings of each layout as of three of its kinds.
-    each = -(-episodes // (kinds_per_layout() + 3 * 4))
-    (labels, _), _, spent = timed(
-        lambda: write_corpus(folder, healthy=3 * each, each=each, seed=seed, own_recordings=RECORDINGS)
-    )
+    each = -(-episodes // (sum(module.KIND_COUNT for module in LAYOUTS) + 3 * len(LAYOUTS)))
+    (labels, config), _, spent = timed(lambda: write_corpus(folder, healthy=3 * each, each=each, seed=seed))
     print(f"wrote {len(labels)} recordings in {spent:.0f} s")
-    _, elapsed, spent = timed(lambda: work(folder, folder / "undisturbed"))
+    curated, filtered = folder / "curated", folder / "filtered"
+    _, _, spent = timed(
+        lambda: (curate(config, {}, curated), filter_episodes(FilterConfig(), {"episodes": curated}, filtered))
+    )
     print(f"curated and filtered in {spent:.0f} s ({1e3 * spent / len(labels):.0f} ms a recording)")
-    found = outcomes(folder / "undisturbed/curated", folder / "undisturbed/filtered")
+    found = outcomes(curated, filtered)
     right = report(labels, found)
     lost, more = {label.episode_id for label in labels} - set(found), set(found) - {x.episode_id for x in labels}
     crashed = sum(outcome.reason == "crashed" for outcome in found.values())
     print(f"lost: {len(lost)}, not in the corpus: {len(more)}, crashed: {crashed}")
-    same = True
-    if kills:
-        killed_run(folder, folder / "killed", kills, elapsed, seed)
-        same = digests(folder / "undisturbed") == digests(folder / "killed")
-        print(f"digests {'are the same' if same else 'DIFFER'}: {digests(folder / 'killed')}")
-    return right and same and not (lost or more or crashed)
+    return right and not (lost or more or crashed)
 
 
 def attack_layout(layout: str, source: Mapping[str, object], cases: int, seed: int) -> bool:
@@ -148,23 +88,14 @@ def main() -> None:
     parser.add_argument("what", choices=("accounting", "mutations"))
     parser.add_argument("--episodes", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kills", type=int, default=0)
     parser.add_argument("--cases", type=int, default=2000, help="mutations of each layout")
-    parser.add_argument("--layout", action="append", help="mutations of this layout; default: all")
-    parser.add_argument("--folder", type=Path, help="where to work; default: a temporary folder, removed at the end")
-    parser.add_argument("--work", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.work is not None:
-        work(arguments.folder, arguments.work)
-        return
     with tempfile.TemporaryDirectory(prefix="worldline-damaged-") as scratch:
-        folder = arguments.folder or Path(scratch)
         if arguments.what == "accounting":
-            right = measure_accounting(folder, arguments.episodes, arguments.seed, arguments.kills)
+            right = measure_accounting(Path(scratch), arguments.episodes, arguments.seed)
         else:
-            sources = write_one_of_each(folder)
-            layouts = arguments.layout or list(sources)
-            clean = [attack_layout(name, sources[name], arguments.cases, arguments.seed) for name in layouts]
+            sources = write_one_of_each(Path(scratch))
+            clean = [attack_layout(name, sources[name], arguments.cases, arguments.seed) for name in sources]
             right = all(clean)
     if not right:
         raise SystemExit(1)

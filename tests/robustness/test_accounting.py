@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
 from tools.corrupted import lerobot_v21
-from tools.corrupted.corpus import confusion, is_right, outcomes, read_corpus, write_corpus
+from tools.corrupted.corpus import confusion, is_right, outcomes, write_corpus
 from tools.corrupted.labels import Label
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_index import read_quarantine
@@ -22,10 +22,7 @@ from worldline_core.filters.filter_config import FilterConfig
 
 @pytest.mark.slow
 def test_every_damaged_recording_is_accounted_for_by_its_true_reason(tmp_path: Path) -> None:
-    written, config = write_corpus(tmp_path, healthy=2, each=1, seed=3)
-    labels, again = read_corpus(tmp_path)
-    assert labels == written
-    assert again == config
+    labels, config = write_corpus(tmp_path, healthy=2, each=1, seed=3)
     assert len({label.kind for label in labels}) >= 40
 
     counts = curate(config, {}, tmp_path / "curated")

@@ -9,9 +9,8 @@ from __future__ import annotations
 import io
 import shutil
 import struct
-import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -218,10 +217,3 @@ def ending(attack: Attack, source: dict[str, Any], folder: Path) -> str:
     finally:
         shutil.rmtree(folder)
     return READ
-
-
-def endings(sources: dict[str, dict[str, Any]], folder: Path) -> Iterator[tuple[Attack, str, float]]:
-    """How each attack ends, and after how many seconds."""
-    for attack in ATTACKS:
-        started = time.monotonic()
-        yield attack, ending(attack, sources[attack.layout], folder / "attacked"), time.monotonic() - started

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tools.corrupted import agibot_world, droid_annotation, lerobot_v21, mcap, recordings
+from tools.corrupted import droid_annotation, lerobot_v21, mcap
 from tools.corrupted.labels import SECOND, Label
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine
-from worldline_core.store.atomic import write_json_atomic
 
-LABELS_FILE = "labels.json"
-CONFIG_FILE = "curate.json"
-_LAYOUTS = (lerobot_v21, agibot_world, droid_annotation, mcap)
+LAYOUTS = (lerobot_v21, droid_annotation, mcap)
 
 
 @dataclass(frozen=True)
@@ -30,55 +26,28 @@ class Outcome:
     reason: str
 
 
-def kinds_per_layout() -> int:
-    """How many recordings one of every kind is, the project's own recordings left out."""
-    return sum(module.KIND_COUNT for module in _LAYOUTS)
-
-
-def write_corpus(
-    folder: Path, *, healthy: int, each: int, seed: int, own_recordings: Path | None = None
-) -> tuple[list[Label], CurateConfig]:
-    """Write a corpus at folder/corpus: of each layout `healthy` clean recordings and `each` of every kind.
-
-    Args:
-        own_recordings: an EpisodeSet whose recordings are spoilt as well, each once; None leaves that layout out.
-    """
+def write_corpus(folder: Path, *, healthy: int, each: int, seed: int) -> tuple[list[Label], CurateConfig]:
+    """Write a corpus at folder/corpus: of each layout `healthy` clean recordings and `each` of every kind."""
     root = folder / "corpus"
     root.mkdir(parents=True)
     random = np.random.default_rng(seed)
     labels: list[Label] = []
     sources: list[dict[str, Any]] = []
-    for module in _LAYOUTS:
+    for module in LAYOUTS:
         found, source = module.write(root / module.__name__.rsplit(".", 1)[1], healthy, each, random)
         ending = f"#source.{len(sources)}"
         labels += [replace(label, episode_id=label.episode_id.replace(SECOND, ending)) for label in found]
         sources.append(source)
-    if own_recordings is not None:
-        found, source = recordings.write(root / "recordings", healthy, each, random, own_recordings)
-        labels += found
-        sources.append(source)
-    config = {"sources": sources}
-    write_json_atomic(folder / LABELS_FILE, [asdict(label) for label in labels])
-    write_json_atomic(folder / CONFIG_FILE, config)
-    return labels, CurateConfig.model_validate(config)
+    return labels, CurateConfig.model_validate({"sources": sources})
 
 
-def read_corpus(folder: Path) -> tuple[list[Label], CurateConfig]:
-    """A corpus written earlier."""
-    listed = json.loads((folder / LABELS_FILE).read_text())
-    labels = [Label(**{**row, "reasons": tuple(row["reasons"])}) for row in listed]
-    return labels, CurateConfig.model_validate_json((folder / CONFIG_FILE).read_text())
-
-
-def outcomes(curated: Path, filtered: Path | None) -> dict[str, Outcome]:
+def outcomes(curated: Path, filtered: Path) -> dict[str, Outcome]:
     """By episode id, from the artifacts of curation and of the filters."""
     result = {row.episode_id: Outcome("curate", row.reason) for row in read_quarantine(curated)}
-    for row in read_index(curated if filtered is None else filtered):
+    for row in read_index(filtered):
         stage2 = Outcome("stage2", row.stage2_reason or "") if not row.stage2_ok else Outcome("kept", "")
-        result.setdefault(row.episode_id.split("@0")[0] if filtered is not None else row.episode_id, stage2)
-    for row in read_quarantine(filtered) if filtered is not None else ():
-        result[row.episode_id] = Outcome("filter", row.reason)
-    return result
+        result.setdefault(row.episode_id.split("@0")[0], stage2)
+    return result | {row.episode_id: Outcome("filter", row.reason) for row in read_quarantine(filtered)}
 
 
 def is_right(label: Label, outcome: Outcome | None) -> bool:

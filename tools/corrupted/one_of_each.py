@@ -11,8 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from tools.corrupted import agibot_world, droid_annotation, lerobot_v21, mcap
-from tools.corrupted.content import FPS, HEIGHT, WIDTH, gripper_motion, joint_motion, pictures
+from tools.corrupted import droid_annotation, lerobot_v21, mcap
+from tools.corrupted.content import FPS, HEIGHT, NUM_FRAMES, WIDTH, gripper_motion, joint_motion, pictures
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.sources.hdf5 import require_h5py
@@ -27,7 +27,7 @@ def write_one_of_each(folder: Path, seed: int = 0) -> dict[str, Source]:
     """Layout -> its `curate.sources[]` entry; each in a folder of its own."""
     random = np.random.default_rng(seed)
     sources: dict[str, Source] = {}
-    for module in (lerobot_v21, agibot_world, droid_annotation, mcap):
+    for module in (lerobot_v21, droid_annotation, mcap):
         name = module.__name__.rsplit(".", 1)[1]
         sources[name] = module.write(folder / name, 1, 0, random)[1]
     own = folder / "episode_set"
@@ -43,6 +43,7 @@ def write_one_of_each(folder: Path, seed: int = 0) -> dict[str, Source]:
         "views": {"observation.images.head": "head"},
     }
     writers: dict[str, Callable[[Path, np.random.Generator], Source]] = {
+        "agibot_world": _agibot_world,
         "robotwin": _robotwin,
         "robomind": _robomind,
         "agibot_gesim": _agibot_gesim,
@@ -57,6 +58,39 @@ def write_one_of_each(folder: Path, seed: int = 0) -> dict[str, Source]:
 
 def _jpegs(random: np.random.Generator) -> list[bytes]:
     return [cv2.imencode(".jpg", image)[1].tobytes() for image in pictures(random, _LENGTH)]
+
+
+def _agibot_world(root: Path, random: np.random.Generator) -> Source:
+    arrays = root / "proprio_stats/327/100000"
+    videos = root / "observations/327/100000/videos"
+    parameters = root / "parameters/327/100000/parameters/camera"
+    for folder in (arrays, videos, parameters, root / "task_info"):
+        folder.mkdir(parents=True)
+    motion = joint_motion(random, 14)
+    opening = np.stack([gripper_motion(random) for _ in range(2)], axis=1)
+    half = 0.5 * joint_motion(random, 2)
+    orientation = np.stack([np.sin(half), np.zeros_like(half), np.zeros_like(half), np.cos(half)], axis=-1)
+    with require_h5py().File(arrays / "proprio_stats.h5", "w") as file:
+        file["timestamp"] = 1_718_000_000_000_000_000 + np.rint(np.arange(NUM_FRAMES) * 1e9 / FPS).astype(np.int64)
+        file["state/joint/position"] = motion
+        file["state/effector/position"] = 120 - 85 * opening
+        file["state/end/position"] = np.stack([motion[:, :3], motion[:, 3:6]], axis=1)
+        file["state/end/orientation"] = orientation
+        file["action/joint/position"] = motion + 0.002
+        file["action/effector/position"] = 1 - opening
+    for index, camera in enumerate(("head", "hand_left", "hand_right")):
+        encode_video(videos / f"{camera}_color.mp4", pictures(random), FPS, preset="ultrafast")
+        intrinsic = {"fx": 80.0 + index, "fy": 81.0, "ppx": 47.5, "ppy": 35.5}
+        (parameters / f"{camera}_intrinsic_params.json").write_text(json.dumps({"intrinsic": intrinsic}))
+        poses = [
+            {"rotation_matrix": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], "translation_vector": [0.1, 0.01 * n, 1.2]}
+            for n in range(1 if camera == "head" else NUM_FRAMES)
+        ]
+        listed = json.dumps([{"extrinsic": pose} for pose in poses])
+        (parameters / f"{camera}_extrinsic_params_aligned.json").write_text(listed)
+    rows = [{"episode_id": 100_000, "task_id": 327, "task_name": "Pick up the block", "label_info": {}}]
+    (root / "task_info/task_327.json").write_text(json.dumps(rows))
+    return {"kind": "agibot_world", "name": root.name, "fps": FPS, "split": "train"}
 
 
 def _robotwin(root: Path, random: np.random.Generator) -> Source:

@@ -63,11 +63,7 @@ def arm_spec(robot: Robot) -> Any:
     folder = ROBOTS_FOLDER / robot.model
     path = folder / "arm.xml"
     if not path.is_file():
-        raise DataError(
-            "Robot model not found",
-            where=path,
-            next_step="write it with: uv run tools/import_robots.py artifacts/shipped/robots",
-        )
+        raise DataError("Robot model not found", where=path, next_step="restore artifacts/shipped/robots")
     spec = mujoco.MjSpec.from_file(str(path))
     spec.meshdir = ""
     for mesh in spec.meshes:
