@@ -11,8 +11,7 @@ from tasks.execution.prefect_artifacts import show_in_prefect
 from tasks.execution.prefect_run import PrefectRun
 from tasks.report import report
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.report.comparison import NightlyComparison
-from worldline_core.report.nightly import compare_with_history, refuse_regressions
+from worldline_core.report.comparison import NightlyComparison, compare_with_history, refuse_regressions
 
 
 @task(name="compare_nights", persist_result=False)

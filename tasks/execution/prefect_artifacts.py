@@ -19,7 +19,7 @@ from prefect.artifacts import create_image_artifact, create_link_artifact, creat
 
 from tasks.execution.prefect_run import ArtifactReference
 from worldline_core.errors import UnavailableError, WorldLineError
-from worldline_core.report.comparison import collect_metrics
+from worldline_core.evaluation.paired import collect_metrics
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ Many series are compared at once, and some of them always look bad by chance. `p
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,16 @@ import pyarrow as pa
 
 from worldline_core.errors import ArtifactError
 from worldline_core.evaluation.metric_registry import METRICS, metric_of
-from worldline_core.evaluation.scores import SCORES_FILE, TRUE_METHOD, Score, table_schema, write_table
-from worldline_core.store.artifact_files import read_table
+from worldline_core.evaluation.scores import (
+    SCORES_FILE,
+    SUMMARY_FILE,
+    TRUE_METHOD,
+    Interval,
+    Score,
+    table_schema,
+    write_table,
+)
+from worldline_core.store.artifact_files import JsonObject, read_json, read_table
 
 Series = dict[str, dict[str, float]]
 """By name of the series, the value of each recording."""
@@ -54,6 +62,38 @@ class PairedTest:
     p_worse: float
     p_better: float
     worst: tuple[tuple[str, float], ...]
+
+
+def collect_metrics(inputs: Mapping[str, Path]) -> dict[str, Interval]:
+    """Intervals of finished evaluations by name, ``<what>/<where>/<method>/<metric>``: ``video/test/shipped_stage2/ssim@head``.
+
+    Whole splits and every number of candidates; embodiments and task families would only add false alarms.
+
+    Args:
+        inputs: folders by step name, a variant after a dot; other steps than evaluations are ignored.
+    """
+    found: dict[str, Interval] = {}
+    for name, folder in sorted(inputs.items()):
+        step, _, variant = name.partition(".")
+        if step in EVALUATIONS:
+            what = ".".join(part for part in (step.removeprefix("evaluate_"), variant) if part)
+            for place, value in _intervals(step, read_json(folder / SUMMARY_FILE)):
+                found[f"{what}/{place}"] = Interval(*(value[field.name] for field in fields(Interval)))
+    return found
+
+
+def _intervals(step: str, summary: JsonObject) -> Iterator[tuple[str, Any]]:
+    if step == "evaluate_video":
+        for split, methods in summary.get("metrics", {}).items():
+            for method, metrics in methods.items() if "/" not in split else ():
+                yield from ((f"{split}/{method}/{metric}", value) for metric, value in metrics.items())
+        return
+    for method, values in summary.get("methods", {}).items():
+        for group, value in (values if step == "evaluate_policy" else values["budgets"]).items():
+            if step == "evaluate_planning":
+                yield f"N={group}/{method}/success", value["success"]
+            elif "/" not in group and value.get("accuracy") is not None:
+                yield f"{group}/{method}/accuracy", value["accuracy"]
 
 
 def read_scores(folder: Path, *, subgroups: bool = False) -> Series:

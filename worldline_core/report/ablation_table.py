@@ -18,10 +18,9 @@ from pydantic import Field
 
 from worldline_core.config import StrictModel, read_yaml, validate
 from worldline_core.errors import ArtifactError
-from worldline_core.evaluation.paired import read_scores
+from worldline_core.evaluation.paired import collect_metrics, read_scores
 from worldline_core.evaluation.scores import SUMMARY_FILE, Interval, paired_difference
 from worldline_core.pages.page import Table, interval, render
-from worldline_core.report.comparison import collect_metrics
 from worldline_core.store.artifact_files import read_json, row_schema
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic
 

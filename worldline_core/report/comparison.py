@@ -1,35 +1,32 @@
-"""Paired comparisons of evaluations: two runs, or a night with the good nights before it.
+"""Paired comparisons of evaluations: two runs, or a night with the good nights before it; and the page of the nights.
 
-Series of scores by recording and their joint test are in `evaluation.paired`. A night is tested in three ways, all metrics and ways
-together; the probability that any turns red on a night without a change is FALSE_ALARM:
-
-- ``step``: the mean difference to the last good night;
-- ``level``: the mean difference to each recording's median over the last DRIFT_NIGHTS good nights;
-- ``drift``: the trend of each recording (least squares) over these nights and this one.
-
-`history.jsonl` has a JSON object a line, oldest night first: `{"night": "2026-11-21", "good": true, "metrics": {name: {mean, low,
-high, count}}}`; the scores by recording are in `scores/`, a Parquet file a night. A night with regressions is not good: later
-nights are compared with the same reference until the loss is repaired or accepted.
+A night is compared with each recording's median over the last REFERENCE_NIGHTS good nights. All metrics are tested together
+(`evaluation.paired`); FALSE_ALARM is the probability that any turns red on a night without a change. A red night is not good:
+later nights are compared with the same reference until the loss is repaired or accepted.
 """
 
 from __future__ import annotations
 
-import json
-import math
+import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
+from markupsafe import Markup
+from pydantic import ValidationError
 
-from worldline_core.errors import ArtifactError, ConfigError
-from worldline_core.evaluation.metric_registry import metric_of
+from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import ArtifactError, ConfigError, RegressionError
 from worldline_core.evaluation.paired import (
     EVALUATIONS,
     PairedTest,
     Series,
+    collect_metrics,
     differences,
     margin_of,
     paired_tests,
@@ -38,73 +35,27 @@ from worldline_core.evaluation.paired import (
     sign_of,
     write_series,
 )
-from worldline_core.evaluation.scores import SCORES_FILE, SUMMARY_FILE, Interval
-from worldline_core.store.artifact_files import (
-    MANIFEST_NAME,
-    JsonObject,
-    digest_value,
-    linked_folder,
-    read_json,
-    read_json_lines,
-)
-from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.evaluation.recordings import HEAD
+from worldline_core.evaluation.scores import SCORES_FILE, Interval
+from worldline_core.pages import charts
+from worldline_core.pages.page import Table, code, interval, render, words
+from worldline_core.pictures import contact_sheet, jpeg_bytes
+from worldline_core.report.videos import compared_rows
+from worldline_core.rollout.rollout_set import RolloutSet
+from worldline_core.store.artifact_files import MANIFEST_NAME, digest_value, linked_folder, read_json
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import exclusive_lock
 from worldline_core.untrusted_text import visible
 
 FALSE_ALARM = 0.02
-DRIFT_NIGHTS = 7
-LEAST_NIGHTS = 4
-"""Level and drift are tested from so many good nights on."""
+REFERENCE_NIGHTS = 7
+HISTORY_FILE = "history.jsonl"
+"""A `Night` a line, oldest first; its scores by recording are in `scores/`."""
+PICTURES = "pictures"
+HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "accuracy", "success")
+MOST_CHARTS, MOST_LINES, MOST_TICKS, MOST_PICTURES = 8, 8, 8, 4
 
 Verdict = Literal["better", "worse", "same", "new", "missing"]
-
-
-def collect_metrics(inputs: Mapping[str, Path]) -> dict[str, Interval]:
-    """Intervals of finished evaluations by name, ``<what>/<where>/<method>/<metric>``: ``video/test/shipped_stage2/ssim@head``.
-
-    Whole splits and every number of candidates; embodiments and task families would only add false alarms. Metrics without a
-    finite mean and bounds are left out.
-
-    Args:
-        inputs: folders by step name, a variant after a dot; other steps than evaluations are ignored.
-
-    Raises:
-        ArtifactError: a summary has another form than its evaluation writes.
-    """
-    found: dict[str, Interval] = {}
-    for name, folder in sorted(inputs.items()):
-        step, _, variant = name.partition(".")
-        path = folder / SUMMARY_FILE
-        summary = read_json(path) if step in EVALUATIONS else {}
-        what = ".".join(part for part in (step.removeprefix("evaluate_"), variant) if part)
-        try:
-            for where, method, metric, value in _intervals(step, summary):
-                numbers = [value.get(key) for key in ("mean", "low", "high")] if isinstance(value, dict) else []
-                finite = [float(n) for n in numbers if isinstance(n, (int, float)) and math.isfinite(n)]
-                if len(finite) == 3:
-                    mean, low, high = finite
-                    found[f"{what}/{where}/{method}/{metric}"] = Interval(mean, low, high, int(value.get("count", 0)))
-        except (AttributeError, TypeError, ValueError, OverflowError) as error:
-            raise ArtifactError(
-                "A summary of an evaluation has another form",
-                where=path,
-                expected="by group or method the mean, low, high and count of each metric",
-                got=str(error),
-                next_step=f"delete {folder}, then the same command writes it again",
-            ) from error
-    return found
-
-
-def _intervals(step: str, summary: JsonObject) -> Iterator[tuple[str, str, str, Any]]:
-    if step == "evaluate_video":
-        for split, methods in summary.get("metrics", {}).items():
-            for method, metrics in methods.items() if "/" not in split else ():
-                yield from ((split, method, metric, value) for metric, value in metrics.items())
-    for method, values in summary.get("methods", {}).items() if step != "evaluate_video" else ():
-        if step == "evaluate_policy":
-            yield from ((g, method, "accuracy", v.get("accuracy")) for g, v in values.items() if "/" not in g)
-        else:
-            yield from ((f"N={n}", method, "success", v.get("success")) for n, v in values.get("budgets", {}).items())
 
 
 # Two runs
@@ -140,12 +91,12 @@ def read_run(place: str) -> Series:
     """
     folder, _, night = place.rpartition(":")
     if folder and not Path(place).exists():
-        return read_night(Path(folder), night)
+        _require_night(read_history(Path(folder)), night)
+        return read_series(scores_file(Path(folder), night))
     path = Path(place)
     if (path / SCORES_FILE).is_file():
         return read_scores(path, subgroups=True)
-    inputs = read_json(path / MANIFEST_NAME).get("inputs")
-    names = [name for name in inputs if name.partition(".")[0] in EVALUATIONS] if isinstance(inputs, dict) else []
+    names = [n for n in read_json(path / MANIFEST_NAME).get("inputs") or () if n.partition(".")[0] in EVALUATIONS]
     folders = [folder for name in names if (folder := linked_folder(path, name)) is not None]
     if not folders or len(folders) < len(names):
         raise ArtifactError(
@@ -167,43 +118,33 @@ def compare_runs(
 
     Raises:
         ArtifactError: a run has no scores.
-        ConfigError: the runs share no method or no recording.
+        ConfigError: the runs share no recording, method and metric.
     """
-    runs = [read_run(first), read_run(second)]
+    runs = read_run(first), read_run(second)
+    named = [sorted({name.split("/")[2] for name in run}) for run in runs]
     if methods is not None:
-        runs = [_of_method(run, method) for run, method in zip(runs, methods, strict=True)]
-    found = differences(*runs)
-    known = sorted({name.split("/", 3)[3] for name in found})
-    if unknown := set(metrics) - set(known):
-        raise ConfigError("Metrics that not both runs have", expected=f"some of {known}", got=sorted(unknown))
-    found = {name: values for name, values in found.items() if not metrics or name.split("/", 3)[3] in metrics}
+        runs = tuple(
+            {name.replace(f"/{method}/", "/*/", 1): v for name, v in run.items() if name.split("/")[2] == method}
+            for run, method in zip(runs, methods, strict=True)
+        )
+    found = {n: v for n, v in differences(*runs).items() if not metrics or n.split("/", 3)[3] in metrics}
     if not found:
-        named = [sorted({name.split("/")[2] for name in run}) for run in runs]
         raise ConfigError(
-            "The runs have no recording and method in common", where=f"{first} and {second}", got=f"{named[0]} and {named[1]}",
+            "The runs have no recording, method and metric in common", where=f"{first} and {second}",
+            got=f"methods {named[0]} and {named[1]}",
             next_step="compare runs over the same recordings; --methods A B pairs methods of other names",
         )  # fmt: skip
-    rows = []
-    together = paired_tests(found)
+    rows, together = [], paired_tests(found)
     for name, test in paired_tests(found, least=1).items():
         what, group, method, metric = name.split("/", 3)
         means = [sum(run[name][r] for r in found[name]) / test.count for run in runs]
-        entry = metric_of(metric)
-        low, high = (-test.high, -test.low) if entry and entry.lower_is_better else (test.low, test.high)
+        low, high = sorted((sign_of(name) * test.low, sign_of(name) * test.high))
         joint = together.get(name)
         better = "first" if joint and joint.p_better <= 0.05 else "second" if joint and joint.p_worse <= 0.05 else ""
         label = method if methods is None else f"{methods[0]} - {methods[1]}"
         values = means[0], means[1], means[0] - means[1], low, high
         rows.append(Difference(what, group.replace("|", "/"), label, metric, *values, test.count, better))
     return rows
-
-
-def _of_method(run: Series, method: str) -> Series:
-    parts = {name: name.split("/", 3) for name in run}
-    kept = {f"{p[0]}/{p[1]}/*/{p[3]}": run[name] for name, p in parts.items() if p[2] == method}
-    if not kept:
-        raise ConfigError("No such method", expected=f"one of {sorted({p[2] for p in parts.values()})}", got=method)
-    return kept
 
 
 def as_table(rows: Sequence[Difference]) -> str:
@@ -217,125 +158,73 @@ def as_table(rows: Sequence[Difference]) -> str:
         for r in rows
     ]  # fmt: skip
     lines = [tuple(map(visible, line)) for line in lines]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(heading))]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(text.ljust(w) for text, w in zip(line, widths, strict=True)).rstrip() for line in lines)
 
 
 # A night and the nights before it
 
 
-class Tested(NamedTuple):
-    """Verdict on one metric, and the question (``step``, ``level`` or ``drift``) and test that decided it."""
+class Night(StrictModel):
+    """Means of one night with 95 % intervals over trajectories, by metric; only good nights are compared with later ones."""
 
-    verdict: Verdict
-    question: str
-    test: PairedTest
+    night: str
+    metrics: dict[str, Interval]
+    good: bool = True
 
 
 @dataclass(frozen=True)
 class Change:
     """One metric beside the last good night; None where one of the two did not measure it.
 
-    ``tested`` is None for metrics without scores by recording; their mean is held against the interval of the good night.
+    ``test`` is None for metrics of too few recordings; their mean is compared with the interval of the good night.
     """
 
     metric: str
     present: Interval | None
     previous: Interval | None
-    tested: Tested | None = None
+    test: PairedTest | None = None
 
     @property
     def verdict(self) -> Verdict:
-        if self.previous is None:
-            return "new"
-        if self.present is None:
-            return "missing"
-        if self.tested is not None:
-            return self.tested.verdict
+        if self.previous is None or self.present is None:
+            return "new" if self.previous is None else "missing"
+        if self.test is not None:
+            return verdict_of(self.metric, self.test)
         if self.previous.low <= self.present.mean <= self.previous.high:
             return "same"
         return "better" if (self.present.mean > self.previous.high) == (sign_of(self.metric) > 0) else "worse"
 
     @property
-    def worst(self) -> tuple[tuple[str, float], ...]:
-        """The recordings that lost most, where the metric became worse and they are known."""
-        return self.tested.test.worst if self.tested and self.tested.verdict == "worse" else ()
+    def worst(self) -> str:
+        """The recordings that lost most, where the metric became worse."""
+        lost = self.test.worst if self.test and self.verdict == "worse" else ()
+        return ", ".join(f"{recording} ({value:+.3f})" for recording, value in lost)
 
     def __str__(self) -> str:
-        if self.tested is None or self.tested.verdict != "worse":
+        if not self.worst or self.test is None:
             return f"{self.metric} ({self.verdict})"
-        test = self.tested.test
-        worst = ", ".join(f"{recording} ({value:+.3f})" for recording, value in test.worst)
-        bounds = f"[{test.low:+.3f}, {test.high:+.3f}]"
-        return f"{self.metric}: {self.tested.question} {test.mean:+.3f} {bounds} on {test.count} recordings, most on {worst}"
+        low, mean, high, count = self.test.low, self.test.mean, self.test.high, self.test.count
+        return f"{self.metric}: {mean:+.3f} [{low:+.3f}, {high:+.3f}] on {count} recordings, most on {self.worst}"
 
 
-def compare_series(present: Series, earlier: Sequence[Series]) -> dict[str, Tested]:
-    """Verdicts on every metric that this and the last good night have scores of by recording.
+def verdict_of(metric: str, test: PairedTest) -> Verdict:
+    """The verdict on a tested metric: a change counts where it is larger than the margin and than chance explains."""
+    if abs(test.mean) <= margin_of(metric) or min(test.p_worse, test.p_better) > FALSE_ALARM:
+        return "same"
+    return "worse" if test.mean < 0 else "better"
 
-    Args:
-        earlier: the good nights before the present one, oldest first, at least one.
-    """
-    asked = {"step": differences(present, earlier[-1])}
-    if len(earlier) >= LEAST_NIGHTS:
-        several = earlier[-DRIFT_NIGHTS:]
-        asked |= {"level": differences(present, medians(several)), "drift": trends([*several, present])}
-    tests = paired_tests({f"{q}:{name}": values for q, found in asked.items() for name, values in found.items()})
-    of_metric = {
-        name: {q: tests[f"{q}:{name}"] for q in asked if f"{q}:{name}" in tests}
-        for name in asked["step"]
-        if f"step:{name}" in tests
+
+def night_tests(present: Series, good: Sequence[Series]) -> dict[str, PairedTest]:
+    """Tests of a night's differences to the median of each recording over the good nights before it, oldest first."""
+    nights = good[-REFERENCE_NIGHTS:]
+    medians = {
+        name: {
+            r: float(np.median([night[name][r] for night in nights if r in night.get(name, ())])) for r in recordings
+        }
+        for name, recordings in (nights[-1].items() if nights else ())
     }
-    return {name: _decide(found, margin_of(name)) for name, found in of_metric.items()}
-
-
-def _decide(tests: Mapping[str, PairedTest], margin: float) -> Tested:
-    losses = [(test.p_worse, q) for q, test in tests.items() if test.p_worse <= FALSE_ALARM and -test.mean > margin]
-    if losses:
-        question = min(losses)[1]
-        return Tested("worse", question, tests[question])
-    step = tests["step"]
-    return Tested("better" if step.p_better <= FALSE_ALARM and step.mean > margin else "same", "step", step)
-
-
-def _shared(nights: Sequence[Series]) -> Iterator[tuple[str, list[str]]]:
-    """Series that all nights have, with the recordings that all have of it."""
-    for name in sorted(set[str].intersection(*(set(night) for night in nights))):
-        recordings = sorted(set[str].intersection(*(set(night[name]) for night in nights)))
-        if recordings:
-            yield name, recordings
-
-
-def medians(nights: Sequence[Series]) -> Series:
-    """The median of each recording over several nights."""
-    return {
-        name: {r: float(np.median([night[name][r] for night in nights])) for r in recordings}
-        for name, recordings in _shared(nights)
-    }
-
-
-def trends(nights: Sequence[Series]) -> Series:
-    """The gain of each recording from the first to the last of several nights, by a line through its values."""
-    time = np.linspace(-1.0, 1.0, len(nights))
-    weights = 2 * time / (time**2).sum()
-    return {
-        name: {r: sign_of(name) * float(weights @ [night[name][r] for night in nights]) for r in recordings}
-        for name, recordings in _shared(nights)
-    }
-
-
-# The history of nights
-
-HISTORY_FILE = "history.jsonl"
-
-
-@dataclass(frozen=True)
-class Night:
-    """Means of one night with 95 % intervals over trajectories, by metric; only good nights are compared with later ones."""
-
-    night: str
-    metrics: Mapping[str, Interval]
-    good: bool = True
+    return paired_tests(differences(present, medians))
 
 
 @dataclass(frozen=True)
@@ -370,19 +259,14 @@ def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -
     """
     metrics = collect_metrics(inputs)
     if not metrics:
-        raise ArtifactError(
-            "A night without scores",
-            where=night,
-            expected=f"inputs named {', '.join(EVALUATIONS)}",
-            got=", ".join(sorted(inputs)) or "none",
-        )
+        raise ArtifactError("A night without scores", where=night, expected=EVALUATIONS, got=sorted(inputs))
     series = _series(inputs)
     with exclusive_lock(history / ".lock"):
         nights = read_history(history)
         known = {found.night: index for index, found in enumerate(nights)}
         name = night or time.strftime("%Y-%m-%d", time.gmtime())
         if name in known and nights[known[name]].metrics == metrics:
-            return compare_nights(nights[: known[name] + 1], history)
+            return _compare(nights[known[name]], nights[: known[name]], history)
         if name in known and night is not None:
             raise ArtifactError(
                 "This night is recorded with other scores", where=history / HISTORY_FILE, got=name,
@@ -391,20 +275,18 @@ def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -
         if name in known:
             name = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime())
         write_series(scores_file(history, name), series)
-        compared = compare_nights([*nights, Night(name, metrics)], history)
-        _write_history(history, [*nights, Night(name, metrics, good=not compared.regressions)])
+        compared = _compare(Night(night=name, metrics=metrics), nights, history)
+        _write_history(history, [*nights, Night(night=name, metrics=metrics, good=not compared.regressions)])
         return compared
 
 
-def compare_nights(nights: Sequence[Night], history: Path) -> NightlyComparison:
-    """The last of several nights against the good ones before it."""
-    present = nights[-1]
-    good = [night for night in nights[:-1] if night.good]
+def _compare(present: Night, earlier: Sequence[Night], history: Path) -> NightlyComparison:
+    good = [night for night in earlier if night.good]
     before = good[-1].metrics if good else {}
+    series = [read_series(scores_file(history, night.night)) for night in [*good[-REFERENCE_NIGHTS:], present]]
+    tests = night_tests(series[-1], series[:-1])
     names = sorted({*present.metrics, *before})
-    earlier = [read_series(scores_file(history, night.night)) for night in good[-DRIFT_NIGHTS:]]
-    tested = compare_series(read_series(scores_file(history, present.night)), earlier) if earlier else {}
-    changes = [Change(name, present.metrics.get(name), before.get(name), tested.get(name)) for name in names]
+    changes = [Change(name, present.metrics.get(name), before.get(name), tests.get(name)) for name in names]
     return NightlyComparison(present.night, good[-1].night if good else None, changes)
 
 
@@ -416,25 +298,14 @@ def accept_night(history: Path, night: str) -> None:
     """
     with exclusive_lock(history / ".lock"):
         nights = read_history(history)
-        _require_night(history, nights, night)
-        _write_history(history, [replace(found, good=found.good or found.night == night) for found in nights])
+        _require_night(nights, night)
+        accepted = [found.model_copy(update={"good": found.good or found.night == night}) for found in nights]
+        _write_history(history, accepted)
 
 
-def read_night(history: Path, night: str) -> Series:
-    """The scores by recording of a recorded night.
-
-    Raises:
-        ArtifactError: there is no such night, or the history is damaged.
-    """
-    _require_night(history, read_history(history), night)
-    return read_series(scores_file(history, night))
-
-
-def _require_night(history: Path, nights: Sequence[Night], night: str) -> None:
+def _require_night(nights: Sequence[Night], night: str) -> None:
     if night not in (names := [found.night for found in nights]):
-        raise ArtifactError(
-            "No such night", where=history / HISTORY_FILE, expected=", ".join(names) or "a history", got=night
-        )
+        raise ArtifactError("No such night", expected=", ".join(names) or "a history", got=night)
 
 
 def _series(inputs: Mapping[str, Path]) -> Series:
@@ -455,8 +326,7 @@ def scores_file(history: Path, night: str) -> Path:
 
 
 def _write_history(history: Path, nights: Sequence[Night]) -> None:
-    lines = [json.dumps(asdict(night), sort_keys=True, allow_nan=False) for night in nights]
-    write_bytes_atomic(history / HISTORY_FILE, ("\n".join(lines) + "\n").encode())
+    write_bytes_atomic(history / HISTORY_FILE, "".join(f"{night.model_dump_json()}\n" for night in nights).encode())
 
 
 def read_history(history: Path) -> list[Night]:
@@ -466,27 +336,117 @@ def read_history(history: Path) -> list[Night]:
         ArtifactError: a line is not a night.
     """
     path = history / HISTORY_FILE
-    nights: list[Night] = []
-    for row in read_json_lines(path, atomic=True):
-        try:
-            nights.append(_night(row))
-            if any(nights[-1].night == other.night for other in nights[:-1]):
-                raise ValueError(f"the night {nights[-1].night} a second time")
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
-            raise ArtifactError(
-                "A line of the history is not a night",
-                where=path,
-                expected="night, good, and metrics of mean, low, high, count",
-                got=str(error),
-            ) from error
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
+    try:
+        nights = [Night.model_validate_json(line, strict=True) for line in lines]
+        if twice := [name for name, count in Counter(night.night for night in nights).items() if count > 1]:
+            raise ValueError(f"a second time: {twice}")
+    except ValueError as error:
+        got = error.errors(include_url=False)[0]["msg"] if isinstance(error, ValidationError) else error
+        raise ArtifactError("A line of the history is not a night", where=path, got=got) from error
     return nights
 
 
-def _night(row: JsonObject) -> Night:
-    night = Night(row["night"], {name: Interval(**v) for name, v in row["metrics"].items()}, row["good"])
-    numbers = [number for value in night.metrics.values() for number in asdict(value).values()]
-    if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
-        raise ValueError("a value that is not a finite number")
-    if not isinstance(night.night, str) or not isinstance(night.good, bool):
-        raise TypeError("night must be a text, good true or false")
-    return night
+# The page of the nights
+
+
+def compare_with_history(
+    scores: Mapping[str, Path], history: Path, night: str | None = None, artifacts: Mapping[str, Path] | None = None
+) -> NightlyComparison:
+    """Record a night, and write `comparison.json`, pictures and the page with trends into the history's folder.
+
+    Args:
+        scores: finished evaluations by step name.
+        night: its name, as in `record_night`.
+        artifacts: ``filter`` (the episodes) and ``rollout.<method>`` of this night, for pictures.
+
+    Raises:
+        ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
+    """
+    compared = record_night(history, night, scores)
+    compared = replace(compared, pictures=_write_pictures(history, compared, artifacts or {}))
+    changes = [asdict(change) | {"verdict": change.verdict} for change in compared.changes]
+    content = asdict(compared) | {"changes": changes, "regressions": compared.regressions}
+    write_json_atomic(history / "comparison.json", content)
+    nights = read_history(history)
+    page = render(
+        "report/nights.html", title="WorldLine nightly evaluation", compared=compared, nights=nights, charts=_trends(nights),
+        tables=[_changes(compared, verdict) for verdict in ("worse", "missing", "better")],
+    )  # fmt: skip
+    write_bytes_atomic(history / "index.html", page.encode())
+    return compared
+
+
+def refuse_regressions(compared: NightlyComparison, history: Path) -> None:
+    """Raises RegressionError, which names the metrics, for a night that became worse."""
+    if compared.regressions:
+        raise RegressionError(
+            f"{len(compared.regressions)} of {len(compared.changes)} metrics became worse than in {compared.previous}",
+            where=history / "index.html",
+            got="; ".join(str(change) for change in compared.worse)
+            + (f"; pictures: {', '.join(compared.pictures.values())}" if compared.pictures else ""),
+            next_step=f"find the cause; if this is the new normal: worldline nightly --accept {compared.night}",
+        )
+
+
+def _write_pictures(history: Path, compared: NightlyComparison, artifacts: Mapping[str, Path]) -> dict[str, str]:
+    """Head views of the recordings that lost most, or of each method's first recording; replaces those of the night before."""
+    shutil.rmtree(history / PICTURES, ignore_errors=True)
+    rollouts = {
+        name.partition(".")[2]: RolloutSet.open(path) for name, path in artifacts.items() if name.startswith("rollout.")
+    }
+    if "filter" not in artifacts or not rollouts:
+        return {}
+    episodes = EpisodeSet.open(artifacts["filter"])
+    recorded = {row.episode_id for row in episodes.rows}
+    tests = [(change.metric.split("/")[2], change.test) for change in compared.worse if change.test]
+    lost = [(method, recording) for method, test in tests for recording, _ in test.worst]
+    written: dict[str, str] = {}
+    for method, recording in lost or [(name, rollout.episode_ids[0]) for name, rollout in rollouts.items()]:
+        rollout, what = rollouts.get(method), f"{recording}, {method}"
+        if rollout is None or recording not in recorded or what in written or HEAD not in rollout.views(recording):
+            continue
+        written[what] = f"{PICTURES}/{digest_value([compared.night, what])[:16]}.jpg"
+        sheet = contact_sheet(
+            compared_rows(rollout, episodes, recording, [HEAD]), title=f"{compared.night}: {recording}"
+        )
+        write_bytes_atomic(history / written[what], jpeg_bytes(sheet))
+        if len(written) == MOST_PICTURES:
+            break
+    return written
+
+
+def _changes(compared: NightlyComparison, verdict: Verdict) -> Table | None:
+    rows = [
+        [
+            code(c.metric),
+            *(interval(None if value is None else asdict(value), 3) for value in (c.previous, c.present)),
+            None if c.test is None else interval(asdict(c.test), 3, signed=True),
+            c.worst,
+        ]
+        for c in compared.changes
+        if c.verdict == verdict
+    ]
+    headings = "Metric", "Last good night", "This night", "Difference on the same recordings", "Most on"
+    return Table(headings, rows, [1, 2, 3], verdict.capitalize()) if rows else None
+
+
+def _trends(nights: Sequence[Night]) -> list[Markup]:
+    """Headline metrics over the nights: a chart per metric and split, a line per method."""
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for name in sorted({name for night in nights for name in night.metrics}):
+        what, group, _, metric = name.split("/", 3)
+        if metric.startswith(HEADLINES):
+            grouped.setdefault((f"{what}, {group}", metric), []).append(name)
+    shown = []
+    for (where, metric), members in sorted(grouped.items())[:MOST_CHARTS]:
+        lines = []
+        for index, name in enumerate(members[:MOST_LINES]):
+            points = [(float(i + 1), night.metrics[name]) for i, night in enumerate(nights) if name in night.metrics]
+            x, means, low, high = zip(*((i, v.mean, v.low, v.high) for i, v in points), strict=True)
+            lines.append(charts.Series(name.split("/")[2], x, means, low, high, colour=f"c{index}", markers=True))
+        ticks = [float(i + 1) for i in range(0, len(nights), max(1, len(nights) // MOST_TICKS))]
+        x_label = f"night ({nights[0].night} to {nights[-1].night})"
+        title = f"{words(metric)} ({where})"
+        shown.append(charts.line_chart(lines, title=title, x_label=x_label, y_label=metric, x_ticks=ticks))
+    return shown

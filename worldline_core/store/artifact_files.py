@@ -57,11 +57,8 @@ def read_json(path: Path) -> JsonObject:
     return value
 
 
-def read_json_lines(path: Path, *, atomic: bool = False) -> list[JsonObject]:
-    """The objects of a `.jsonl` file; an absent file has none.
-
-    Args:
-        atomic: the file is always written as a whole; otherwise a last line cut short by a kill is left out.
+def read_json_lines(path: Path) -> list[JsonObject]:
+    """The objects of a `.jsonl` file; an absent file has none, and a last line cut short by a kill is left out.
 
     Raises:
         ArtifactError: another line is not a JSON object.
@@ -74,7 +71,7 @@ def read_json_lines(path: Path, *, atomic: bool = False) -> list[JsonObject]:
         try:
             value = json.loads(line)
         except (ValueError, RecursionError) as error:
-            if index == len(lines) - 1 and not atomic:
+            if index == len(lines) - 1:
                 break
             raise ArtifactError("A line is not JSON", where=f"{path}:{index + 1}", got=line[:80]) from error
         if not isinstance(value, dict):
