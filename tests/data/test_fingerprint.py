@@ -113,10 +113,8 @@ def test_looks_survive_light_size_and_noise_but_not_another_episode() -> None:
     ):
         seen = printed(episode, copy.astype(np.uint8)).views["head"]
         assert np.bitwise_count(seen.frames ^ first.frames).mean() < 4
-        assert np.bitwise_count(seen.moving ^ first.moving).sum() < 0.2 * np.bitwise_count(first.moving).sum()
         assert np.bitwise_count(seen.first ^ first.first).sum() < 24
     assert np.bitwise_count(other.frames ^ first.frames).mean() > 8
-    assert np.bitwise_count(other.moving ^ first.moving).sum() > 0.5 * np.bitwise_count(first.moving).sum()
 
 
 def test_a_view_without_images_is_an_error() -> None:

@@ -80,9 +80,8 @@ def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> tuple
             "near_duplicate",
             "The same recording as episode {}, encoded or cut another way",
             compared_with=parts[left[found.compared_with]]["episode_id"],
-            motion_overlap=None if found.motion_overlap is None else round(found.motion_overlap, 4),
+            motion_overlap=round(found.motion_overlap, 4),
             frame_distance_bits=round(found.frame_distance, 4),
-            moving_distance=round(found.moving_distance, 4),
         )
     kept = [position for position in range(len(parts)) if position not in rows]
     check_scenes_disjoint([parts[position] for position in kept])

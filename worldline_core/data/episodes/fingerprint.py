@@ -1,10 +1,8 @@
 """Fingerprint of an episode: a digest of its exact content, and hashes that survive re-encoding, resizing and trimming.
 
-Four kinds of evidence, all small enough to be kept for every episode (about 2 kB):
+Three kinds of evidence, all small enough to be kept for every episode (about 1 kB):
 
 - frames: a perceptual hash (signs of low DCT frequencies; Zauner 2010) of moments spread over the episode, by view;
-- moving: in which cells of an 8 x 8 grid these moments differ from the episode's median image, so what the arm does, not
-  what the room looks like;
 - first: a finer hash of the first image alone, by which two names of one scene are found;
 - motion: a MinHash (Broder 1997) of the set of state cells that the episode visits. Two copies share nearly all cells
   whatever was trimmed; two demonstrations of one task share few.
@@ -36,32 +34,25 @@ _POSITION_STEP_M = 0.01
 _HASH_SIDE = 8
 _FIRST_SIDE = 16
 _DCT_SIDE = 32
-_MOVED_LEVELS = 8.0
 
 
 @dataclass(frozen=True)
 class ViewPrint:
-    """What one view looked like.
-
-    Attributes:
-        frames, moving: (MOMENTS,) uint64. first: (4,) uint64, 256 bits of the first image.
-    """
+    """Hashes of one view: `frames` (MOMENTS,) uint64; `first` (4,) uint64, 256 bits of the first image."""
 
     frames: np.ndarray
-    moving: np.ndarray
     first: np.ndarray
 
 
 @dataclass(frozen=True)
 class Fingerprint:
     """Attributes:
-    digest: of states, actions and thumbnails, exactly as recorded. seconds: length of the images.
+    digest: of states, actions and thumbnails, exactly as recorded.
     layout: kind and number of state columns; motions of different layouts cannot be compared.
     motion: (MINHASHES,) uint32, or None where the robot hardly moves.
     """
 
     digest: str
-    seconds: float
     layout: str
     motion: np.ndarray | None
     views: Mapping[str, ViewPrint]
@@ -97,12 +88,10 @@ def fingerprint(episode: Episode, thumbnails: Mapping[str, ViewThumbnails]) -> d
     for array in arrays:
         digest.update(str((array.shape, array.dtype.str)).encode())
         digest.update(memoryview(np.ascontiguousarray(array)).cast("B") if array.size else b"")
-    lengths = [len(images.gray) for images in thumbnails.values()]
-    if 0 in lengths:
+    if any(len(images.gray) == 0 for images in thumbnails.values()):
         raise DataError("View has no images", where=f"episode {episode.episode_id}")
     return Fingerprint(
         digest.hexdigest(),
-        max(lengths, default=0) / episode.fps,
         f"{episode.state_kind}/{episode.state.shape[1]}",
         motion_hashes(episode),
         {view: view_print(images.gray) for view, images in thumbnails.items()},
@@ -113,17 +102,9 @@ def view_print(gray: UInt8[np.ndarray, "n h w"]) -> ViewPrint:
     """Hashes of one view."""
     middles = (np.arange(MOMENTS) + 0.5) / MOMENTS * len(gray)
     chosen = gray[np.minimum(middles.astype(int), len(gray) - 1)]
-    median = np.median(chosen, axis=0).astype(np.float32)
     frames = [_words_of(_low_frequency_signs(image.astype(np.float32), _HASH_SIDE)) for image in chosen]
     first = _words_of(_low_frequency_signs(gray[0].astype(np.float32), _FIRST_SIDE))
-    difference = chosen.astype(np.float32) - median
-    # Light that flickers over the whole image is not motion.
-    difference -= np.median(difference, axis=(1, 2), keepdims=True)
-    cells = np.stack(
-        [cv2.resize(np.abs(d), (_HASH_SIDE, _HASH_SIDE), interpolation=cv2.INTER_AREA) for d in difference]
-    )
-    moving = [_words_of(cell > _MOVED_LEVELS) for cell in cells]
-    return ViewPrint(np.concatenate(frames), np.concatenate(moving), first)
+    return ViewPrint(np.concatenate(frames), first)
 
 
 def _low_frequency_signs(image: Float[np.ndarray, "h w"], side: int) -> np.ndarray:
