@@ -118,7 +118,7 @@ def test_task_and_inspect_answer_scripts_in_json(tmp_path: Path, capsys: pytest.
 
 
 def test_a_reader_that_ends_first_is_no_error(project_root: Path) -> None:
-    code = "import sys; from flows.command_line import main; sys.argv[1:] = ['embodiment', 'list', '--json']; main()"
+    code = "import sys; from flows.command_line import main; sys.argv[1:] = ['embodiment', 'list']; main()"
     command = [sys.executable, "-c", code]
     with subprocess.Popen(command, cwd=project_root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
         assert run.stdout is not None

@@ -230,7 +230,7 @@ def test_a_planner_stays_within_the_limits_of_the_robot(world: WorldLine, head: 
     plan = planner.plan(head.now(), head.controls[0])
     assert plan.score == plan.scores.max() == plan.scores[0]
     assert len(plan.scores) == plan.model_calls == 6
-    robot = CommandedRobot(planner.kinematics, 8.0, head.controls[:1], limits=True, response=None)
+    robot = CommandedRobot(planner.kinematics, 8.0, head.controls[:1], limits=True)
     assert np.array_equal(robot.follow(plan.sequence[None])[1][0], plan.sequence)
     assert not np.array_equal(robot.follow(head.controls[0] + np.full((1, 16, 14), 3.0))[1][0], head.controls[0] + 3.0)
 

@@ -52,11 +52,10 @@ def test_unknown_key_is_an_error(tmp_path):
     [
         ({"limits": [[-1.0, 1.0]]}, "1 limits for 2 joints"),
         ({"limits": [[1.0, -1.0], [-2.0, 2.0]]}, "lower limit is not below"),
-        ({"limits": [[float("nan"), 1.0], [-2.0, 2.0]]}, "lower limit is not below its upper limit: pan"),
+        ({"limits": [[float("nan"), 1.0], [-2.0, 2.0]]}, "lower limit is not below"),
         ({"gripper": {"closed": 0.5, "open": 0.5}}, "closed and open are equal"),
-        ({"T_link_tool": {"rotation_wxyz": [1.0, 1.0, 0.0, 0.0]}}, "rotation_wxyz has length"),
         ({"T_link_tool": {"rotation_wxyz": [1.002, 0.0, 0.0, 0.0]}}, "rotation_wxyz has length 1.002"),
-        ({"T_link_tool": {"rotation_wxyz": [0.0, 0.0, 0.0, 0.0]}}, "zero quaternion"),
+        ({"T_link_tool": {"rotation_wxyz": [0.0, 0.0, 0.0, 0.0]}}, "rotation_wxyz has length"),
         ({"wrist_camera": {"link": "hand", "T_link_camera": [[1.0, 0.0], [0.0, 1.0]]}}, "not a 4x4 matrix"),
         (
             {"wrist_camera": {"link": "hand", "T_link_camera": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}},
@@ -76,12 +75,12 @@ def test_quaternion_with_rounding_errors_is_normalised(tmp_path):
     np.testing.assert_allclose(T[:3, :3], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-12)
 
 
-def test_what_was_not_verified_says_why(tmp_path):
-    with pytest.raises(ConfigError, match="unverified_reason goes with verified: false"):
-        load_embodiment(write(tmp_path, verified=False))
-    with pytest.raises(ConfigError, match="unverified_reason goes with verified: false"):
-        load_embodiment(write(tmp_path, unverified_reason="guessed"))
-    assert not load_embodiment(write(tmp_path, verified=False, unverified_reason="guessed")).verified
+def test_own_file_and_variable_go_before_the_file_beside_the_yaml(tmp_path, monkeypatch):
+    path, mine = write(tmp_path), tmp_path / "mine.xml"
+    mine.write_text("mine")
+    monkeypatch.setenv("WORLDLINE_DESCRIPTION_TOY", str(mine))
+    assert read_description(load_embodiment(path)) == "mine"
+    assert load_embodiment(path, tmp_path / "other.xml").description_path.name == "other.xml"
 
 
 @pytest.mark.parametrize("name", embodiment_names())
@@ -91,7 +90,7 @@ def test_description_is_here_or_the_file_says_how_to_get_it(name, monkeypatch):
     if embodiment.description_path.is_file():
         assert read_description(embodiment)
     else:
-        with pytest.raises(UnavailableError, match=r"next step: (take .* from github.com|pip install)"):
+        with pytest.raises(UnavailableError, match=r"next step: take .* from github.com"):
             read_description(embodiment)
 
 
@@ -112,15 +111,8 @@ def test_limits_are_checked_joint_by_joint_and_never_for_the_gripper(tmp_path):
     state = np.array([[0.0, 0.0, 9.0], [1.5, 0.0, 0.0], [0.0, -2.01, 0.0]])
     outside = load_embodiment(write(tmp_path)).outside_limits(state)
     assert outside.tolist() == [[False] * 3, [True, False, False], [False] * 3]
-
-
-def test_joint_without_limits_is_never_outside(tmp_path):
-    arm = {**ARM, "limits": [[float("-inf"), float("inf")], [-2.0, 2.0]]}
-    state = np.array([[50.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
-    assert load_embodiment(write(tmp_path, arms=[arm])).outside_limits(state).tolist() == [
-        [False] * 3,
-        [False, True, False],
-    ]
+    free = {**ARM, "limits": [[float("-inf"), float("inf")], [-2.0, 2.0]]}
+    assert not load_embodiment(write(tmp_path, arms=[free])).outside_limits(state).any()
 
 
 def test_position_beyond_a_limit_is_named_with_its_limits(tmp_path):
@@ -128,17 +120,7 @@ def test_position_beyond_a_limit_is_named_with_its_limits(tmp_path):
     state = np.array([[0.0, 0.0, 0.0], [1.5, -2.1, 0.0], [1.2, 0.0, 0.0]])
     with pytest.raises(
         DataError,
-        match=r"beyond its limit[\s\S]*episode 3.*frame 1, pan[\s\S]*-1 to 1 rad[\s\S]*1\.5 rad; 2 of 3 frames are outside, "
-        "and 1 more joints",
+        match=r"beyond its limit[\s\S]*episode 3.*frame 1, pan[\s\S]*-1 to 1[\s\S]*1\.5; 2 of 3 frames",
     ):
         embodiment.check_limits(state, "episode 3")
     embodiment.check_limits(state[:1], "episode 3")
-
-
-def test_limits_in_degrees_have_a_tolerance_in_degrees(tmp_path):
-    arm = {**ARM, "limits": [[-60.0, 60.0], [-90.0, 90.0]]}
-    embodiment = load_embodiment(write(tmp_path, arms=[arm], joint_units="deg"))
-    state = np.array([[61.0, 0.0, 0.0], [62.0, 0.0, 0.0]])
-    assert embodiment.outside_limits(state)[:, 0].tolist() == [False, True]
-    with pytest.raises(DataError, match=r"-60 to 60 deg[\s\S]*62 deg; 1 of 2 frames are outside"):
-        embodiment.check_limits(state, "episode 3")

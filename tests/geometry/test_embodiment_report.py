@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import re
 
@@ -26,9 +25,8 @@ has_mujoco = pytest.mark.skipif(
 def test_kinematics_equal_mujoco_at_a_thousand_random_positions(name):
     embodiment = load_embodiment(name)
     if not embodiment.description_path.is_file():
-        pytest.skip(f"the description of {name} is not here: {embodiment.description.how_to_get}")
+        pytest.skip(f"the description of {name} is not here")
     check = check_embodiment(embodiment, samples=1000)
-    assert check["samples"] == 1000
     frames = [(error["kind"], error["frame"]) for error in check["errors"]]
     for arm in embodiment.arms:
         assert ("end-effector", arm.end_effector_link) in frames
@@ -36,8 +34,7 @@ def test_kinematics_equal_mujoco_at_a_thousand_random_positions(name):
         assert arm.wrist_camera is None or ("camera", arm.camera_view) in frames
     assert check["passed"]
     # The promise is 1e-5; in float64 all of it is rounding.
-    assert max(error["max_position_m"] for error in check["errors"]) <= 1e-12
-    assert max(error["max_rotation_rad"] for error in check["errors"]) <= 1e-12
+    assert max(max(error["position_m"], error["rotation_rad"]) for error in check["errors"]) <= 1e-12
     assert not [note for note in check["notes"] if "limits" in note]
 
 
@@ -48,7 +45,7 @@ def test_agibot_equals_mujoco(shared_data):
         pytest.skip("the AgiBot G1 URDF is not here")
     check = check_embodiment(load_embodiment("agibot_g1", urdf), samples=1000)
     assert check["passed"]
-    assert max(error["max_position_m"] for error in check["errors"]) <= 1e-9
+    assert max(error["position_m"] for error in check["errors"]) <= 1e-9
 
 
 def test_random_states_stay_within_limits_and_turn_where_there_are_none():
@@ -80,7 +77,7 @@ def test_a_wrong_pose_is_found(monkeypatch, metres, passed):
     check = check_embodiment(load_embodiment("franka_panda"), samples=20)
     assert check["passed"] is passed
     flange = next(error for error in check["errors"] if error["kind"] == "end-effector")
-    assert flange["max_position_m"] == pytest.approx(metres, rel=1e-6)
+    assert flange["position_m"] == pytest.approx(metres, rel=1e-6)
 
 
 @has_mujoco
@@ -90,7 +87,7 @@ def test_other_limits_than_the_description_has_are_noted(tmp_path):
     (tmp_path / "franka_panda.yaml").write_text(text)
     (tmp_path / "franka_panda.xml").write_text(source.read_text())
     notes = check_embodiment(load_embodiment(tmp_path / "franka_panda.yaml"), samples=2)["notes"]
-    assert notes == ["panda_joint2: limits -1.7628 to 2 rad, the description has -1.7628 to 1.7628"]
+    assert notes == ["panda_joint2: limits -1.7628 to 2, the description has -1.7628 to 1.7628"]
 
 
 def test_without_mujoco_it_says_what_to_install(monkeypatch):
@@ -111,23 +108,8 @@ def test_list_names_every_embodiment(capsys, monkeypatch):
     main(["embodiment", "list"])
     text = capsys.readouterr().out
     assert [line.split()[0] for line in text.split("\n\n")[0].splitlines()[1:]] == embodiment_names()
-    assert re.search(r"galaxea_r1 .*your file: not here +no", text)
+    assert re.search(r"galaxea_r1 .*not here +no", text)
     assert "set WORLDLINE_DESCRIPTION_GALAXEA_R1=" in text
-    main(["embodiment", "list", "--json"])
-    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
-    assert rows["panda_pair"]["state_size"] == 16
-    assert rows["panda_pair"]["found"] is True
-    assert rows["tienkung2_pro"]["verified"] is False
-    assert rows["yam_station"]["wrist_cameras"] == ["left_wrist", "right_wrist"]
-
-
-def test_show_says_which_column_is_which(capsys):
-    main(["embodiment", "show", "piper_pair"])
-    text = capsys.readouterr().out
-    assert re.search(r"column 7 +right/joint1 +-2\.687 to 2\.687", text)
-    assert re.search(r"column 13 +gripper +0 closed, 1 open; right/joint7 0 to 0\.04", text)
-    main(["embodiment", "show", "kinova_gen3"])
-    assert re.search(r"column 0 +Actuator1 +no limits", capsys.readouterr().out)
 
 
 @has_mujoco
@@ -136,10 +118,8 @@ def test_check_command_ends_with_status_one_on_a_wrong_pose(capsys, monkeypatch)
     assert "passed: the limit is 1e-05 m" in capsys.readouterr().out
     break_the_reader(monkeypatch, 1e-3)
     with pytest.raises(SystemExit, match="1"):
-        main(["embodiment", "check", "franka_panda", "--samples", "5", "--json"])
-    result = json.loads(capsys.readouterr().out)
-    assert result["passed"] is False
-    assert {error["frame"]: error["passed"] for error in result["errors"]}["panda_link8"] is False
+        main(["embodiment", "check", "franka_panda", "--samples", "5"])
+    assert re.search(r"panda_link8 .*FAILED", capsys.readouterr().out)
 
 
 def test_check_command_says_how_to_get_a_description(capsys, monkeypatch):

@@ -18,31 +18,31 @@ from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.tensor_transforms import is_rigid
 from worldline_core.geometry.transforms import rotation_angle
 
-# Everything that decides a pose: each way to write an orientation, joints off the body's origin, two joints on a
+# Everything that decides a pose: joints off the body's origin, two joints on a
 # body, a slide, defaults by class and childclass, a site, an unnormalised axis and quaternion.
 TOY = """
 <mujoco model="toy">
   <!-- a comment -->
-  <compiler angle="degree" eulerseq="zyx"/>
+  <compiler angle="degree"/>
   <default>
     <joint axis="0 1 0"/>
     <default class="finger"><joint type="slide" axis="0 0 2" range="0 0.04"/></default>
   </default>
   <worldbody>
     <geom type="plane" size="1 1 0.1"/>
-    <body name="base" pos="0.1 -0.2 0.3" euler="10 20 30">
+    <body name="base" pos="0.1 -0.2 0.3" quat="0.9 0.1 -0.2 0.4">
       <geom size="0.05"/>
       <body name="shoulder" pos="0 0 0.2" quat="2 0.4 0.1 -0.3">
         <joint name="pan" axis="0 0 1"/>
         <joint name="tilt" pos="0.02 0.03 -0.01"/>
         <geom size="0.05"/>
-        <body name="elbow" pos="0.3 0 0" axisangle="1 1 0 40">
+        <body name="elbow" pos="0.3 0 0" quat="0.94 0.24 0.24 0">
           <joint name="elbow" axis="0.3 -0.5 0.7" pos="0 0 0.05"/>
           <geom size="0.05"/>
-          <body name="hand" pos="0.25 0 0.02" xyaxes="0 1 0 -1 0 0.2" childclass="finger">
+          <body name="hand" pos="0.25 0 0.02" quat="0.7 0.1 0.07 0.7" childclass="finger">
             <joint name="roll" type="hinge" axis="1 0 0"/>
             <geom size="0.05"/>
-            <site name="tip" pos="0 0 0.1" zaxis="0.2 0.1 0.9"/>
+            <site name="tip" pos="0 0 0.1" quat="0.98 0.1 0.1 0"/>
             <body name="thumb" pos="0 0.02 0.05"><joint name="thumb"/><geom size="0.01"/></body>
             <body name="index" pos="0 -0.02 0.05"><joint name="index" axis="0 -1 0"/><geom size="0.01"/></body>
           </body>
@@ -158,33 +158,6 @@ def test_mounts_place_one_description_twice():
     np.testing.assert_allclose(both[:, 1], right @ alone[::-1], atol=1e-12)
 
 
-def test_degrees_become_radians_and_slides_stay_metres(tmp_path):
-    arm = TOY_YAML["arms"][0]  # type: ignore[index]
-    state = np.array([[0.4, -0.9, 1.1, 0.2, 0.7]])
-    expected = toy(tmp_path).link_poses(state)
-    degrees = np.concatenate([np.rad2deg(state[:, :4]), state[:, 4:]], axis=1)
-    got = toy(tmp_path, joint_units="deg", arms=[{**arm, "limits": [[-170.0, 170.0]] * 4}]).link_poses(degrees)
-    for name in ("tip", "thumb"):
-        torch.testing.assert_close(got[name], expected[name], atol=1e-12, rtol=0)
-
-
-def test_posture_in_degrees(tmp_path):
-    arm = {**TOY_YAML["arms"][0], "joints": ["tilt", "elbow", "roll"], "limits": [[-3.0, 3.0]] * 3}  # type: ignore[index]
-    expected = toy(tmp_path, arms=[arm], posture={"pan": 0.5}).tool_poses(np.zeros((1, 4)))
-    got = toy(tmp_path, arms=[arm], posture={"pan": float(np.rad2deg(0.5))}, joint_units="deg").tool_poses(
-        np.zeros((1, 4))
-    )
-    torch.testing.assert_close(got, expected, atol=1e-12, rtol=0)
-
-
-def test_slide_in_an_arm_cannot_be_given_in_degrees(tmp_path):
-    arm = {**TOY_YAML["arms"][0], "joints": ["pan", "thumb"], "limits": [[-3.0, 3.0], [0.0, 0.04]]}  # type: ignore[index]
-    arm["gripper"] = {"closed": 0.0, "open": 1.0}
-    toy(tmp_path, arms=[arm])
-    with pytest.raises(ConfigError, match=r"slide cannot be given in degrees[\s\S]*thumb"):
-        toy(tmp_path, arms=[arm], joint_units="deg")
-
-
 def test_base_link_is_the_frame_of_everything(tmp_path):
     state = np.array([[0.3, -0.4, 0.5, 0.6, 1.0]])
     world = toy(tmp_path).link_poses(state)
@@ -238,6 +211,7 @@ def test_unknown_joint_lists_the_joints(tmp_path):
         ("<include file='x.xml'/>", "<include> is not supported"),
         ("<frame><body/></frame>", "<frame> is not supported"),
         ("<body name='b' quat='0 0 0 0'/>", r"direction of length zero[\s\S]*body b"),
+        ("<body name='b' euler='0 0 1'/>", r"orientation is not supported[\s\S]*body b"),
         ("<body name='b' pos='0 0'/>", r"body b[\s\S]*3 finite numbers"),
         ("<body><joint name='j' axis='0 0 0'/></body>", r"direction of length zero[\s\S]*joint j"),
     ],

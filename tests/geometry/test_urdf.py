@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import pytorch_kinematics as pk
 import torch
-import yaml
 
-from worldline_core.errors import ConfigError, DataError
-from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.errors import DataError
 from worldline_core.geometry.kinematic_tree import read_urdf
-from worldline_core.geometry.kinematics import ArmKinematics, chain_from_tree
+from worldline_core.geometry.kinematics import chain_from_tree
 
 # Origins with all three angles, unnormalised axes, a missing origin and axis, every kind of joint, an undeclared prefix.
 TOY = """<?xml version="1.0"?>
@@ -82,30 +80,6 @@ def test_reader_equals_the_parser_of_pytorch_kinematics():
     _, poses = ours(["finger", "camera"])
     for name, pose in poses.items():
         np.testing.assert_allclose(pose, expected[theirs.frame_to_idx[name]].numpy(), atol=2e-6)
-
-
-def test_limits_are_read_and_a_continuous_joint_has_none():
-    limits = {joint.name: joint.limits for body in read_urdf(TOY, "toy.urdf").walk() for joint in body.joints}
-    assert limits == {"pan": None, "lift": (-1.2, 0.8), "roll": (-3.0, 3.0), "slide": (0.0, 0.04)}
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            {"end_effector_link": "paw"},
-            r"no link of this name[\s\S]*base, shoulder, elbow, hand, finger, camera[\s\S]*paw",
-        ),
-        ({"joints": ["pan", "bend"]}, r"no joint of this name[\s\S]*pan, lift, roll, slide[\s\S]*bend"),
-    ],
-)
-def test_link_or_joint_that_the_urdf_does_not_have_lists_those_there_are(tmp_path, change, message):
-    arm = {"name": "right", "joints": ["pan", "lift"], "limits": [[-1.0, 1.0]] * 2, "end_effector_link": "hand"}
-    body = {"name": "toy", "description": {"format": "urdf", "file": "toy.urdf"}, "base_link": "base"}
-    (tmp_path / "toy.urdf").write_text(TOY)
-    (tmp_path / "toy.yaml").write_text(yaml.safe_dump({**body, "arms": [{**arm, **change}]}))
-    with pytest.raises(ConfigError, match=message):
-        ArmKinematics(load_embodiment(tmp_path / "toy.yaml"))
 
 
 def robot(body: str) -> str:

@@ -44,7 +44,6 @@ from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, Embodiment, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.pretrained import pretrained_folder
-from worldline_core.rollout.robot import Response
 from worldline_core.rollout.samplers import FULL_STEPS
 from worldline_core.rollout.simulation import Frames, Simulation
 from worldline_core.rollout.worldline import WorldLine
@@ -274,7 +273,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         trust: trust.safetensors of an evaluation of this checkpoint by the measured judge, or its folder: when an episode has
             been judged, ``info`` has ``trust``, the probability that the judge is right, and ``do_not_trust``, why it should not
             be relied on ("" where it may).
-        limits, response: as of ``WorldLine.start``.
+        limits: as of ``WorldLine.start``.
         autoreset_mode: of finished episodes: at the next step, in the same step, or never (``reset`` with ``reset_mask``).
         options: further arguments of ``WorldLine.from_pretrained``.
 
@@ -299,7 +298,6 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         stop_at_success: bool = False,
         trust: Path | str | None = None,
         limits: bool = True,
-        response: Response | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: Literal["rgb_array"] | None = "rgb_array",
         **options: Any,
@@ -323,7 +321,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         )  # fmt: skip
         self.kinematics = ArmKinematics(load_embodiment(self.starts.embodiment))
         self.num_envs, self.episode_frames = num_envs, episode_frames
-        self._limits, self._response, self._stop_at_success = limits, response, stop_at_success
+        self._limits, self._stop_at_success = limits, stop_at_success
         self._succeeds = judge_of(success, trust, model, self.world, self.views, self.starts.embodiment)
         self.render_mode = render_mode
         self._autoreset = AutoresetMode(autoreset_mode)
@@ -431,7 +429,6 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             state=np.stack([start.state for start in starts]),
             seed=seeds,
             limits=self._limits,
-            response=self._response,
         )
 
     def _begin(self, slots: Sequence[int], seeds: Sequence[int | None]) -> None:

@@ -1,9 +1,7 @@
 """Robots as data: arms, joint order, tools, grippers, wrist cameras.
 
-One YAML file per embodiment in `configs/embodiments/`. Its kinematic description (an MJCF or URDF file) is looked for in
-this order: a path given by the caller, the environment variable `WORLDLINE_DESCRIPTION_<NAME>`, a file of an installed
-Python package (`package`), a file beside the YAML. `observation.state` and `action` hold, for each arm in order, its joint positions,
-then its gripper.
+One YAML file per embodiment in `configs/embodiments/`. `observation.state` and `action` hold, for each arm in order, its
+joint positions, then its gripper.
 """
 
 from __future__ import annotations
@@ -12,12 +10,10 @@ import difflib
 import math
 import os
 from collections.abc import Mapping
-from importlib import metadata
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from pydantic import Field, model_validator
 
 from worldline_core.config import CONFIG_ROOT, StrictModel, read_yaml, validate
@@ -27,12 +23,10 @@ from worldline_core.geometry.transforms import pose_from_quaternion_wxyz, rotati
 QUATERNION_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's length from 1 that is taken for rounding and normalised away."""
 EMBODIMENT_ROOT = CONFIG_ROOT / "embodiments"
-MAX_DESCRIPTION_BYTES = 16 << 20
 LIMIT_TOLERANCE_RAD = 0.02
 """Joint positions may pass their limits by this much."""
 
 Bound = Annotated[float, Field(allow_inf_nan=True)]
-Speed = Annotated[float, Field(gt=0)]
 Limits = Annotated[tuple[Bound, Bound], Field(description="lower, upper; -.inf and .inf where there is none")]
 
 
@@ -44,11 +38,7 @@ class RigidOffset(StrictModel):
 
     @model_validator(mode="after")
     def _proper(self) -> RigidOffset:
-        if not all(math.isfinite(value) for value in (*self.translation, *self.rotation_wxyz)):
-            raise ValueError("translation and rotation_wxyz must be finite numbers")
         norm = float(np.linalg.norm(self.rotation_wxyz))
-        if norm == 0.0:
-            raise ValueError("rotation_wxyz is the zero quaternion, which is no rotation (no rotation: 1 0 0 0)")
         if abs(norm - 1.0) > QUATERNION_TOLERANCE:
             raise ValueError(f"rotation_wxyz has length {norm:.6f}, expected 1")
         return self
@@ -62,11 +52,8 @@ class Description(StrictModel):
     """The kinematic description.
 
     Attributes:
-        file: path beside the YAML; with `package`, path as in the wheel, package folder first
-            (`robosuite/models/assets/...`).
-        package: distribution on PyPI that carries the file.
-        version: versions of the distribution for which the embodiment was written, for example `>=0.2,<0.3`.
-        obtain: how to get the file, in words. With `package` this is `pip install` unless given.
+        file: path beside the YAML.
+        obtain: where a user gets a file that is not shipped.
         source: where the file comes from, with version and licence.
         mounts: the description is one arm and is placed once per entry, `T_world_root` each; its links and joints
             are named by the entry, a slash, and their own name (`left/joint1`), under a common link `world`.
@@ -74,33 +61,9 @@ class Description(StrictModel):
 
     format: Literal["mjcf", "urdf"]
     file: str = Field(min_length=1)
-    package: str | None = None
-    version: str | None = None
     obtain: str | None = None
     source: str | None = None
     mounts: dict[str, RigidOffset] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Description:
-        if self.version is not None and self.package is None:
-            raise ValueError("version says which versions of package fit, and there is no package")
-        if self.package is not None:
-            path = PurePosixPath(self.file)
-            if path.is_absolute() or ".." in path.parts or len(path.parts) < 2:
-                raise ValueError(f"file {self.file!r} is not a path inside the package {self.package}")
-        if self.version is not None:
-            try:
-                SpecifierSet(self.version)
-            except InvalidSpecifier as error:
-                raise ValueError(f"version {self.version!r} is no version specifier like '>=0.2,<0.3'") from error
-        return self
-
-    @property
-    def how_to_get(self) -> str | None:
-        """Instructions for a user without the file."""
-        if self.obtain is None and self.package is not None:
-            return f"pip install '{self.package}{self.version or ''}'"
-        return self.obtain
 
 
 class FingerJoint(StrictModel):
@@ -117,9 +80,6 @@ class Gripper(StrictModel):
     closed: float = 0.0
     open: float = 1.0
     finger_joints: tuple[FingerJoint, ...] = ()
-    travel_s: float = Field(
-        default=0.4, gt=0, description="shortest time from open to closed; a Panda hand's by default"
-    )
 
     @model_validator(mode="after")
     def _range(self) -> Gripper:
@@ -136,7 +96,6 @@ class WristCamera(StrictModel):
 
     link: str
     T_link_camera: tuple[tuple[float, ...], ...]
-    view: str | None = None
 
     @model_validator(mode="after")
     def _rigid(self) -> WristCamera:
@@ -154,9 +113,6 @@ class Arm(StrictModel):
     name: str
     joints: tuple[str, ...] = Field(min_length=1)
     limits: tuple[Limits, ...]
-    max_speeds: tuple[Speed, ...] | None = Field(
-        None, description="of each joint, rad/s or m/s; where not known, pi rad/s and 1 m/s"
-    )
     end_effector_link: str
     T_link_tool: RigidOffset = RigidOffset()
     gripper: Gripper = Gripper()
@@ -169,8 +125,6 @@ class Arm(StrictModel):
     def _limits(self) -> Arm:
         if len(self.limits) != len(self.joints):
             raise ValueError(f"{len(self.limits)} limits for {len(self.joints)} joints")
-        if self.max_speeds is not None and len(self.max_speeds) != len(self.joints):
-            raise ValueError(f"{len(self.max_speeds)} max_speeds for {len(self.joints)} joints")
         for joint, (low, high) in zip(self.joints, self.limits, strict=True):
             if not low < high:
                 raise ValueError(f"a lower limit is not below its upper limit: {joint}, {low} to {high}")
@@ -179,29 +133,23 @@ class Arm(StrictModel):
     @property
     def camera_view(self) -> str:
         """Name of the view of the wrist camera."""
-        named = self.wrist_camera.view if self.wrist_camera is not None else None
-        return named or f"{self.name}_wrist"
+        return f"{self.name}_wrist"
 
 
 class Embodiment(StrictModel):
-    """A robot.
+    """A robot; angles in radians, slides in metres.
 
     Attributes:
-        joint_units: of all angles of this file (limits, posture, finger joints) and of the angles in state vectors
-            handed to this embodiment. EpisodeSets hold radians; `deg` is for arrays as a robot wrote them. Slides are
-            in metres either way.
         posture: joints that are no part of the state (waist, head), at fixed positions.
-        verified: whether names, limits and poses were checked against the description itself; if not,
-            `unverified_reason` says why.
+        unverified_reason: why names, limits and poses could not be checked against the description itself.
+        description_path: where the kinematic description is expected.
     """
 
     name: str
     description: Description
     base_link: str
     arms: tuple[Arm, ...] = Field(min_length=1)
-    joint_units: Literal["rad", "deg"] = "rad"
     posture: dict[str, float] = Field(default_factory=dict)
-    verified: bool = True
     unverified_reason: str | None = None
     description_path: Path
 
@@ -214,8 +162,6 @@ class Embodiment(StrictModel):
         names = [arm.name for arm in self.arms]
         if len(set(names)) != len(names):
             raise ValueError(f"arms named twice: {', '.join(names)}")
-        if self.verified == bool(self.unverified_reason):
-            raise ValueError("unverified_reason goes with verified: false, and only with it")
         return self
 
     @property
@@ -275,16 +221,15 @@ class Embodiment(StrictModel):
 
     def outside_limits(self, state: np.ndarray, tolerance_rad: float = LIMIT_TOLERANCE_RAD) -> np.ndarray:
         """Bool (N, J): joint positions beyond their limits by more than the tolerance; gripper columns are False."""
-        tolerance = tolerance_rad if self.joint_units == "rad" else math.degrees(tolerance_rad)
         outside = np.zeros(state.shape, dtype=bool)
         for arm in self.arms:
             columns, limits = self.joint_columns(arm), np.asarray(arm.limits, dtype=np.float64)
             joints = state[:, columns].astype(np.float64)
-            outside[:, columns] = (joints < limits[:, 0] - tolerance) | (joints > limits[:, 1] + tolerance)
+            outside[:, columns] = (joints < limits[:, 0] - tolerance_rad) | (joints > limits[:, 1] + tolerance_rad)
         return outside
 
     def check_limits(self, state: np.ndarray, where: object, tolerance_rad: float = LIMIT_TOLERANCE_RAD) -> None:
-        """Raises: DataError naming the joint that is furthest out, its value, its limits and the frames outside."""
+        """Raises: DataError naming the joint that is furthest out, its value and its limits."""
         self.check_state(state, where)
         outside = self.outside_limits(state, tolerance_rad)
         if not outside.any():
@@ -293,13 +238,11 @@ class Embodiment(StrictModel):
         lower, upper = np.array([limits for arm in self.arms for limits in (*arm.limits, free)]).T
         beyond = np.where(outside, np.maximum(lower - state, state - upper), -math.inf)
         frame, joint = np.unravel_index(int(beyond.argmax()), beyond.shape)
-        others = int(outside.any(axis=0).sum()) - 1
         raise DataError(
             "Joint position is beyond its limit",
             where=f"{where}, embodiment {self.name}, frame {frame}, {self.state_names[joint]}",
-            expected=f"{lower[joint]:g} to {upper[joint]:g} {self.joint_units}",
-            got=f"{state[frame, joint]:g} {self.joint_units}; {int(outside[:, joint].sum())} of {len(state)} frames are "
-            "outside" + (f", and {others} more joints" if others else ""),
+            expected=f"{lower[joint]:g} to {upper[joint]:g}",
+            got=f"{state[frame, joint]:g}; {int(outside[:, joint].sum())} of {len(state)} frames are outside",
             next_step="check the joint order, the units and the sign of this joint",
         )
 
@@ -325,95 +268,33 @@ def check_embodiment_name(name: str) -> None:
 def load_embodiment(name_or_path: str | Path, description_path: Path | str | None = None) -> Embodiment:
     """Load an embodiment by its name, or from a YAML file.
 
-    The kinematic description is looked for at `description_path`, then where the environment variable
-    `WORLDLINE_DESCRIPTION_<NAME>` points, then in the package or beside the YAML file, as the YAML says. It is opened
-    only when kinematics are built.
+    The kinematic description is expected at `description_path`, else where the environment variable
+    `WORLDLINE_DESCRIPTION_<NAME>` points, else beside the YAML file. It is opened when kinematics are built.
 
-    Raises:
-        ConfigError: no embodiment of that name (the message lists those there are), the YAML is not valid, or an
-            installed package lacks the description.
-        UnavailableError: the package that carries the description is installed in a version that does not fit.
+    Raises: ConfigError when there is no embodiment of that name (the message lists the names), or the YAML is not valid.
     """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
         check_embodiment_name(str(name_or_path))
         path = EMBODIMENT_ROOT / f"{name_or_path}.yaml"
-    values = read_yaml(path)
-    if "description_path" in values:
-        raise ConfigError(
-            "description_path is not a key of the file", where=path, next_step="use description: {file: ...}"
-        )
-    embodiment = validate(Embodiment, {**values, "description_path": path.parent}, where=path)
-    located = locate_description(embodiment.name, embodiment.description, path.parent, description_path)
+    embodiment = validate(Embodiment, {**read_yaml(path), "description_path": path.parent}, where=path)
+    chosen = description_path or os.environ.get(description_variable(embodiment.name))
+    located = Path(chosen) if chosen else path.parent / embodiment.description.file
     return embodiment.model_copy(update={"description_path": located})
 
 
 def description_variable(name: str) -> str:
-    """Environment variable that says where the kinematic description of an embodiment is."""
+    """Environment variable with the path of an embodiment's kinematic description."""
     return f"WORLDLINE_DESCRIPTION_{name.upper()}"
-
-
-def locate_description(name: str, description: Description, folder: Path, override: Path | str | None) -> Path:
-    """Returns the path at which the description of an embodiment is expected; nothing is opened.
-
-    Args:
-        folder: of the embodiment's YAML.
-        override: a path that goes before everything else.
-    """
-    chosen = override or os.environ.get(description_variable(name))
-    if chosen:
-        return Path(chosen)
-    if description.package is not None:
-        return _in_package(description, description.package) or Path(description.package) / description.file
-    return folder / description.file
-
-
-def _in_package(description: Description, package: str) -> Path | None:
-    """The file of an installed distribution, or None where the distribution is not installed.
-
-    Raises:
-        ConfigError: the distribution has no such file, or the file lies outside of its package folder.
-        UnavailableError: another version than `version` is installed.
-    """
-    try:
-        distribution = metadata.distribution(package)
-    except metadata.PackageNotFoundError:
-        return None
-    if description.version is not None and not SpecifierSet(description.version).contains(
-        distribution.version, prereleases=True
-    ):
-        raise UnavailableError(
-            "The installed package that carries the kinematic description has another version",
-            where=package,
-            expected=description.version,
-            got=distribution.version,
-            next_step=f"pip install '{package}{description.version}'",
-        )
-    top = PurePosixPath(description.file).parts[0]
-    root = Path(str(distribution.locate_file(top))).resolve()
-    path = Path(str(distribution.locate_file(description.file)))
-    if not path.resolve().is_relative_to(root):
-        raise ConfigError("The kinematic description lies outside of its package", where=root, got=path.resolve())
-    if not path.is_file():
-        raise ConfigError(
-            "The installed package has no such kinematic description",
-            where=f"{package} {distribution.version}",
-            expected=description.file,
-            next_step="check description.file and description.version of the embodiment",
-        )
-    return path
 
 
 def how_to_get(embodiment: Embodiment) -> str:
     """Instructions for a user without the kinematic description."""
-    description = embodiment.description
-    steps = [description.how_to_get or "restore the file beside the embodiment's YAML"]
-    if description.package is None:
-        name, variable = embodiment.name, description_variable(embodiment.name)
-        steps.append(
-            f"then set {variable}=/path/to/it, or render_actions.description_paths.{name} in the configuration"
-        )
-    return "; ".join(steps)
+    name = embodiment.name
+    return (
+        f"{embodiment.description.obtain or 'restore the file beside its YAML'}; then set {description_variable(name)}="
+        f"/path/to/it, or render_actions.description_paths.{name} in the configuration"
+    )
 
 
 def read_description(embodiment: Embodiment) -> str:
@@ -421,7 +302,7 @@ def read_description(embodiment: Embodiment) -> str:
 
     Raises:
         UnavailableError: the file is not there; the message says how to get it.
-        DataError: it is far larger than a description, or no UTF-8.
+        DataError: it is no UTF-8.
     """
     description, path = embodiment.description, embodiment.description_path
     if not path.is_file():
@@ -430,13 +311,6 @@ def read_description(embodiment: Embodiment) -> str:
             where=path,
             expected=description.file,
             next_step=how_to_get(embodiment),
-        )
-    if (size := path.stat().st_size) > MAX_DESCRIPTION_BYTES:
-        raise DataError(
-            "Kinematic description is too large",
-            where=path,
-            expected=f"at most {MAX_DESCRIPTION_BYTES:,} bytes",
-            got=size,
         )
     try:
         return path.read_text(encoding="utf-8")

@@ -9,7 +9,6 @@ Axis legend: a arms, j state columns, d joints of an arm. Poses in the base fram
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +41,7 @@ class Reached:
 
 
 class InverseKinematics:
-    """Solver for all arms of an embodiment at once; states are in the embodiment's units."""
+    """Solver for all arms of an embodiment at once."""
 
     def __init__(self, kinematics: ArmKinematics) -> None:
         self.kinematics = kinematics
@@ -51,20 +50,16 @@ class InverseKinematics:
             np.arange(*embodiment.joint_columns(arm).indices(embodiment.state_size)) for arm in embodiment.arms
         ]
         self._limits = [np.asarray(arm.limits, np.float64) for arm in embodiment.arms]
-        # Where each joint turns: the link that it moves, its axis there, and what one unit of the state is [rad, m].
+        # Where each joint turns: the link that it moves, and its axis there.
         found = {
             joint.name: (f"{body.name}#{i}" if i < len(body.joints) - 1 or joint.position.any() else body.name, joint)
             for body in kinematics.tree.walk()
             for i, joint in enumerate(body.joints)
         }
-        degree = math.pi / 180 if embodiment.joint_units == "deg" else 1.0
-        self._joints = [
-            [(*found[name], degree if found[name][1].kind == "revolute" else 1.0) for name in arm.joints]
-            for arm in embodiment.arms
-        ]
+        self._joints = [[found[name] for name in arm.joints] for arm in embodiment.arms]
 
     def jacobians(self, state: Float[np.ndarray, " j"]) -> list[Float[np.ndarray, "6 d"]]:
-        """By arm: metres (first three rows) and radians of its tool in the base frame per unit of each of its joints."""
+        """By arm: metres (first three rows) and radians of its tool in the base frame per rad or m of each of its joints."""
         return self._at(state)[1]
 
     def _at(self, state: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -74,10 +69,10 @@ class InverseKinematics:
         for arm, joints in zip(self.kinematics.embodiment.arms, self._joints, strict=True):
             tool = links[arm.end_effector_link] @ arm.T_link_tool.matrix()
             columns = []
-            for link, joint, unit in joints:
+            for link, joint in joints:
                 axis = links[link][:3, :3] @ joint.axis
                 if joint.kind == "revolute":
-                    columns.append(unit * np.concatenate([np.cross(axis, tool[:3, 3] - links[link][:3, 3]), axis]))
+                    columns.append(np.concatenate([np.cross(axis, tool[:3, 3] - links[link][:3, 3]), axis]))
                 else:
                     columns.append(np.concatenate([axis, np.zeros(3)]))
             jacobians.append(np.stack(columns, axis=1))

@@ -1,17 +1,9 @@
-"""A robot as a tree of bodies and joints, read from MJCF or URDF.
+"""A robot as a tree of bodies and joints, read from MJCF or URDF without MuJoCo, in float64 (`pytorch_kinematics` reads
+URDF in float32, and MJCF with MuJoCo only). Tests compare both readers with MuJoCo itself.
 
-MJCF is read without MuJoCo: the lean install has no simulator, and `pytorch_kinematics.build_chain_from_mjcf` needs
-one. Covered is what decides the pose of a body: nested bodies with pos and quat / euler / axisangle / xyaxes / zaxis,
-hinge and slide joints with pos and axis, joint defaults by class, sites, and the compiler's angle and eulerseq. Geoms,
-cameras, actuators and the like are passed over; a ball joint, a free body, `<include>`, `<frame>` or a joint `ref` is
-refused rather than guessed.
-
-URDF is read in float64: `pytorch_kinematics` reads it in float32 (about 1e-7 of the robot's size lost at every joint)
-and stops at planar and floating joints with a KeyError. Links, joints, their origins, axes and limits are read; meshes,
-inertia and vendor tags decide no pose. A `mimic` joint is a joint of its own here: the embodiment lists it among its
-finger joints. Reference: https://wiki.ros.org/urdf/XML/joint.
-
-Tests compare both readers with MuJoCo itself.
+MJCF: nested bodies and sites with pos and quat, hinge and slide joints, joint defaults by class. URDF: links, joints, origins
+and axes; a `mimic` joint is a joint of its own, listed among the embodiment's finger joints. All that decides a pose and is
+not read is refused by name.
 """
 
 from __future__ import annotations
@@ -20,7 +12,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,24 +21,18 @@ from worldline_core.errors import DataError
 from worldline_core.geometry.transforms import rotation_about_axis, rotation_from_euler_fixed_xyz
 
 _UNDECLARED_PREFIX = re.compile(r"</?([A-Za-z_][\w.-]*):|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=")
-MAX_BODIES, MAX_DEPTH = 5_000, 200
-"""Bodies, links and sites of one description, and how many hang below each other; robots have some hundreds."""
 _URDF_KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": None}
 _MJCF_KINDS = {"hinge": "revolute", "slide": "prismatic"}
 
 
 @dataclass(frozen=True)
 class TreeJoint:
-    """One degree of freedom; `kind` is revolute or prismatic, axis (unit) and position [m] are in its body's frame.
-
-    `limits` [rad or m] are those of the description, None where it sets none.
-    """
+    """One degree of freedom; `kind` is revolute or prismatic, axis (unit) and position [m] are in its body's frame."""
 
     name: str
     kind: str
     axis: np.ndarray
     position: np.ndarray
-    limits: tuple[float, float] | None = None
 
 
 @dataclass
@@ -79,10 +65,9 @@ def mounted(tree: TreeBody, T_world_root: Mapping[str, np.ndarray]) -> TreeBody:
 
 
 def parse_xml(text: str, where: object) -> ET.Element:
-    """Root of an XML text, comments dropped.
+    """Root of an XML text.
 
-    Descriptions made by xacro often keep a prefix whose namespace they no longer declare (`drake:acceleration`);
-    ROS and MuJoCo read those, so they are declared here.
+    Descriptions made by xacro often keep a prefix whose namespace they no longer declare; it is declared here.
 
     Raises: DataError when the text is not XML.
     """
@@ -102,16 +87,6 @@ def parse_xml(text: str, where: object) -> ET.Element:
     raise DataError("Kinematic description is not XML", where=where, got=str(problem))
 
 
-def _check_size[T](root: T, children: Callable[[T], Iterable[T]], where: object) -> None:
-    """Raises: DataError for more bodies or deeper chains than readers of trees, which call themselves, can take."""
-    level, bodies, depth = [root], 1, 1
-    while level := [child for element in level for child in children(element)]:
-        bodies, depth = bodies + len(level), depth + 1
-        if bodies > MAX_BODIES or depth > MAX_DEPTH:
-            limit = f"at most {MAX_BODIES:,} bodies, {MAX_DEPTH} below each other"
-            raise DataError("Kinematic description is too large", where=where, expected=limit, got=(bodies, depth))
-
-
 def _check_names(tree: TreeBody, where: object) -> None:
     """Raises: DataError when two joints have one name: a column of the state would turn both."""
     joints = Counter(joint.name for body in tree.walk() for joint in body.joints)
@@ -120,10 +95,7 @@ def _check_names(tree: TreeBody, where: object) -> None:
 
 
 def _numbers(text: str, count: int, where: object) -> np.ndarray:
-    """(count,) float64 from an attribute.
-
-    Raises: DataError for another number of values, or one that is not a finite number.
-    """
+    """(count,) float64 from an attribute. Raises: DataError for another count, or a value that is not a finite number."""
     try:
         values = np.array([float(value) for value in text.split()], dtype=np.float64)
     except ValueError as error:
@@ -134,10 +106,7 @@ def _numbers(text: str, count: int, where: object) -> np.ndarray:
 
 
 def _unit(vector: np.ndarray, where: object) -> np.ndarray:
-    """The vector at length 1.
-
-    Raises: DataError when it is zero.
-    """
+    """The vector at length 1. Raises: DataError when it is zero."""
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         raise DataError("A direction of length zero", where=where, expected="a vector that is not zero")
@@ -160,8 +129,6 @@ def read_mjcf(text: str, where: object) -> TreeBody:
                 where=where,
                 next_step="write the file out flat (mujoco.mj_saveLastXML)",
             )
-    for part, tags in ((worldbody, ("body", "site")), (root, ("default",))):
-        _check_size(part, lambda element, tags=tags: (child for child in element if child.tag in tags), where)
     tree = _MjcfReader(root, where).body(worldbody, "world", None)
     _check_names(tree, where)
     return tree
@@ -171,14 +138,7 @@ class _MjcfReader:
     """Reader of an MJCF; holds what bodies inherit: the compiler's settings and the joint defaults by class."""
 
     def __init__(self, root: ET.Element, where: object) -> None:
-        compiler = root.find("compiler")
-        settings = {} if compiler is None else compiler.attrib
         self.where = where
-        self.to_radians = 1.0 if settings.get("angle", "degree") == "radian" else math.pi / 180
-        self.eulerseq = settings.get("eulerseq", "xyz")
-        if not re.fullmatch("[xyzXYZ]{3}", self.eulerseq):
-            raise DataError("Not a sequence of axes", where=f"{where}: eulerseq", expected="xyz", got=self.eulerseq)
-        self.autolimits = settings.get("autolimits", "true") == "true"
         self.joint_defaults: dict[str, dict[str, str]] = {}
         for default in root.findall("default"):
             self._read_defaults(default, {}, "main")
@@ -226,45 +186,21 @@ class _MjcfReader:
         name = values.get("name", f"{body}_joint")
         place = f"{self.where}: joint {name}"
         axis = _unit(_numbers(values.get("axis", "0 0 1"), 3, place), place)
-        position = _numbers(values.get("pos", "0 0 0"), 3, place)
-        return TreeJoint(name, kind, axis, position, self._limits(values, kind, place))
-
-    def _limits(self, values: dict[str, str], kind: str, place: str) -> tuple[float, float] | None:
-        limited = values.get("limited", "auto")
-        if "range" not in values or limited == "false" or (limited == "auto" and not self.autolimits):
-            return None
-        lower, upper = _numbers(values["range"], 2, place) * (self.to_radians if kind == "revolute" else 1.0)
-        return float(lower), float(upper)
+        return TreeJoint(name, kind, axis, _numbers(values.get("pos", "0 0 0"), 3, place))
 
     def _pose(self, element: ET.Element) -> np.ndarray:
-        """T_parent_body from pos and whichever of the five forms of orientation the element has."""
+        """T_parent_body from pos and quat."""
         place = f"{self.where}: {element.tag} {element.get('name', '')}"
-        given = element.attrib
+        if others := [form for form in ("euler", "axisangle", "xyaxes", "zaxis") if form in element.attrib]:
+            raise DataError(
+                "MJCF orientation is not supported here", where=place, expected="quat", got=others[0],
+                next_step="write the file out flat (mujoco.mj_saveLastXML)",
+            )  # fmt: skip
         T = np.eye(4)
-        T[:3, 3] = _numbers(given.get("pos", "0 0 0"), 3, place)
-        if "quat" in given:
-            w, *xyz = _unit(_numbers(given["quat"], 4, place), place)
-            # Through axis and angle: digests of action tracks hold the last bit of this.
-            T[:3, :3] = rotation_about_axis(np.array(xyz), 2 * math.atan2(float(np.linalg.norm(xyz)), float(w)))
-        elif "euler" in given:
-            for letter, angle in zip(self.eulerseq, _numbers(given["euler"], 3, place) * self.to_radians, strict=True):
-                turn = rotation_about_axis(np.eye(3)["xyz".index(letter.lower())], float(angle))
-                # Lower case: about the moving axes; upper case: about the fixed ones.
-                T[:3, :3] = T[:3, :3] @ turn if letter.islower() else turn @ T[:3, :3]
-        elif "axisangle" in given:
-            *axis, angle = _numbers(given["axisangle"], 4, place)
-            T[:3, :3] = rotation_about_axis(np.asarray(axis), float(angle) * self.to_radians)
-        elif "xyaxes" in given:
-            axes = _numbers(given["xyaxes"], 6, place)
-            x = _unit(axes[:3], place)
-            y = _unit(axes[3:] - (axes[3:] @ x) * x, place)
-            T[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
-        elif "zaxis" in given:
-            z = _unit(_numbers(given["zaxis"], 3, place), place)
-            axis = np.cross([0.0, 0.0, 1.0], z)
-            sine = float(np.linalg.norm(axis))
-            axis = axis if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
-            T[:3, :3] = rotation_about_axis(axis, math.atan2(sine, float(z[2])))
+        T[:3, 3] = _numbers(element.get("pos", "0 0 0"), 3, place)
+        w, *xyz = _unit(_numbers(element.get("quat", "1 0 0 0"), 4, place), place)
+        # Through axis and angle: digests of action tracks hold the last bit of this.
+        T[:3, :3] = rotation_about_axis(np.array(xyz), 2 * math.atan2(float(np.linalg.norm(xyz)), float(w)))
         return T
 
 
@@ -296,7 +232,6 @@ def read_urdf(text: str, where: object) -> TreeBody:
     if len(roots) != 1:
         raise DataError("A URDF has one root link", where=where, expected="one without a parent", got=f"{roots[:8]}")
     root = bodies[roots[0]]
-    _check_size(root, lambda body: body.children, where)
     _check_names(root, where)
     if (reached := sum(1 for _ in root.walk())) != len(bodies):
         raise DataError("Links form a circle", where=where, got=f"{reached} of {len(bodies)} reached from {roots}")
@@ -338,10 +273,6 @@ def _urdf_joints(joint: ET.Element, where: object) -> list[TreeJoint]:
     moves = _URDF_KINDS[kind]
     if moves is None:
         return []
-    axis, limit = joint.find("axis"), joint.find("limit")
+    axis = joint.find("axis")
     direction = _unit(_numbers("1 0 0" if axis is None else axis.get("xyz", "1 0 0"), 3, place), place)
-    limits = None
-    if limit is not None and kind != "continuous":
-        lower, upper = (float(_numbers(limit.get(key, "0"), 1, place)[0]) for key in ("lower", "upper"))
-        limits = (lower, upper)
-    return [TreeJoint(name, moves, direction, np.zeros(3), limits)]
+    return [TreeJoint(name, moves, direction, np.zeros(3))]

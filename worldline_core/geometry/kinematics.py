@@ -6,7 +6,6 @@ float64. Axis legend: n frames, a arms, j state columns, l links.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -58,8 +57,9 @@ class ArmKinematics:
         self.chain: Chain = chain_from_tree(self.tree)
         self.links: tuple[str, ...] = tuple(self.chain.get_frame_names(exclude_fixed=False))
         self.joints: tuple[str, ...] = tuple(self.chain.get_joint_parameter_names())
+        kinds = {joint.name: joint.kind for body in self.tree.walk() for joint in body.joints}
+        self.revolute = {name for name, kind in kinds.items() if kind == "revolute"}
         self._check_names()
-        self._check_units()
 
     def _check_names(self) -> None:
         embodiment = self.embodiment
@@ -79,23 +79,8 @@ class ArmKinematics:
                     got=", ".join(unknown),
                 )
 
-    def _check_units(self) -> None:
-        kinds = {joint.name: joint.kind for body in self.tree.walk() for joint in body.joints}
-        slides = [name for arm in self.embodiment.arms for name in arm.joints if kinds[name] == "prismatic"]
-        if self.embodiment.joint_units == "deg" and slides:
-            raise ConfigError(
-                "An arm with a slide cannot be given in degrees",
-                where=f"embodiment {self.embodiment.name}",
-                expected="joint_units: rad",
-                got=f"slides {', '.join(slides)}",
-            )
-        self.revolute = {name for name, kind in kinds.items() if kind == "revolute"}
-
     def _joint_positions(self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray | float] | None) -> Tensor:
-        """Positions [rad or m] of the chain's joints (n, joints): state, posture, fingers; anything else at zero.
-
-        This is the one place where degrees become radians.
-        """
+        """Positions [rad or m] of the chain's joints (n, joints): state, posture, fingers; anything else at zero."""
         embodiment = self.embodiment
         values = torch.as_tensor(state, dtype=torch.float64)
         embodiment.check_state(values.detach().cpu().numpy(), "state")
@@ -114,8 +99,6 @@ class ArmKinematics:
             columns.update({name: values[:, start + i] for i, name in enumerate(arm.joints)})
             for finger in arm.gripper.finger_joints:
                 columns[finger.name] = finger.closed + opening[:, index].clamp(0, 1) * (finger.open - finger.closed)
-        if embodiment.joint_units == "deg":
-            columns.update({n: c * (math.pi / 180) for n, c in columns.items() if n in self.revolute})
         zero = torch.zeros_like(values[:, 0])
         return torch.stack([columns.get(name, zero) for name in self.joints], dim=-1)
 
@@ -126,7 +109,7 @@ class ArmKinematics:
 
         Args:
             state: (n, j) observation.state or action.
-            posture: positions [the embodiment's units, m] of joints outside the state, (n,) or one number each; the
+            posture: positions [rad, m] of joints outside the state, (n,) or one number each; the
                 embodiment's own posture where not given.
 
         Raises:

@@ -35,7 +35,7 @@ from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.tokenizers import VideoDecoder, VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.model.world_model_config import ActionContract
 from worldline_core.rollout.observation import Camera, image_size, project_controls
-from worldline_core.rollout.robot import CommandedRobot, Response
+from worldline_core.rollout.robot import CommandedRobot
 from worldline_core.rollout.samplers import BlockCausalSimulator, FullClipSampler
 
 Frames = list[dict[str, np.ndarray]]
@@ -289,14 +289,12 @@ class Simulation:
             the robot then is (:mod:`worldline_core.rollout.robot`). At the start those of the observed frame.
     """
 
-    def __init__(
-        self, session: Session, starts: Starts, stepping: Stepping, *, limits: bool, response: Response | None
-    ) -> None:
+    def __init__(self, session: Session, starts: Starts, stepping: Stepping, *, limits: bool) -> None:
         self._session = session
         self._starts = starts
         self._stepping = stepping
         self.fps = stepping.contract.fps
-        self._robot = CommandedRobot(starts.kinematics, self.fps, starts.state, limits=limits, response=response)
+        self._robot = CommandedRobot(starts.kinematics, self.fps, starts.state, limits=limits)
         self.views, self.image_size, self.frames_per_step = stepping.views, stepping.image_size, stepping.frames
         self.num_frames = 1
         self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in session.observed]

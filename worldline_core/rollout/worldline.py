@@ -22,7 +22,6 @@ from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video, load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.observation import Camera, given_tracks, ordered_views
-from worldline_core.rollout.robot import Response
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts, Stepping
 
@@ -189,7 +188,6 @@ class WorldLine:
         state: np.ndarray,
         seed: int | Sequence[int] = 42,
         limits: bool = True,
-        response: Response | None = None,
     ) -> Simulation:
         """A simulation that a policy drives from these images on, step by step.
 
@@ -200,7 +198,6 @@ class WorldLine:
             seed: of the noise, one for all starts or each.
             limits: hold commands within the embodiment's limits before they are drawn. Without, and with commands within
                 them, the bytes are those of :meth:`predict` (of a Stage II model: with ``clip_frames``, 33 if not given).
-            response: fitted response of the robot, from which its state follows.
 
         Raises:
             DataError, CalibrationError, ConfigError: as :meth:`predict`.
@@ -213,7 +210,7 @@ class WorldLine:
         maps = partial(self.action_maps, frames=index, start=int(self.causal is None), views=views)
         session = self.session(starts.pictures(views, self.image_size), starts.seeds, views)
         stepping = Stepping(self.contract, views, self.image_size, frames, maps)
-        return Simulation(session, starts, stepping, limits=limits, response=response)
+        return Simulation(session, starts, stepping, limits=limits)
 
     def chosen_views(self, given: Iterable[str]) -> tuple[str, ...]:
         """Given views in the model's order.

@@ -66,7 +66,7 @@ class Columns:
         self.names = [f"{name.removeprefix(single).replace('/', '_')}.pos" for name in robot.state_names]
         self._scale, self._zero = np.ones(robot.state_size), np.zeros(robot.state_size)
         if use_degrees:
-            turning = [name in kinematics.revolute and robot.joint_units == "rad" for name in robot.state_names]
+            turning = [name in kinematics.revolute for name in robot.state_names]
             self._scale[turning] = np.degrees(1.0)
             for arm in robot.arms:
                 column, gripper = robot.gripper_column(arm), arm.gripper

@@ -181,7 +181,7 @@ class WorldLineRobot(Robot):
             write_cameras(root, self._episode, self._start, self._kinematics, np.stack(rows), fps)
             names = [self._columns.names[robot.gripper_column(arm)] for arm in robot.arms]
             ends = [(0.0, 100.0) if config.use_degrees else (a.gripper.closed, a.gripper.open) for a in robot.arms]
-            unit = "deg" if config.use_degrees else robot.joint_units
+            unit = "deg" if config.use_degrees else "rad"
             write_source(root, robot.name, unit, dict(zip(names, ends, strict=True)), list(self.cameras))
 
     def _check_pace(self) -> None:

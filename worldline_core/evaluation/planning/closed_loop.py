@@ -27,7 +27,7 @@ from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.tokenizers import frames_to_video, video_to_frames
 from worldline_core.rollout.observation import Camera, image_size, project_controls
-from worldline_core.rollout.robot import CommandedRobot, Response
+from worldline_core.rollout.robot import CommandedRobot
 from worldline_core.rollout.simulation import Simulation
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.training.video_teacher import VideoTeacher
@@ -234,7 +234,7 @@ class ClosedLoopPlanner:
         batch: candidates that are simulated together; time and certainty are checked between batches.
         seconds, certain, margin: of one call, as of :func:`search`; the margin is in favour of the rest of the last choice.
         seed: of the proposals, and of the model's noise, which all candidates share.
-        limits, response: as of ``WorldLine.start``.
+        limits: as of ``WorldLine.start``.
 
     Raises:
         ConfigError: there is no such solver or embodiment, or a number is not positive.
@@ -258,7 +258,6 @@ class ClosedLoopPlanner:
         margin: float = 0.0,
         seed: int = 42,
         limits: bool = True,
-        response: Response | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         if isinstance(solver, str) and solver not in SOLVERS:
@@ -276,7 +275,7 @@ class ClosedLoopPlanner:
         self._solver: Solver = SOLVERS[solver] if isinstance(solver, str) else solver
         self._batch, self._seconds, self._clock = batch, seconds, clock
         self._certain, self._margin = certain, margin
-        self._seed, self._random, self._limits, self._response = seed, np.random.default_rng(seed), limits, response
+        self._seed, self._random, self._limits = seed, np.random.default_rng(seed), limits
         self._first_state: np.ndarray | None = None
         self._past: dict[str, list[np.ndarray]] = {}
         self._points: np.ndarray | None = None
@@ -341,7 +340,6 @@ class ClosedLoopPlanner:
             }
         return self.world.start(
             now, cameras, embodiment=self.kinematics, state=command, seed=self._seed, limits=self._limits,
-            response=self._response,
         )  # fmt: skip
 
     def _rest(self, chunk: int, frames: int) -> np.ndarray:
@@ -364,7 +362,7 @@ class ClosedLoopPlanner:
     def _executable(self, command: np.ndarray, sequences: np.ndarray) -> np.ndarray:
         starts = np.repeat(command[None], len(sequences), axis=0)
         fps = self.world.contract.fps
-        robot = CommandedRobot(self.kinematics, fps, starts, limits=self._limits, response=None)
+        robot = CommandedRobot(self.kinematics, fps, starts, limits=self._limits)
         return robot.follow(sequences)[1]
 
     def _scores(
