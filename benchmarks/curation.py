@@ -33,9 +33,8 @@ from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.fingerprint import Fingerprint, fingerprint
 from worldline_core.data.episodes.view_recording import RecordedView
-from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.clip import VideoClip, decode_video
 from worldline_core.data.video.encoder import encode_video
-from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 

@@ -32,8 +32,8 @@ from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.overlays import draw_overlay
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.clip import decode_video
 from worldline_core.data.video.encoder import encode_video
-from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure

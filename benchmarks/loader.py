@@ -1,12 +1,11 @@
 """Speed of the training input beside raw decoding of the same clips.
 
-Run: `python benchmarks/loader.py [--processes 2] [--only 480x640] [--decoder pyav]`. It makes its own recordings (three views, encoded as
+Run: `python benchmarks/loader.py [--processes 2] [--only 480x640]`. It makes its own recordings (three views, encoded as
 curation does) in a temporary folder, then times, in turns so that a busy machine disturbs all alike:
 
 - *raw*: processes that do nothing but decode the clips and drop the frames;
-- *loader*: the same number of loader processes of the same decoder that read the same clips in the same order into
-  shared memory, and the training process that takes every batch from them;
-- *whole clips*: torchcodec's own `get_frames_in_range` / `EpisodeSet.frames`, what one would write without this loader.
+- *loader*: the same number of loader processes that read the same clips in the same order into shared memory, and the
+  training process that takes every batch from them.
 
 The ratio of a table is loader to raw in frames per second of processor time, all processes added up (the training process
 too), which hardly depends on what else the machine does; the ratio by the clock stands beside it. Medians of the rounds.
@@ -30,7 +29,6 @@ import numpy as np
 from benchmarks.harness import RECORDINGS, command_line, print_table
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.video.frame_decoder import torchcodec_fault
 from worldline_core.training.clip_config import ClipSampling, FrameInput, ReadingConfig
 from worldline_core.training.clip_loader import ClipDataset, read_ahead
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
@@ -105,55 +103,27 @@ def decode_raw(source: FrameSource, clips: Sequence[Clip]) -> None:
                 pass
 
 
-def decode_whole(source: FrameSource, clips: Sequence[Clip]) -> None:
-    """Whole clips as arrays of their own, as one would write it first."""
-    if source.config.decoder == "pyav":
-        for clip in clips:
-            position = source.episodes.position(clip.episode_id)
-            np.stack([source.episodes.frames(position, view, list(clip.frames)) for view in VIEWS])
-        return
-    from torchcodec.decoders import VideoDecoder
-
-    for clip in clips:
-        position = source.episodes.position(clip.episode_id)
-        views = []
-        for view in VIEWS:
-            video = source.episodes.clip(position, view)
-            decoder = VideoDecoder(str(video.path), dimension_order="NHWC", seek_mode="approximate")
-            first = round(video.start_time * video.fps) + clip.start
-            views.append(decoder.get_frames_in_range(first, first + clip.stride * clip.num_frames, clip.stride).data)
-        np.stack(views)
-
-
-def serve(
-    work: Callable[[FrameSource, Sequence[Clip]], None], source: FrameSource, clips: list[Clip], pipe: Connection
-) -> None:
-    """A process of a baseline: one pass over its clips whenever it is asked."""
+def serve(source: FrameSource, clips: list[Clip], pipe: Connection) -> None:
+    """A process of the baseline: one pass over its clips whenever it is asked."""
     import torch
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     while pipe.recv():
-        work(source, clips)
+        decode_raw(source, clips)
         pipe.send(True)
 
 
 class Baseline:
     """Processes that share clips as the loader's do: clip i belongs to process i modulo their number."""
 
-    def __init__(
-        self,
-        work: Callable[[FrameSource, Sequence[Clip]], None],
-        source: FrameSource,
-        batches: list[tuple[Clip, ...]],
-        processes: int,
-    ) -> None:
+    def __init__(self, source: FrameSource, batches: list[tuple[Clip, ...]], processes: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.processes, self.pipes = [], []
         for number in range(processes):
             ours, theirs = context.Pipe()
             clips = [clip for batch in batches[number::processes] for clip in batch]
-            process = context.Process(target=serve, args=(work, source, clips, theirs), daemon=True)
+            process = context.Process(target=serve, args=(source, clips, theirs), daemon=True)
             process.start()
             self.processes.append(process)
             self.pipes.append(ours)
@@ -181,16 +151,16 @@ class RepeatedClips:
         return self.sampler.clips(index % self.steps)
 
 
-def measure(case: dict[str, Any], episodes: EpisodeSet, decoder: str, processes: int, rounds: int) -> dict[str, Any]:
-    """Frames a second of the loader and of both baselines."""
-    config = FrameInput.model_validate({"decoder": decoder, "image_size": case["size"]})
+def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int, rounds: int) -> dict[str, Any]:
+    """Frames a second of the loader and of the baseline."""
+    config = FrameInput.model_validate({"image_size": case["size"]})
     source = FrameSource(episodes, RECORDINGS.with_name("models") / "tokenizer", config, views=VIEWS)
     sampling = ClipSampling.model_validate({"lengths": case["lengths"]})
     sampler = ClipSampler(source.rows, sampling, splits=["train"], start_step=1, batch_size=case["batch"], seed=0)
     steps = case["steps"]
     batches = [sampler.clips(index).clips for index in range(steps)]
     frames = len(VIEWS) * sum(clip.num_frames for batch in batches for clip in batch)
-    raw, whole = (Baseline(work, source, batches, processes) for work in (decode_raw, decode_whole))
+    raw = Baseline(source, batches, processes)
     repeated: Any = RepeatedClips(sampler, steps)
     loader = read_ahead(ClipDataset(source, repeated, VIEWS, ReadingConfig(workers=processes)), 0, None)
 
@@ -205,14 +175,13 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, decoder: str, processes:
             spent = now
             time.sleep(0.1)
 
-    baselines = {process.pid for process in (*raw.processes, *whole.processes)}
+    baselines = {process.pid for process in raw.processes}
     load()
     loading += [process.pid or 0 for process in multiprocessing.active_children() if process.pid not in baselines]
     me = os.getpid()
     runs: dict[str, tuple[Callable[[], None], list[int]]] = {
         "raw": (raw.run, [process.pid for process in raw.processes]),
         "loader": (load, loading),
-        "whole_clips": (whole.run, [process.pid for process in whole.processes]),
     }
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}
     for turn in range(rounds + 1):
@@ -223,7 +192,6 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, decoder: str, processes:
             if turn:  # the first round opens files and touches memory for the first time
                 times[name].append(spent)
     raw.close()
-    whole.close()
     found: dict[str, Any] = {"decoder": source.decoder.name, "frames_a_round": frames}
     for name, spent in times.items():
         found[f"{name}_frames_per_processor_second"] = frames / statistics.median(cpu for cpu, _ in spent)
@@ -241,10 +209,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", choices=sorted(CASES))
-    parser.add_argument("--decoder", choices=["torchcodec", "pyav"], help="one decoder instead of both")
     arguments = parser.parse_args()
-    decoders = ["pyav"] if torchcodec_fault() else ["torchcodec", "pyav"]
-    decoders = [arguments.decoder] if arguments.decoder else decoders
 
     def rows() -> Iterator[tuple[str, ...]]:
         for name, case in CASES.items():
@@ -252,18 +217,17 @@ def main() -> None:
                 continue
             with tempfile.TemporaryDirectory() as folder:
                 episodes = write_recordings(Path(folder) / "set", case)
-                for decoder in decoders:
-                    found = measure(case, episodes, decoder, arguments.processes, arguments.rounds)
-                    cells = [
-                        f"{found[f'{kind}_frames_per_processor_second']:.0f} ({found[f'{kind}_frames_per_second']:.0f})"
-                        for kind in ("raw", "loader", "whole_clips")
-                    ]
-                    yield name, found["decoder"], *cells, f"{found['ratio']:.2f} ({found['ratio_by_the_clock']:.2f})"
+                found = measure(case, episodes, arguments.processes, arguments.rounds)
+            cells = [
+                f"{found[f'{kind}_frames_per_processor_second']:.0f} ({found[f'{kind}_frames_per_second']:.0f})"
+                for kind in ("raw", "loader")
+            ]
+            yield name, found["decoder"], *cells, f"{found['ratio']:.2f} ({found['ratio_by_the_clock']:.2f})"
 
     print(
         f"{arguments.processes} processes; frames per second of processor time (by the clock), all processes together"
     )
-    print_table(("", "decoder", "raw", "loader", "whole clips", "loader over raw"), rows())
+    print_table(("", "decoder", "raw", "loader", "loader over raw"), rows())
 
 
 if __name__ == "__main__":

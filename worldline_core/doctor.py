@@ -87,15 +87,9 @@ def _hardware(project: Path) -> Iterator[MachineCheck]:
 def _libraries() -> Iterator[MachineCheck]:
     import av
 
-    from worldline_core.data.video.frame_decoder import describe_decoders
-
     missing = [name for name in ("libx264", "libdav1d") if name not in av.codecs_available]
     found = f"PyAV {av.__version__}" + (f" without {', '.join(missing)}" if missing else ": H.264, AV1 decode")
     yield _check("video codecs", not missing, found, "reinstall av from PyPI")
-    decoders = describe_decoders()
-    advice = decoders["next_step"]
-    found = f"auto takes {decoders['auto']}" + (f" (torchcodec: {decoders['torchcodec']})" if advice else "")
-    yield _check("clip decoder", not advice, found, advice, optional=True)
     for package, purpose in EXTRAS.items():
         present = importlib.util.find_spec(package) is not None
         advice = installing(purpose.split()[0])

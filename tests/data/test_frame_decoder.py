@@ -1,10 +1,7 @@
-"""Both decoders against PyAV's plain frame-by-frame decoding: same frames, same bytes, whatever the file is like."""
+"""The decoder against PyAV's plain frame-by-frame decoding: same frames, same bytes, whatever the file is like."""
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,22 +10,11 @@ import numpy as np
 import pytest
 
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.video import frame_decoder
-from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.clip import FrameDecoder, VideoClip
 from worldline_core.data.video.encoder import concatenate_videos, encode_video
-from worldline_core.data.video.frame_decoder import (
-    FrameDecoder,
-    PyavDecoder,
-    TorchcodecDecoder,
-    describe_decoders,
-    open_decoder,
-    torchcodec_fault,
-)
-from worldline_core.doctor import examine_machine, format_findings
-from worldline_core.errors import DataError, UnavailableError
+from worldline_core.errors import DataError
 
 FPS = 10.0
-needs_torchcodec = pytest.mark.skipif(torchcodec_fault() is not None, reason=f"torchcodec: {torchcodec_fault()}")
 
 
 def moving(count: int, *, seed: int = 0, height: int = 48, width: int = 64) -> np.ndarray:
@@ -63,9 +49,9 @@ def plain(path: Path) -> list[np.ndarray]:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
-@pytest.fixture(params=["pyav", pytest.param("torchcodec", marks=needs_torchcodec)])
-def decoder(request: pytest.FixtureRequest) -> Iterator[FrameDecoder]:
-    opened = open_decoder(request.param, open_files=2)
+@pytest.fixture
+def decoder() -> Iterator[FrameDecoder]:
+    opened = FrameDecoder(open_files=2)
     yield opened
     opened.close()
 
@@ -185,57 +171,3 @@ def test_open_files_are_bounded(decoder: FrameDecoder, tmp_path: Path) -> None:
             assert 1 <= descriptors() <= 2
     decoder.close()
     assert descriptors() == 0
-
-
-@needs_torchcodec
-def test_torchcodec_leaves_approximate_seeking_where_it_misses(tmp_path: Path) -> None:
-    # The rate in the header is the mean of two: frame numbers computed from it are wrong nearly everywhere.
-    times = [*range(30), *range(30, 120, 3)]
-    path = write(tmp_path / "variable.mp4", moving(60), times=times, g="12")
-    expected = dict(zip(times, plain(path), strict=True))
-    moved = plain(own(tmp_path / "own.mp4"))[9]
-    decoder = TorchcodecDecoder(open_files=4)
-    for index in (3, 29, 33, 60, 117):
-        found = next(iter(decoder.frames(VideoClip(path, 120, FPS, 0.0), [index])))
-        assert np.array_equal(found, expected[index]), index
-    assert decoder.exact_files == {str(path)}
-    assert np.array_equal(next(iter(decoder.frames(VideoClip(tmp_path / "own.mp4", 60, FPS, 0.0), [9]))), moved)
-    assert decoder.exact_files == {str(path)}
-    decoder.close()
-
-
-def test_torchcodec_that_does_not_load_is_said_and_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_decoder, "torchcodec_fault", lambda: "RuntimeError: libavutil.so.59 is missing")
-    with pytest.raises(
-        UnavailableError, match=r"torchcodec cannot be loaded[\s\S]*libavutil[\s\S]*apt-get install ffmpeg"
-    ):
-        open_decoder("torchcodec")
-    assert isinstance(open_decoder("auto"), PyavDecoder)
-    found = describe_decoders()
-    assert found["auto"].startswith("PyAV")
-    assert "apt-get install ffmpeg" in found["next_step"]
-    line = next(line for line in format_findings(examine_machine(Path.cwd())).splitlines() if "clip decoder" in line)
-    assert "auto takes PyAV" in line
-    assert "libavutil.so.59 is missing" in line
-
-
-def test_the_fault_of_torchcodec_is_read_from_its_import(tmp_path: Path) -> None:
-    package = tmp_path / "torchcodec"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "decoders.py").write_text("raise RuntimeError('Could not load libtorchcodec.\\nMany more lines')")
-    code = "from worldline_core.data.video.frame_decoder import torchcodec_fault; print(torchcodec_fault())"
-    found = subprocess.run(
-        [sys.executable, "-c", code],
-        env={"PYTHONPATH": f"{tmp_path}:{Path(__file__).parents[2]}", "PATH": ""},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert found.stdout.strip() == "RuntimeError: Could not load libtorchcodec."
-
-
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="no ffmpeg on the path")
-def test_the_fault_is_none_where_ffmpeg_is_installed() -> None:
-    assert torchcodec_fault() is None
-    assert open_decoder("auto").name.startswith("torchcodec")

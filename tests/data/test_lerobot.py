@@ -18,9 +18,8 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.view_recording import RecordedView
-from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.clip import VideoClip, decode_video
 from worldline_core.data.video.encoder import encode_video
-from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import ConfigError, DataError
 
 Make = Callable[..., tuple]

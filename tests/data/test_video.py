@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from worldline_core.data.video.clip import VideoClip, video_size
+from worldline_core.data.video.clip import VideoClip, decode_frames, decode_video, video_size
 from worldline_core.data.video.encoder import X264_PARAMETERS, Encoding, VideoEncoder, concatenate_videos, encode_video
-from worldline_core.data.video.frame_decoder import decode_frames, decode_video
 from worldline_core.errors import DataError
 
 

@@ -11,9 +11,8 @@ import pytest
 
 from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, copy_clip, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.video.clip import VideoClip, open_video, read_clip
+from worldline_core.data.video.clip import VideoClip, decode_frames, decode_video, open_video, read_clip
 from worldline_core.data.video.encoder import concatenate_videos, encode_video
-from worldline_core.data.video.frame_decoder import decode_frames, decode_video
 
 FPS = 30.0
 ENCODERS = {

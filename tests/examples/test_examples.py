@@ -13,8 +13,8 @@ import pytest
 from flows.pipeline import chain
 from tasks.execution.chain import outline, ready_inputs
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.clip import decode_video
 from worldline_core.data.video.encoder import encode_video
-from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.store.store import ArtifactStore
 

@@ -26,7 +26,7 @@ from worldline_core.actions.overlays import (
     picture_pixel,
     write_overlay_video,
 )
-from worldline_core.data.video.frame_decoder import decode_video
+from worldline_core.data.video.clip import decode_video
 from worldline_core.errors import DataError
 from worldline_core.pictures import COLUMN_GAP_PX, LABEL_HEIGHT_PX, text_width_px
 

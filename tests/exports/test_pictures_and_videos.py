@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from worldline_core.data.video.frame_decoder import decode_video
+from worldline_core.data.video.clip import decode_video
 from worldline_core.pictures import (
     COLUMN_GAP_PX,
     LABEL_HEIGHT_PX,

@@ -14,7 +14,7 @@ import pytest
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.frame_decoder import decode_video
+from worldline_core.data.video.clip import decode_video
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.exports.export import export, export_rollout, export_worldarena
 from worldline_core.rollout.rollout_set import RolloutSet

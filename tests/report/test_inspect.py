@@ -15,7 +15,7 @@ from rerun.chunk import RrdReader
 from tests.report.conftest import EPISODES, episode, frames  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.overlays import ARM_COLOURS
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
-from worldline_core.data.video.frame_decoder import decode_video
+from worldline_core.data.video.clip import decode_video
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.report.inspect import inspect
 from worldline_core.store.artifact_files import write_manifest

@@ -149,17 +149,14 @@ def test_batches_reach_a_gpu(world: Any) -> None:
         assert torch.equal(load(index).latents.cpu(), plain.load(sampler_of(source).clips(index)).latents)
 
 
-@pytest.mark.parametrize("decoder", ["auto", "pyav"])
-def test_a_damaged_clip_is_named_or_skipped_and_counted(
-    world: Any, tokenizer: Path, tmp_path: Path, decoder: str
-) -> None:
+def test_a_damaged_clip_is_named_or_skipped_and_counted(world: Any, tokenizer: Path, tmp_path: Path) -> None:
     shutil.copytree(world.episodes, tmp_path / "set")
     (video,) = (tmp_path / "set").rglob("*left_wrist*/**/*.mp4")
     content = video.read_bytes()
     half = len(content) // 2
     video.write_bytes(content[:half] + bytes(len(content) - half))
     episodes = EpisodeSet.open(tmp_path / "set")
-    config = FrameInput.model_validate({"image_size": [32, 32], "decoder": decoder, "on_unreadable": "skip"})
+    config = FrameInput.model_validate({"image_size": [32, 32], "on_unreadable": "skip"})
     source = FrameSource(episodes, tokenizer, config, views=VIEWS)
     faults: dict[str, str] = {}
     for row in episodes.rows:

@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
+from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput
 from worldline_core.training.clip_loader import ClipLoader
@@ -145,10 +145,9 @@ def open_frames(episodes: EpisodeSet | Path, tokenizer: Path, **changes: Any) ->
     return FrameSource(episodes, tokenizer, FrameInput.model_validate(values), **options)
 
 
-@pytest.mark.parametrize("decoder", ["auto", "pyav"])
-def test_frames_are_those_of_the_episode_set(world: Any, tokenizer: Path, decoder: str) -> None:
+def test_frames_are_those_of_the_episode_set(world: Any, tokenizer: Path) -> None:
     episodes = EpisodeSet.open(world.episodes)
-    source = open_frames(episodes, tokenizer, decoder=decoder)
+    source = open_frames(episodes, tokenizer)
     for clip in (Clip("episode-003", 0, 17, 1), Clip("episode-005", 3, 5, 3), Clip("episode-000", 7, 9, 1)):
         position = episodes.position(clip.episode_id)
         for view, pictures in zip(VIEWS, read(source, clip), strict=True):
@@ -239,12 +238,3 @@ def test_what_is_sent_to_loader_processes_reads_the_same(world: Any, tokenizer: 
     content = pickle.dumps(source)
     assert len(content) < 40_000
     assert np.array_equal(read(pickle.loads(content), clip), first)  # noqa: S301 - our own
-
-
-def test_an_explicit_torchcodec_that_cannot_load_stops_before_training(
-    world: Any, tokenizer: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("worldline_core.data.video.frame_decoder.torchcodec_fault", lambda: "OSError: libavcodec.so")
-    with pytest.raises(UnavailableError, match="libavcodec"):
-        open_frames(world.episodes, tokenizer, decoder="torchcodec")
-    assert open_frames(world.episodes, tokenizer).description["decoder"].startswith("PyAV")

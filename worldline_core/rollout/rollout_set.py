@@ -13,9 +13,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.clip import VideoClip, decode_video
 from worldline_core.data.video.encoder import Encoding, VideoEncoder
-from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.artifact_files import read_table, row_schema
 from worldline_core.store.atomic import atomic_path

@@ -9,7 +9,6 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import ImageSize, StrictModel
-from worldline_core.data.video.frame_decoder import DecoderChoice
 
 JOINT = "joint"
 """In place of a view's name: all views of the model together."""
@@ -100,14 +99,12 @@ class FrameInput(ReadingConfig):
     """Frames straight from the EpisodeSet; the tokenizer encodes them during training.
 
     ``image_size``: (H, W) that frames are resized to, as in encode_latents. ``start_step``: clips start at multiples of
-    it. ``decoder``: "auto" is torchcodec where it loads, else PyAV. ``open_files``: video files that a process keeps
-    open.
+    it. ``open_files``: video files that a process keeps open.
     """
 
     kind: Literal["frames"] = "frames"
     image_size: ImageSize = (64, 96)
     start_step: int = Field(default=1, ge=1)
-    decoder: DecoderChoice = "auto"
     open_files: int = Field(default=16, ge=1)
 
 

@@ -26,7 +26,7 @@ from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import SAMPLES, ActionTracks, TrackBatch, collate_tracks
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.frame_decoder import FrameDecoder, open_decoder
+from worldline_core.data.video.clip import FrameDecoder
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import (
@@ -409,7 +409,7 @@ class FrameSource(ClipSource):
         self.description = {
             "tokenizer": tokenizer_fingerprint(self._tokenizer, tokenizer_folder),
             "views": list(views),
-            "decoder": self.decoder.name,
+            "decoder": FrameDecoder.name,
         }
 
     def __getstate__(self) -> dict[str, Any]:
@@ -421,7 +421,7 @@ class FrameSource(ClipSource):
     def decoder(self) -> FrameDecoder:
         """This process's decoder."""
         if self._decoder is None:
-            self._decoder = open_decoder(self.config.decoder, open_files=self.config.open_files)
+            self._decoder = FrameDecoder(self.config.open_files)
         return self._decoder
 
     def shape(self, num_frames: int) -> tuple[int, ...]:

@@ -23,8 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from worldline_core.data.guards.plain_files import column_names, read_json, read_json_lines, read_table, validated
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, note_file, regular_file
-from worldline_core.data.video.clip import VideoClip, video_size
-from worldline_core.data.video.frame_decoder import decode_frames
+from worldline_core.data.video.clip import VideoClip, decode_frames, video_size
 from worldline_core.errors import DataError
 
 VERSION = "v3.0"

@@ -1,14 +1,16 @@
-"""The encoded video of one view of an episode: where it lies, what its file says, and its pictures one after the other.
+"""The encoded video of one view of an episode: where it lies, what its file says, and its pictures: all, or exact ones.
 
 A picture keeps the decoder's frame: grey values cost nothing, colours are converted only when they are asked for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import av
@@ -16,11 +18,12 @@ import av.error
 import numpy as np
 from av.container import InputContainer
 from av.video.frame import VideoFrame
-from av.video.reformatter import ColorRange
+from av.video.reformatter import ColorRange, VideoReformatter
 from av.video.stream import VideoStream
 
 from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import AnyPath, local_file, regular_file
+from worldline_core.errors import DataError
 
 _LUMA_FIRST = frozenset(
     ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "nv21", "gray", "yuv440p", "yuvj440p")
@@ -324,3 +327,102 @@ def wrong_count(path: AnyPath, expected: int | None, got: int, cause: str | None
         next_step="copy the file again, or leave the episode in quarantine",
         evidence={"expected_frames": expected, "decoded_frames": got},
     )
+
+
+class FrameDecoder:
+    """Exact frames of clips, found by their presentation times: a neighbouring frame is an error and never returned.
+
+    Files stay open, for clips of joined videos come from the same files again and again.
+
+    Args:
+        open_files: largest number of them; the least recently used one is closed first.
+    """
+
+    name = f"PyAV {av.__version__}"
+
+    def __init__(self, open_files: int = 16) -> None:
+        self._limit = open_files
+        self._open: OrderedDict[str, tuple[InputContainer, VideoStream, ExitStack]] = OrderedDict()
+        self._reformatter = VideoReformatter()  # one for all frames: setting one up costs as much as a small frame
+
+    def frames(self, clip: VideoClip, indices: Sequence[int]) -> Iterator[np.ndarray]:
+        """uint8 (H, W, 3) RGB of the clip's frames ``indices`` (increasing), one after the other.
+
+        Raises: RejectedInputError: missing_file; unreadable, truncated_video when a frame is not there. DataError when the
+            indices are not increasing, or lie outside of the clip.
+        """
+        if not indices or any(b <= a for a, b in pairwise(indices)):
+            raise DataError(
+                "Frames are read in order", where=clip.path, expected="increasing indices", got=list(indices)
+            )
+        if indices[0] < 0 or indices[-1] >= clip.num_frames:
+            raise DataError(
+                "Frame index outside of the clip",
+                where=clip.path,
+                expected=f"0 <= index < {clip.num_frames}",
+                got=f"{indices[0]}..{indices[-1]}",
+            )
+        times = [clip.start_time + index / clip.fps for index in indices]
+        found, cause = 0, "a frame is not where it should be"
+        try:
+            for frame in seek_before(*self._file(clip.path), times[0]):
+                if frame.time is None or (late := (float(frame.time) - times[found]) * clip.fps) < -FRAME_TOLERANCE:
+                    continue
+                if late > FRAME_TOLERANCE:
+                    break
+                yield self._reformatter.reformat(frame, format="rgb24").to_ndarray()
+                found += 1
+                if found == len(times):
+                    return
+        except av.error.FFmpegError as error:
+            cause = str(error)
+        self._close(str(clip.path))
+        raise wrong_count(clip.path, len(times), found, cause)
+
+    def close(self) -> None:
+        """Close the files that are kept open."""
+        for path in list(self._open):
+            self._close(path)
+
+    def _file(self, path: AnyPath) -> tuple[InputContainer, VideoStream]:
+        if str(path) not in self._open:
+            with ExitStack() as stack:
+                container, stream = stack.enter_context(open_video(path))
+                # dav1d starts threads of its own by default; loader processes are parallel already.
+                stream.codec_context.thread_count = 1
+                self._open[str(path)] = container, stream, stack.pop_all()
+            while len(self._open) > self._limit:
+                self._close(next(iter(self._open)))
+        self._open.move_to_end(str(path))
+        return self._open[str(path)][:2]
+
+    def _close(self, path: str) -> None:
+        if path in self._open:
+            self._open.pop(path)[2].close()
+
+
+def decode_video(path: AnyPath, expected_frames: int | None = None) -> np.ndarray:
+    """All frames of a video, uint8 (N, H, W, 3).
+
+    Raises: RejectedInputError naming the file and the frame counts when it is truncated, undecodable or of another length.
+    """
+    count = len(frame_times(path)) if expected_frames is None else expected_frames
+    return np.stack([picture.rgb for picture in read_clip(VideoClip.whole_file(path, count, 1.0))])
+
+
+def decode_frames(clip: VideoClip, indices: Sequence[int] | None = None) -> np.ndarray:
+    """Exact frames of one clip, uint8 (len, H, W, 3).
+
+    Args:
+        indices: frame numbers inside the clip, in any order, also repeated; None for all.
+
+    Raises: DataError when an index lies outside of the clip; RejectedInputError when a frame cannot be decoded.
+    """
+    wanted = range(clip.num_frames) if indices is None else [int(index) for index in indices]
+    ordered = sorted(set(wanted))
+    decoder = FrameDecoder(open_files=1)
+    try:
+        frames = dict(zip(ordered, decoder.frames(clip, ordered), strict=True))
+    finally:
+        decoder.close()
+    return np.stack([frames[index] for index in wanted])

@@ -11,8 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from worldline_core.data.guards.plain_files import expect_layout
-from worldline_core.data.video.clip import VideoClip, read_clip, video_size
-from worldline_core.data.video.frame_decoder import decode_frames
+from worldline_core.data.video.clip import VideoClip, decode_frames, read_clip, video_size
 
 
 class Frames(Protocol):
