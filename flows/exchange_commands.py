@@ -43,9 +43,7 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     compare.add_argument("--json", action="store_true", help="print JSON")
     compare.set_defaults(run=_compare)
     places = "hf://datasets/ORG/NAME (token: HF_TOKEN), a URL such as s3://bucket/folder, or a folder"
-    push = commands.add_parser(
-        "push", help="publish an EpisodeSet with its dataset card; continues after an interruption"
-    )
+    push = commands.add_parser("push", help="publish an EpisodeSet with its dataset card")
     push.add_argument("artifact", type=Path, metavar="FOLDER")
     push.add_argument("where", metavar="WHERE", help=places)
     push.add_argument("--public", action="store_true", help="others may read it there (default: a private repository)")
@@ -53,7 +51,6 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
         "--allow-restricted", action="store_true",
         help="push although a source's licence forbids it or does not say: you have the right",
     )  # fmt: skip
-    push.add_argument("--title", help="heading of the dataset card")
     push.set_defaults(run=_push)
     pull = commands.add_parser("pull", help="fetch a published EpisodeSet and compare every file with its digest")
     pull.add_argument("where", metavar="WHERE", help=places)
@@ -110,17 +107,13 @@ def _push(arguments: argparse.Namespace) -> None:
     from worldline_core.publishing import push
 
     pushed = push(
-        arguments.artifact,
-        arguments.where,
-        public=arguments.public,
-        allow_restricted=arguments.allow_restricted,
-        title=arguments.title,
+        arguments.artifact, arguments.where, public=arguments.public, allow_restricted=arguments.allow_restricted
     )
-    print(f"{arguments.where}  {pushed.files} files  {pushed.num_bytes / 2**20:.1f} MiB")
+    print(f"{arguments.where}  {len(pushed.files)} files  {pushed.num_bytes / 2**20:.1f} MiB")
 
 
 def _pull(arguments: argparse.Namespace) -> None:
     from worldline_core.publishing import pull
 
     pulled = pull(arguments.where, arguments.folder)
-    print(f"{arguments.folder}  {pulled.files} files  {pulled.num_bytes / 2**20:.1f} MiB")
+    print(f"{arguments.folder}  {len(pulled.files)} files  {pulled.num_bytes / 2**20:.1f} MiB")

@@ -1,9 +1,7 @@
 """Push a finished EpisodeSet to a folder, an object store or the Hugging Face hub, and pull it back.
 
-A published set has a list of its files with sizes and digests, which is pulled first and checked before anything else.
-A push to the hub is one commit. Elsewhere files that differ are removed first, and the list is written last; until then
-a list of another name records what is being sent, so that the same command continues after an interruption.
-Credentials come from the environment alone (HF_TOKEN for the hub; HF_ENDPOINT names another hub).
+A published set has a list of its files with sizes and digests, by which every pulled file is checked. A push to the hub is
+one commit; elsewhere the list says until the end that the set is incomplete. Credentials come from the environment alone.
 """
 
 from __future__ import annotations
@@ -14,7 +12,6 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import batched
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, cast
@@ -39,27 +36,23 @@ from worldline_core.store.remote import AnyPath, file_system, first_line, list_f
 from worldline_core.store.store import folder_lock
 
 FILE_LIST = "worldline_files.json"
-"""Written last wherever a set is published: a copy without it is not complete."""
-UNFINISHED_LIST = "worldline_files.unfinished.json"
-MAX_LIST_BYTES = 256 << 20
 _BATCH_FILES = 32
 _HUB_LOCATION = re.compile(r"hf://datasets/(?P<id>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?/?")
 _CLIENTS = ("aiohttp", "botocore", "httpx", "huggingface_hub")
-_DEVICES = frozenset({"CON", "PRN", "AUX", "NUL", *(f"{name}{n}" for name in ("COM", "LPT") for n in range(1, 10))})
 
 
 class PublishedFile(StrictModel):
-    """Size and digest of a file; `card` marks those made for the publication, which are not content of the set."""
+    """Size and digest of a file."""
 
     size: int = Field(ge=0)
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    card: bool = False
 
 
 class FileList(StrictModel):
-    """All files of a published set except the list itself, by path."""
+    """The files of a published set by path; neither the list itself nor the dataset card is among them."""
 
-    version: Literal[2] = 2
+    version: Literal[3] = 3
+    complete: bool = True
     files: dict[str, PublishedFile]
 
     @property
@@ -67,19 +60,7 @@ class FileList(StrictModel):
         return sum(file.size for file in self.files.values())
 
 
-@dataclass(frozen=True)
-class Published:
-    """A published or pulled set; `moved_files` were sent or fetched by this call, `commit` is the hub's."""
-
-    files: int
-    num_bytes: int
-    moved_files: int
-    commit: str | None = None
-
-
-def push(
-    folder: Path, where: str, *, public: bool = False, allow_restricted: bool = False, title: str | None = None
-) -> Published:
+def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bool = False) -> FileList:
     """Push a finished EpisodeSet with its dataset card; files of an earlier push that are gone are removed.
 
     Args:
@@ -87,7 +68,6 @@ def push(
         public: others can read the location, so licences that do not allow that are refused. Otherwise a new repository
             of the hub is private.
         allow_restricted: push although licences do not allow it.
-        title: heading of the dataset card.
 
     Raises: DataError when the folder is no set, or its licences do not allow it; ArtifactError when the set is damaged or
         not self-contained, the location holds something else or has another visibility, or the store refuses;
@@ -97,47 +77,31 @@ def push(
     verify_artifact(folder)
     sources = set_files(folder)
     _check_may_publish(folder, public=public, allow_restricted=allow_restricted)
-    card = _card_files(folder, sources, title)
-    sources |= card
-    contents = FileList(
-        files={
-            name: PublishedFile(size=path.stat().st_size, sha256=digest_file(path), card=name in card)
-            for name, path in sorted(sources.items())
-        }
-    )
-    _check_names(contents, folder)
+    files = {name: PublishedFile(size=p.stat().st_size, sha256=digest_file(p)) for name, p in sorted(sources.items())}
+    contents = FileList(files=files)
+    _check_names(files, folder)
     place = _place(where, writing=True)
     with place.errors("push"):
         place.prepare(public=public)
         present = place.sizes()
-        finished = place.file_list(present, FILE_LIST)
-        earlier = finished or place.file_list(present, UNFINISHED_LIST) or FileList(files={})
-        if foreign := _foreign(present, {*contents.files, *earlier.files}):
+        if FILE_LIST not in present and present.keys() - {".gitattributes"}:
             raise ArtifactError(
                 "The location holds files that are not of this set",
                 where=where,
                 expected="an empty location, or an earlier push",
-                got=_shortened(foreign),
+                got=_shortened(sorted(present)),
                 next_step="push to a location of its own",
             )
-        trusted = earlier.files if place.keeps_sent_files else {}
-        kept = {
-            name
-            for name, file in contents.files.items()
-            if trusted.get(name) == file and present.get(name) == file.size
-        }
-        sending = {name: path for name, path in sources.items() if name not in kept}
-        stale = [name for name in {*contents.files, *earlier.files} & present.keys() if name not in kept]
-        if sending or stale or finished != contents:
-            place.change(sending, stale, contents)
-            _check_listing(contents, place.sizes(), where, "run the same command again: what arrived is kept")
-    return Published(len(contents.files), contents.num_bytes, len(sending), place.commit)
+        earlier = place.file_list() if FILE_LIST in present else FileList(files={})
+        trusted = earlier.files if earlier.complete else {}
+        kept = {n for n, file in files.items() if trusted.get(n) == file and present.get(n) == file.size}
+        gone = sorted((earlier.files.keys() - files.keys()) & present.keys())
+        place.change(sources | _card_files(folder, files), kept, gone, contents, earlier)
+    return contents
 
 
-def pull(where: str, folder: Path) -> Published:
+def pull(where: str, folder: Path) -> FileList:
     """Pull a pushed set into a new folder, which appears once every file has been compared with its digest.
-
-    The card goes to the folder's run/card, so that the folder's content is that of the pushed set.
 
     Raises: ArtifactError when the folder exists, no finished set is published there, names or files do not match the list,
         or the store refuses; ConfigError for an unknown location; UnreachableInputError when the store does not answer.
@@ -145,41 +109,34 @@ def pull(where: str, folder: Path) -> Published:
     if folder.exists():
         raise ArtifactError("Folder exists already", where=folder, next_step="pull into a new folder")
     unfinished, place = folder.with_name(f"{folder.name}.partial"), _place(where, writing=False)
-    again = "pull again; if it stays, delete the published copy and push the set again"
     with folder_lock(unfinished), place.errors("pull"):
         if folder.exists():
             raise ArtifactError("Another command has pulled into this folder", where=folder)
         place.pin()
         present = place.sizes()
-        contents = place.file_list(present, FILE_LIST)
-        if contents is None:
+        contents = place.file_list() if FILE_LIST in present else None
+        if contents is None or not contents.complete:
             raise ArtifactError(
                 "No finished EpisodeSet is published here",
                 where=where,
                 expected=FILE_LIST,
-                next_step="push it again: an interrupted push continues",
+                next_step="push it again",
             )
-        _check_names(contents, where)
-        _check_listing(contents, present, where, again)
+        _check_names({*contents.files, *(present.keys() - {FILE_LIST})}, where)
+        _raise_mismatch([name for name, file in contents.files.items() if present.get(name) != file.size], where)
         targets = {name: unfinished / name for name in contents.files}
         there = {name for name, file in contents.files.items() if _is_at(file, targets[name])}
-        for path in folder_files(unfinished, everything=True):  # of an interrupted pull of an earlier version
-            name = path.relative_to(unfinished)
-            if name.as_posix() not in there and name.parts[0] not in (VOLATILE_FOLDER, ".cache"):
-                path.unlink()
         place.fetch({name: target for name, target in targets.items() if name not in there}, unfinished)
-        wrong = [f"{name} differs" for name, file in contents.files.items() if not _is_at(file, targets[name])]
-        _raise_mismatch(wrong, where, again)
-        for name, file in contents.files.items():
-            if file.card:
-                target = unfinished / VOLATILE_FOLDER / "card" / name
-                target.parent.mkdir(parents=True, exist_ok=True)
-                targets[name].rename(target)
+        for path in folder_files(unfinished, everything=True):  # the card, or files of an earlier, interrupted pull
+            name = path.relative_to(unfinished)
+            if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
+                path.unlink()
+        _raise_mismatch([name for name, file in contents.files.items() if not _is_at(file, targets[name])], where)
         set_files(unfinished)  # a set that refers to folders beside it would read what others put there
         verify_artifact(unfinished)
         unfinished.rename(folder)
         (folder / VOLATILE_FOLDER / ".lock").unlink()
-    return Published(len(contents.files), contents.num_bytes, len(contents.files) - len(there), place.commit)
+    return contents
 
 
 def set_files(folder: Path) -> dict[str, Path]:
@@ -201,14 +158,14 @@ def set_files(folder: Path) -> dict[str, Path]:
     return files | ({MANIFEST_NAME: manifest} if manifest.is_file() else {})
 
 
-def _card_files(folder: Path, taken: Iterable[str], title: str | None) -> dict[str, Path]:
+def _card_files(folder: Path, taken: Iterable[str]) -> dict[str, Path]:
     """The dataset card, unless the set has a README.md of its own."""
     from worldline_core.report.dataset_card import write_card
 
     if "README.md" in taken:
         return {}
     output = folder / VOLATILE_FOLDER / "card"
-    return {path.relative_to(output).as_posix(): path for path in write_card(folder, output, title)}
+    return {path.relative_to(output).as_posix(): path for path in write_card(folder, output)}
 
 
 def _check_may_publish(folder: Path, *, public: bool, allow_restricted: bool) -> None:
@@ -244,56 +201,32 @@ def _evaluation_only(row: EpisodeRow) -> bool:
     return marked or says_droid(row.source, row.embodiment)
 
 
-def _check_names(contents: FileList, where: object) -> None:
-    """Raises: ArtifactError for a name that leads out of the folder or is not one file of its own on every machine."""
-    folders = {str(parent).casefold() for name in contents.files for parent in PurePosixPath(name).parents}
-    seen = {FILE_LIST, UNFINISHED_LIST, *folders}
-    for name in contents.files:
-        parts = name.split("/")
-        usable = parts[0] not in (VOLATILE_FOLDER, ".cache") and name.casefold() not in seen
-        for part in parts:
-            usable &= part.isprintable() and not set('\\:*?"<>|') & set(part) and not part.endswith((".", " "))
-            usable &= part != "" and not part.startswith("..") and part.split(".")[0].upper() not in _DEVICES
-        if not usable:
+def _check_names(names: Iterable[str], where: object) -> None:
+    """Raises: ArtifactError for a name that leads out of the folder, or to a file of this module's."""
+    for name in names:
+        pure = PurePosixPath(name)
+        plain = name.isprintable() and "\\" not in name and pure.as_posix() == name and not pure.is_absolute()
+        if not plain or ".." in pure.parts or pure.parts[:1] in ((), (VOLATILE_FOLDER,), (".cache",), (FILE_LIST,)):
             raise ArtifactError(
                 "A file name of the set is unsafe or taken",
                 where=where,
-                expected="relative names of printable characters that every file system takes, different in more than case",
+                expected="relative names of printable characters",
                 got=repr(name),
             )
-        seen.add(name.casefold())
-
-
-def _foreign(present: Iterable[str], own: Iterable[str]) -> list[str]:
-    """Files at a location that are neither the set's nor the hub's own."""
-    known = {*own, FILE_LIST, UNFINISHED_LIST, ".gitattributes"}
-    return sorted(name for name in present if name not in known and not name.startswith(".cache/"))
 
 
 def _shortened(items: list[str]) -> str:
     return "; ".join(items[:5]) + (f"; and {len(items) - 5} more" if len(items) > 5 else "")
 
 
-def _check_listing(contents: FileList, present: Mapping[str, int], where: str, next_step: str) -> None:
-    """Raises: ArtifactError where a location's files are not those of the list, or of another size."""
-    wrong = [f"{name} is missing" for name in contents.files.keys() - present.keys()]
-    wrong += [
-        f"{name} has {present[name]} bytes instead of {file.size}"
-        for name, file in contents.files.items()
-        if present.get(name, file.size) != file.size
-    ]
-    wrong += [f"{name} is not listed" for name in _foreign(present, contents.files)]
-    _raise_mismatch(sorted(wrong), where, next_step)
-
-
-def _raise_mismatch(wrong: list[str], where: str, next_step: str) -> None:
+def _raise_mismatch(wrong: list[str], where: str) -> None:
     if wrong:
         raise ArtifactError(
             "Published files are not those of the set",
             where=where,
             expected=f"the files with the sizes and digests of {FILE_LIST}",
             got=_shortened(wrong),
-            next_step=next_step,
+            next_step="pull again; if it stays, delete the published copy and push the set again",
         )
 
 
@@ -303,10 +236,6 @@ def _is_at(file: PublishedFile, path: Path) -> bool:
 
 class _Place:
     """A folder or an object store that sets are published to."""
-
-    commit: str | None = None
-    keeps_sent_files = True
-    """Whether a push goes on with the files that an interrupted one has sent."""
 
     def __init__(self, where: str, location: AnyPath) -> None:
         self.where = where
@@ -324,7 +253,7 @@ class _Place:
                 f"The store did not finish the {verb}",
                 where=self.where,
                 got=first_line(error)[:300],
-                next_step="check the name, the room and the rights (of HF_TOKEN); the same command continues where it stopped",
+                next_step="check the name, the room and the rights (of HF_TOKEN), then run the same command again",
             ) from error
 
     def prepare(self, *, public: bool) -> None:
@@ -338,18 +267,14 @@ class _Place:
         file_system(self.location).invalidate_cache()
         return {name: about["size"] for name, about in list_files(self.location).items()}
 
-    def file_list(self, present: Mapping[str, int], name: str) -> FileList | None:
-        """The list of files at the place; None where there is none."""
-        if name not in present:
-            return None
-        source = str(self.location / name)
+    def file_list(self) -> FileList:
+        """The list of files at the place."""
+        source = str(self.location / FILE_LIST)
+        content = with_retries(lambda: file_system(self.location).cat_file(source), source)
         try:
-            if present[name] > MAX_LIST_BYTES:
-                raise ValueError(f"{present[name]} bytes")
-            content = with_retries(lambda: file_system(self.location).cat_file(source), source)
             return FileList.model_validate_json(content)
-        except ValueError as error:
-            got = error.errors(include_url=False)[0]["msg"] if isinstance(error, ValidationError) else error
+        except ValidationError as error:
+            got = error.errors(include_url=False)[0]["msg"]
             raise ArtifactError("List of files is damaged or of another version", where=source, got=got) from error
 
     def fetch(self, targets: Mapping[str, Path], folder: Path) -> None:
@@ -361,33 +286,27 @@ class _Place:
             sources, copies = [str(self.location / name) for name, _ in batch], [str(target) for _, target in batch]
             with_retries(lambda sources=sources, copies=copies: fs.get(sources, copies), self.where)
 
-    def change(self, add: Mapping[str, Path], remove: Iterable[str], contents: FileList) -> None:
-        """Remove files, send others, and write the list of what is there afterwards."""
+    def change(
+        self, sources: Mapping[str, Path], kept: set[str], gone: Iterable[str], contents: FileList, earlier: FileList
+    ) -> None:
+        """Remove the files that are gone, send all but those kept, and write the list of what is there afterwards."""
         fs = file_system(self.location)
 
-        def delete(name: str) -> None:
-            with_retries(lambda: fs.rm_file(str(self.location / name)), self.where)
+        def write(listed: FileList) -> None:
+            content = listed.model_dump_json(indent=1).encode()
+            with_retries(lambda: fs.pipe_file(str(self.location / FILE_LIST), content), self.where)
 
-        def write(name: str) -> None:
-            content = contents.model_dump_json(indent=1).encode()
-            with_retries(lambda: fs.pipe_file(str(self.location / name), content), self.where)
-
-        for name in remove:
-            delete(name)
-        write(UNFINISHED_LIST)
-        if fs.exists(str(self.location / FILE_LIST)):
-            delete(FILE_LIST)
-        for batch in batched(add.items(), _BATCH_FILES):
-            sources, targets = [str(path) for _, path in batch], [str(self.location / name) for name, _ in batch]
-            with_retries(lambda sources=sources, targets=targets: fs.put(sources, targets), self.where)
-        write(FILE_LIST)
-        delete(UNFINISHED_LIST)
+        write(FileList(complete=False, files={**earlier.files, **contents.files}))
+        for name in gone:
+            with_retries(lambda name=name: fs.rm_file(str(self.location / name)), self.where)
+        for batch in batched([name for name in sources if name not in kept], _BATCH_FILES):
+            here, there = [str(sources[name]) for name in batch], [str(self.location / name) for name in batch]
+            with_retries(lambda here=here, there=there: fs.put(here, there), self.where)
+        write(contents)
 
 
 class _Hub(_Place):
     """A dataset repository of the hub, made when it does not exist, changed by one commit."""
-
-    keeps_sent_files = False
 
     def __init__(self, where: str, repo_id: str, revision: str | None, *, writing: bool) -> None:
         from huggingface_hub import HfApi
@@ -423,30 +342,30 @@ class _Hub(_Place):
         self.pin()
 
     def pin(self) -> None:
-        self.commit = self._api.repo_info(**self._repo, revision=self._revision).sha
-        name = f"hf://datasets/{self._repo['repo_id']}@{self.commit}"
+        self._commit = self._api.repo_info(**self._repo, revision=self._revision).sha
+        name = f"hf://datasets/{self._repo['repo_id']}@{self._commit}"
         self.location = cast("AnyPath", UPath(name, **self._client, skip_instance_cache=True))
 
     def fetch(self, targets: Mapping[str, Path], folder: Path) -> None:
-        self._api.snapshot_download(
-            **self._repo, revision=self.commit, local_dir=folder, ignore_patterns=[".gitattributes", FILE_LIST]
-        )
+        ignored = [".gitattributes", FILE_LIST]
+        self._api.snapshot_download(**self._repo, revision=self._commit, local_dir=folder, ignore_patterns=ignored)
         shutil.rmtree(folder / ".cache", ignore_errors=True)
 
-    def change(self, add: Mapping[str, Path], remove: Iterable[str], contents: FileList) -> None:
+    def change(
+        self, sources: Mapping[str, Path], kept: set[str], gone: Iterable[str], contents: FileList, earlier: FileList
+    ) -> None:
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
         self._api.create_commit(
             **self._repo,
             revision=self._revision,
             operations=[
-                *(CommitOperationDelete(name) for name in remove if name not in add),
-                *(CommitOperationAdd(name, path) for name, path in add.items()),  # the client sends what differs
+                *(CommitOperationDelete(name) for name in gone),
+                *(CommitOperationAdd(name, path) for name, path in sources.items()),  # the client sends what differs
                 CommitOperationAdd(FILE_LIST, contents.model_dump_json(indent=1).encode()),
             ],
             commit_message="Upload EpisodeSet",
         )
-        self.pin()
 
 
 def _place(where: str, *, writing: bool) -> _Place:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.hub.conftest import Repository
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
@@ -49,20 +50,18 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_set_comes_back_to_the_byte_with_its_card(hub: Any, folder: Path, tmp_path: Path) -> None:
-    pushed = push(folder, PLACE, title="Toy arms")
+    pushed = push(folder, PLACE)
     repository = hub.repositories["lab/toy"]
     assert repository.private
     assert hub.tokens == {"hf_test"}
     readme = repository.files["README.md"][0].decode()
     assert readme.startswith("---\n")
-    assert "pretty_name: Toy arms\n" in readme
     assert not [path for path in repository.files if path.startswith("run/")]
     video = next(path for path in repository.files if path.endswith(".mp4"))
     assert repository.files[video][1]  # through LFS
     pulled = pull(PLACE, tmp_path / "back")
-    assert (pulled.commit, pulled.files, pulled.num_bytes) == (pushed.commit, pushed.files, pushed.num_bytes)
+    assert pulled == pushed
     assert digest_folder(tmp_path / "back") == digest_folder(folder)
-    assert (tmp_path / "back/run/card/README.md").read_text() == readme
     assert np.array_equal(
         EpisodeSet.open(tmp_path / "back").frames(1, "head"), EpisodeSet.open(folder).frames(1, "head")
     )
@@ -98,7 +97,7 @@ def test_an_interrupted_push_leaves_what_was_published_and_continues(hub: Any, f
         return 400 if method == "PUT" and len(set(seen)) > 1 else None
 
     hub.refuse = refuse_second_object
-    with pytest.raises(ArtifactError, match=r"(?s)did not finish the push.*continues where it stopped"):
+    with pytest.raises(ArtifactError, match="did not finish the push"):
         push(folder, PLACE)
     first = set(hub.objects)
     hub.refuse = lambda method, path: 400 if method == "POST" and "/commit/" in path else None
@@ -148,15 +147,13 @@ def test_a_pull_continues_and_a_changed_file_is_found(hub: Any, folder: Path, tm
     content, lfs = repository.files[video]
     repository.files[video] = content[:-1] + bytes([content[-1] ^ 1]), lfs
     repository.commits.append("f" * 40)
-    with pytest.raises(ArtifactError, match=r"(?s)not those of the set.*mp4 differs"):
-        pull(PLACE, tmp_path / "changed")
-    repository.files["stray.txt"] = b"?", False
-    with pytest.raises(ArtifactError, match=r"(?s)not those of the set.*stray\.txt is not listed"):
+    with pytest.raises(ArtifactError, match=r"(?s)not those of the set.*mp4"):
         pull(PLACE, tmp_path / "changed")
     assert not (tmp_path / "changed").exists()
-    del repository.files["stray.txt"]
     push(folder, PLACE)  # sends the changed file anew
+    repository.files["stray.txt"] = b"?", False
     pull(PLACE, tmp_path / "changed")
+    assert digest_folder(tmp_path / "changed") == digest_folder(folder)
 
 
 def test_a_damaged_set_is_not_pushed(hub: Any, folder: Path) -> None:
@@ -232,8 +229,7 @@ def test_a_revision_is_a_branch_of_its_own(hub: Any, folder: Path, tmp_path: Pat
 
 
 def test_files_of_others_in_a_repository_are_left_alone(hub: Any, folder: Path) -> None:
-    push(folder, PLACE)
-    hub.repositories["lab/toy"].files["thesis.txt"] = b"keep", False
+    hub.repositories["lab/toy"] = Repository(private=True, files={"thesis.txt": (b"keep", False)})
     with pytest.raises(ArtifactError, match=r"(?s)files that are not of this set.*thesis\.txt"):
         push(folder, PLACE)
     assert hub.repositories["lab/toy"].files["thesis.txt"][0] == b"keep"

@@ -52,13 +52,11 @@ def add(place: Path, name: str, content: bytes = b"x") -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "../x", "/etc/x", "a/../../x", "a\\..\\..\\x", "C:x", "c:/x", "\\\\host\\x", "x\0y", "a\nb", "", ".", "./x", "a//b",
-        "a/./b", "CON", "sub/aux.txt", "x.", "x /y", "x:stream", "INDEX.parquet", "index.parquet/x", "run/x",
-        "a*", "manifest.JSON/../x", "..x", "..a:stream", "..\\..\\x", "a/..", "a\u202eb", "a\u200fb", " ", "a/", ".cache/x",
-        FILE_LIST,
+        "../x", "/etc/x", "a/../../x", "a\\..\\..\\x", "\\\\host\\x", "x\0y", "a\nb", "", ".", "./x", "a//b", "a/./b", "run/x",
+        "manifest.JSON/../x", "..\\..\\x", "a/..", "a\u202eb", "a\u200fb", "a/", ".cache/x", FILE_LIST,
     ],
 )  # fmt: skip
-def test_names_that_are_not_one_file_each_on_every_machine(name: str, place: Path, tmp_path: Path) -> None:
+def test_names_that_lead_out_of_the_folder(name: str, place: Path, tmp_path: Path) -> None:
     add(place, name)
     before = sorted(path for path in tmp_path.rglob("*") if "back" not in str(path))
     with pytest.raises(ArtifactError, match="unsafe or taken"):
@@ -72,7 +70,7 @@ def test_files_of_another_size_than_listed_are_not_fetched(listed: int, place: P
     add(place, "large.bin")
     (place / "large.bin").write_bytes(bytes(1000))
     change_list(place, lambda files: files["large.bin"].update(size=listed))
-    with pytest.raises(ArtifactError, match=rf"large\.bin has 1000 bytes instead of {listed}"):
+    with pytest.raises(ArtifactError, match=r"not those of the set[\s\S]*large\.bin"):
         pull(str(place), tmp_path / "back")
     assert [path.name for path in (tmp_path / "back.partial").rglob("*")] == ["run", ".lock"]
 
@@ -96,8 +94,8 @@ def test_a_set_that_reads_its_neighbours_is_not_taken_in(place: Path, published:
 @pytest.mark.parametrize(
     "content",
     [
-        b"", b"[]", b"null", b"[" * 100_000, b"\xff", b'{"version": 2, "files": 3}', b'{"version": 1, "files": {}}',
-        b'{"version": 2, "files": {"a": {"size": -1, "sha256": "0"}}}',
+        b"", b"[]", b"null", b"[" * 100_000, b"\xff", b'{"version": 3, "files": 3}', b'{"version": 2, "files": {}}',
+        b'{"version": 3, "files": {"a": {"size": -1, "sha256": "0"}}}',
     ],
 )  # fmt: skip
 def test_lists_that_are_none(content: bytes, place: Path, tmp_path: Path) -> None:

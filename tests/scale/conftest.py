@@ -44,9 +44,7 @@ def store_server() -> Iterator[object]:
 
 @pytest.fixture
 def store(store_server: object) -> Iterator[object]:
-    from worldline_core.store.remote import process_cache
-
-    process_cache().clear()
+    remote._cache_of.cache_clear()
     yield store_server
     store_server.misbehave = lambda method, path: None  # type: ignore[attr-defined]
 
@@ -54,7 +52,7 @@ def store(store_server: object) -> Iterator[object]:
 @pytest.fixture
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stores are asked again at once, by our own patience alone: s3fs waits two seconds before it gives up."""
-    monkeypatch.setattr(remote, "FIRST_PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr(remote, "PAUSES", (0.01, 0.02, 0.04, 0.08))
     if find_spec("s3fs") is not None:
         monkeypatch.setattr("s3fs.S3FileSystem.retries", 1)
 

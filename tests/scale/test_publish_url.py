@@ -32,12 +32,13 @@ def test_there_and_back(tmp_path: Path, finished: Path, store: ObjectStore, kind
     pushed = push(finished, where)
     pulled = pull(where, tmp_path / "back")
     assert digest_folder(tmp_path / "back") == digest_folder(finished)
-    assert pulled.files == pushed.files
-    assert (tmp_path / "back" / "run" / "card" / "README.md").is_file()
+    assert pulled == pushed
     assert [row.episode_id for row in EpisodeSet.open(tmp_path / "back").rows] == ["episode-000", "episode-001"]
     with pytest.raises(ArtifactError, match="Folder exists already"):
         pull(where, tmp_path / "back")
-    assert push(finished, where).moved_files == 0
+    sent = len(store.requests)
+    push(finished, where)
+    assert not [path for method, path in store.requests[sent:] if method == "PUT" and "/datasets/" in path]
 
 
 def test_an_interrupted_push_is_no_set_and_goes_on(tmp_path: Path, finished: Path, store: ObjectStore) -> None:
@@ -57,18 +58,13 @@ def test_an_interrupted_push_is_no_set_and_goes_on(tmp_path: Path, finished: Pat
     store.misbehave = lambda method, path: None
     with pytest.raises(ArtifactError, match="No finished EpisodeSet is published here"):
         pull(where, tmp_path / "back")
-    pushed = push(finished, where)
-    assert pushed.moved_files < pushed.files  # uploads that were under way when the first one failed may have ended
+    push(finished, where)
     pull(where, tmp_path / "back")
     assert digest_folder(tmp_path / "back") == digest_folder(finished)
 
 
-@pytest.mark.parametrize(
-    ("refused", "found"), [("", r"not those of the set.*first\.txt is missing"), (".txt", "No finished EpisodeSet")]
-)
-def test_an_interrupted_second_push_goes_on(
-    tmp_path: Path, finished: Path, store: ObjectStore, refused: str, found: str
-) -> None:
+@pytest.mark.parametrize("refused", [".json", ".txt"])
+def test_an_interrupted_second_push_goes_on(tmp_path: Path, finished: Path, store: ObjectStore, refused: str) -> None:
     """Files that the second set lacks are removed and those of another content sent, also after an interruption."""
     store.upload(tmp_path / "nothing", "x")
     where = f"s3://{BUCKET}/again{refused}"
@@ -82,8 +78,9 @@ def test_an_interrupted_second_push_goes_on(
     with pytest.raises(UnreachableInputError, match="A store could not be reached"):
         push(finished, where)
     store.misbehave = lambda method, path: None
-    with pytest.raises(ArtifactError, match=f"(?s){found}"):
-        pull(where, tmp_path / "back")
+    if refused == ".txt":
+        with pytest.raises(ArtifactError, match="No finished EpisodeSet"):
+            pull(where, tmp_path / "back")
     push(finished, where)
     pull(where, tmp_path / "back")
     assert digest_folder(tmp_path / "back") == digest_folder(finished)

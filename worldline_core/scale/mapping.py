@@ -27,7 +27,7 @@ from worldline_core.errors import ArtifactError, ConfigError, DataError, Unavail
 from worldline_core.progress import Progress
 from worldline_core.scale.account import InputRow, crash_evidence, portable_message, write_shard_account
 from worldline_core.store.artifact_files import VerifyMode
-from worldline_core.store.remote import UnreachableInputError, first_line, is_transient, retry_pauses, with_retries
+from worldline_core.store.remote import UnreachableInputError, first_line, is_transient, with_retries
 
 logger = logging.getLogger(__name__)
 
@@ -299,7 +299,7 @@ class RunnerConfig(StrictModel):
     @property
     def pauses(self) -> list[float]:
         """Seconds before each further attempt at a shard."""
-        return retry_pauses(self.retries, self.retry_seconds)
+        return [self.retry_seconds * 2**number for number in range(self.retries)]
 
 
 def try_shard(shard: Shard[Any], pauses: Sequence[float]) -> Exception | None:

@@ -34,17 +34,14 @@ from worldline_core.untrusted_text import carries_credentials
 
 logger = logging.getLogger(__name__)
 
-ATTEMPTS = 5
-FIRST_PAUSE_SECONDS = 0.2
-
+PAUSES = (0.2, 0.4, 0.8, 1.6)
+"""Seconds before each further attempt."""
 _TRANSIENT_ERRNOS = frozenset(
-    {
-        errno.EIO, getattr(errno, "EREMOTEIO", errno.EIO), errno.ESTALE, errno.EAGAIN, errno.EBUSY, errno.ETIMEDOUT,
-        errno.ENETDOWN, errno.ENETUNREACH, errno.ENETRESET, errno.EHOSTDOWN, errno.EHOSTUNREACH,
-    }
+    getattr(errno, name, errno.EIO)  # as network file systems report, and s3fs for answers of status 5xx
+    for name in ("EIO", "EREMOTEIO", "ESTALE", "EAGAIN", "EBUSY", "ETIMEDOUT", "ENETDOWN", "ENETUNREACH", "ENETRESET",
+                 "EHOSTDOWN", "EHOSTUNREACH")
 )  # fmt: skip
-"""Reported by a network file system, and by s3fs for answers of status 5xx."""
-_TRANSIENT_CLASSES = frozenset(
+_TRANSIENT_CLASSES = frozenset(  # by name: the library of an unused store need not be installed
     {
         "botocore.exceptions.HTTPClientError", "botocore.exceptions.ResponseStreamingError",
         "botocore.exceptions.IncompleteReadError", "botocore.parsers.ResponseParserError",
@@ -52,7 +49,6 @@ _TRANSIENT_CLASSES = frozenset(
         "http.client.IncompleteRead", "httpx.TransportError",
     }
 )  # fmt: skip
-"""By name, so that the library of an unused store need not be installed."""
 
 
 class UnreachableInputError(UnavailableError):
@@ -61,9 +57,7 @@ class UnreachableInputError(UnavailableError):
 
 def is_transient(error: BaseException | None) -> bool:
     """Whether another attempt may help: the error, or one of its causes, comes from a network or a busy store."""
-    seen: set[int] = set()
-    while error is not None and id(error) not in seen:
-        seen.add(id(error))
+    while error is not None:
         if isinstance(error, ConnectionError | TimeoutError | UnreachableInputError):
             return True
         if isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS:
@@ -80,17 +74,12 @@ def is_transient(error: BaseException | None) -> bool:
     return False
 
 
-def retry_pauses(retries: int, first_seconds: float) -> list[float]:
-    """Seconds before each further attempt, doubling."""
-    return [first_seconds * 2**number for number in range(retries)]
-
-
 def with_retries[T](action: Callable[[], T], what: str, pauses: Sequence[float] | None = None) -> T:
     """The result of `action`, tried again after each of `pauses` [s] while it fails for a transient reason.
 
     Raises: UnreachableInputError after the last attempt; every other error at once.
     """
-    waiting = iter(retry_pauses(ATTEMPTS - 1, FIRST_PAUSE_SECONDS) if pauses is None else pauses)
+    waiting = iter(PAUSES if pauses is None else pauses)
     while True:
         try:
             return action()
@@ -98,13 +87,12 @@ def with_retries[T](action: Callable[[], T], what: str, pauses: Sequence[float] 
             if not is_transient(error):
                 raise
             pause = next(waiting, None)
-            if pause is None and isinstance(error, UnreachableInputError):
-                raise
             if pause is None:
+                if isinstance(error, UnreachableInputError):
+                    raise
                 raise UnreachableInputError(
                     "A store could not be reached",
                     where=what,
-                    expected=f"an answer within {ATTEMPTS} attempts",
                     got=f"{type(error).__name__}: {error}",
                     next_step="run the same command again when the store answers; finished work is kept",
                 ) from error
@@ -142,7 +130,7 @@ def parse_location(text: str | Path | UPath) -> AnyPath:
         location = UPath(text) if isinstance(text, str) else text
     except ValueError as error:
         raise ConfigError(
-            "Unknown kind of location", expected="a folder, or a URL of a protocol that fsspec knows", got=text
+            "Unknown kind of location", expected="a folder, or a URL that fsspec knows", got=text
         ) from error
     if isinstance(location, Path):
         return Path(str(location))
@@ -162,11 +150,9 @@ def file_system(path: AnyPath) -> Any:
     try:
         return cast("UPath", path).fs
     except ImportError as error:
+        next_step = f"for s3:// {installing('s3')}; otherwise install the fsspec library of that store"
         raise UnavailableError(
-            f"Locations of the form {cast('UPath', path).protocol}:// need a library that is not installed",
-            where=path,
-            got=str(error),
-            next_step=f"for s3:// {installing('s3')}; otherwise install the fsspec library of that store",
+            "A store's library is not installed", where=path, got=error, next_step=next_step
         ) from error
 
 
@@ -188,16 +174,9 @@ def _find(fs: Any, base: str) -> dict[str, dict[str, Any]]:
         return cast("dict[str, dict[str, Any]]", fs.find(base, detail=True))
     # fsspec's own walk silently omits the folders it could not list: `on_error` does not reach folders further down.
     found: dict[str, dict[str, Any]] = {}
-    folders = [base]
+    folders = [base] if fs.exists(base) else []
     while folders:
-        folder = folders.pop()
-        try:
-            listing = fs.ls(folder, detail=True)
-        except FileNotFoundError:
-            if folder != base:
-                raise
-            return {}
-        for about in listing:
+        for about in fs.ls(folder := folders.pop(), detail=True):
             name = about["name"].rstrip("/")
             if about["type"] != "directory":
                 found[name] = about
@@ -246,15 +225,14 @@ _FOLDER_PREFIX = "worldline-remote-"
 class RemoteCache:
     """Copies of remote files in a private folder of this process, the least recently read removed first.
 
-    A copy may be removed as soon as the next file is fetched: open the result of `fetch` at once, and ask again later.
-    A single file larger than the bound is kept alone. (fsspec's caches have no size bound.)
+    A copy may be removed as soon as the next file is fetched: open the result of `fetch` at once.
     """
 
     def __init__(self, max_bytes: int = 8 << 30) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix=_FOLDER_PREFIX))  # of mode 0700, with an unpredictable name
         self.max_bytes = max_bytes
-        self._alive = os.open(self.folder, os.O_RDONLY)  # its lock shows other processes that this one is alive
-        fcntl.flock(self._alive, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        # This lock shows other processes that this one is alive.
+        fcntl.flock(os.open(self.folder, os.O_RDONLY), fcntl.LOCK_SH | fcntl.LOCK_NB)
         self._sizes: OrderedDict[Path, int] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -283,13 +261,6 @@ class RemoteCache:
                 oldest, _ = self._sizes.popitem(last=False)
                 oldest.unlink(missing_ok=True)
             return copy
-
-    def clear(self) -> None:
-        """Remove all copies."""
-        with self._lock:
-            self._sizes.clear()
-            for entry in self.folder.iterdir():
-                shutil.rmtree(entry, ignore_errors=True)
 
 
 def _download(path: AnyPath, copy: Path) -> int:
