@@ -26,26 +26,23 @@ def add_plan_command(commands: argparse._SubParsersAction[argparse.ArgumentParse
     plan.add_argument(
         "--utilisation", type=float, default=0.4, help="share of the card's peak that is reached (default: 0.4)"
     )
-    plan.add_argument("--json", action="store_true", help="print JSON")
     plan.set_defaults(run=_plan)
 
 
 def _plan(arguments: argparse.Namespace) -> None:
-    import json
-
     from worldline_core.config import load_config, preset_path, validate
 
     preset = arguments.preset or (None if arguments.config else "demo")
     if preset is not None:
         preset_path(preset)  # answers before torch is imported
     from worldline_core.pipeline.pipeline_config import PipelineConfig
-    from worldline_core.pipeline.size_sheet import Machine, SizeSheet, as_json, as_text
+    from worldline_core.pipeline.size_sheet import Machine, SizeSheet, as_text
 
     asked = {"devices": arguments.gpus, **{name: vars(arguments)[name] for name in ("memory", "card", "utilisation")}}
     machine = validate(Machine, asked, where="worldline plan")
     config = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=arguments.overrides)
     rows = list(SizeSheet(config, Path.cwd(), machine).rows())
-    print(json.dumps(as_json(machine, rows), indent=1) if arguments.json else as_text(machine, rows))
+    print(as_text(machine, rows))
     raise SystemExit(0 if not any(setting for _, setting in rows) else 1)
 
 

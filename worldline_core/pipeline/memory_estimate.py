@@ -1,18 +1,16 @@
 """Memory and operations of a training, counted by running its own objective on tensors that have shapes and no values.
 
-`worldline plan` prints these estimates (`size_sheet.py`), and a training's task refuses what its device cannot hold.
 torch's own MemTracker gives the same figures within 0.4 % for a single pass, but refuses modules that are called several times
 before a backward pass, as the tokenizers and Stage III do; operations are counted by the formulas of its FlopCounterMode.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry, sdpa_backward_flop_count, sdpa_flop_count
 
 from worldline_core.config import StrictModel
@@ -49,7 +48,7 @@ from worldline_core.training.training_config import RelationalConfig, Stage1Conf
 from worldline_core.training.video_teacher import teacher_outline
 
 _SMALL = 8
-"""Largest size (layers, latent frames) that is traced whole; presets for a CPU have no more layers, and so an exact peak."""
+"""Largest size (layers, latent frames) that is traced whole."""
 USABLE = 0.92
 """Share of a device's memory that a stage may fill; the rest is for the driver, communication and fragmentation."""
 
@@ -66,10 +65,9 @@ class Cost(NamedTuple):
     """Bytes held at once and operations of one computation.
 
     Attributes:
-        forward, backward: most bytes until the loss is there, and from then on; gradients of parameters are not in them.
+        forward, backward: most bytes until the loss is there, and from then on, without gradients of parameters.
         held: bytes when the loss is there.
-        gradients: bytes of the parameters' gradients at the end.
-        peak: most bytes at once, gradients included.
+        peak: most bytes at once, gradients of parameters included; not linear in the size of a model.
         flops: floating-point operations, two for a multiplication and addition, except attention's.
         attention_flops: those of attention, which grow with the square of the tokens.
     """
@@ -77,7 +75,6 @@ class Cost(NamedTuple):
     forward: float = 0.0
     backward: float = 0.0
     held: float = 0.0
-    gradients: float = 0.0
     peak: float = 0.0
     flops: float = 0.0
     attention_flops: float = 0.0
@@ -126,16 +123,14 @@ class _Tracker(TorchDispatchMode):
             self.attention_flops += _ATTENTION[packet](args)
         elif packet in flop_registry:
             self.flops += flop_registry[packet](*args, **kwargs, out_val=result)
-        given = {tensor.untyped_storage()._cdata for tensor in _tensors((*args, *kwargs.values()))}
-        for tensor in _tensors((result,)):
-            if tensor.untyped_storage()._cdata not in given:  # else it is a view, or was changed in place
-                self._follow(tensor.untyped_storage())
+        given = {storage._cdata for storage in _storages((args, kwargs))}
+        for storage in _storages(result):
+            if storage._cdata not in given and storage._cdata not in self._storages:  # else it is no new memory
+                self._follow(storage)
         return result
 
     def _follow(self, storage: torch.UntypedStorage) -> None:
         key, size = storage._cdata, storage.nbytes()
-        if key in self._storages:
-            return
 
         def freed(_: object) -> None:
             if self._storages.pop(key, None) is not None:
@@ -153,12 +148,8 @@ class _Tracker(TorchDispatchMode):
             self.gradients += parameter.grad.untyped_storage().nbytes()
 
 
-def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
-    for value in values:
-        if isinstance(value, Tensor):
-            yield value
-        elif isinstance(value, (tuple, list)):
-            yield from _tensors(value)
+def _storages(values: Any) -> list[torch.UntypedStorage]:
+    return [value.untyped_storage() for value in tree_leaves(values) if isinstance(value, Tensor)]
 
 
 def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> Cost:
@@ -175,20 +166,16 @@ def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> 
             loss.backward()
     for hook in hooks:
         hook.remove()
-    return Cost(forward, tracker.most, held, tracker.gradients, tracker.peak, tracker.flops, tracker.attention_flops)
+    return Cost(forward, tracker.most, held, tracker.peak, tracker.flops, tracker.attention_flops)
 
 
 def extrapolated(trace: Callable[[int], Cost], size: int, traced_at: tuple[int, int]) -> Cost:
-    """``trace(size)`` by a straight line through two smaller sizes (layers of a model, frames of a clip).
-
-    The ``peak`` becomes the sum of activations and gradients, at most too high: where it lies depends on the size.
-    """
-    small, large = traced_at
+    """``trace(size)`` by a straight line through two smaller sizes (layers of a model, frames of a clip)."""
     if size <= _SMALL:
         return trace(size)
+    small, large = traced_at
     share = (size - small) / (large - small)
-    line = Cost(*(a + (b - a) * share for a, b in zip(trace(small), trace(large), strict=True)))
-    return line._replace(peak=line.activations + line.gradients)
+    return Cost(*(a + (b - a) * share for a, b in zip(trace(small), trace(large), strict=True)))
 
 
 def to_bfloat16(model: nn.Module) -> None:
@@ -212,23 +199,20 @@ def parameter_counts(model: WorldModelConfig, trained: Callable[[str], bool] = l
     return counted, sum(value.numel() for value in network.layers[0].parameters())
 
 
+def gigabytes(size: float) -> str:
+    """Bytes as GB (10^9), short enough for a table."""
+    value = size / 1e9
+    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 0.1 else f"{value:.3f}"
+
+
 @dataclass(frozen=True)
 class ClipShape:
-    """The micro-batch of one device.
-
-    Attributes:
-        clips, views: how many; frames: of every clip, as recorded; grid: rows and columns of a latent.
-    """
+    """Number of clips, their views, recorded frames, and rows and columns of a latent of one device's micro-batch."""
 
     clips: int
     views: tuple[str, ...]
     frames: int
     grid: tuple[int, int]
-
-    def tokens(self, model: WorldModelConfig) -> int:
-        """Video tokens of one clip."""
-        rows, columns = (size // model.patch_size for size in self.grid)
-        return latent_frame_count(self.frames) * len(self.views) * rows * columns
 
     def batch(self, model: WorldModelConfig, *, maps: bool = True, text: int = 0) -> Batch:
         """An uninitialised batch of this shape, with ``text`` tokens for each clip (0: without text)."""
@@ -252,7 +236,6 @@ class Estimate:
         parameters: trained ones, or those of a model that only predicts.
         parts: bytes at the worst moment, by name; their sum is ``total``.
         flops: of one optimiser step, prediction or clip; steps: how many of these, where known.
-        facts: other figures for the sheet, by name.
     """
 
     title: str
@@ -260,7 +243,6 @@ class Estimate:
     parts: Mapping[str, float]
     flops: float = 0.0
     steps: int | None = None
-    facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     @property
     def total(self) -> float:
@@ -274,23 +256,6 @@ class Estimate:
         return ", ".join(f"{name} {gigabytes(size)}" for name, size in self.parts.items())
 
 
-def gigabytes(size: float) -> str:
-    """Bytes as GB (10^9), short enough for a table."""
-    value = size / 1e9
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 0.1 else f"{value:.3f}"
-
-
-def upper_bound(model: WorldModelConfig, shape: ClipShape, models: int = 1) -> float:
-    """Cheap upper bound on the memory of a training of small pictures, several times what it takes.
-
-    Args:
-        models: world models that are held, trained or not.
-    """
-    width = 20 * model.hidden_size + 8 * model.num_heads * model.head_dim + 6 * model.intermediate_size
-    activations = 4 * width * model.num_layers * shape.clips * shape.tokens(model)
-    return 2 * models * (24 * parameter_counts(model)[0] + activations)
-
-
 Frozen = dict[str, tuple[int, Cost]]
 """Bytes of models that are not trained, whole on every device, and the cost of what they compute for a micro-batch."""
 
@@ -300,49 +265,32 @@ class Training:
     """One training, by its configuration alone.
 
     Attributes:
-        views, grid: of the model; rows and columns of its latents.
+        shape: the largest micro-batch (`largest_batch`).
         objective, batch: what is minimised, and a micro-batch for it; both are made without values.
         trained: whether a parameter gets gradients, by its name.
         turns: steps of each kind that the training takes, and their share (distribution matching alternates).
         models, scores: world models that are trained, the first alone averaged, and those that are not.
         before: what encodes clips and asks the teacher, over when the model's own step begins.
-        perceptual: what compares pictures at the end of the forward pass, in the last turn.
+        compared: what compares pictures at the end of the forward pass, in the last turn.
     """
 
     title: str
     trainer: TrainerConfig
     clips: ClipSampling
     model: WorldModelConfig
-    views: tuple[str, ...]
-    grid: tuple[int, int]
+    shape: ClipShape
     objective: Callable[[WorldModel], Any]
-    batch: Callable[[ClipShape], Batch]
+    batch: Callable[[], Batch]
     trained: Callable[[str], bool] = lambda _: True
     turns: Sequence[tuple[int, float]] = ((0, 1.0),)
     models: int = 1
     scores: int = 0
-    before: Callable[[ClipShape], Frozen] = lambda _: {}
-    perceptual: Callable[[ClipShape], Frozen] | None = None
+    before: Callable[[], Frozen] = dict
+    compared: Callable[[], Frozen] = dict
 
-    @property
-    def shape(self) -> ClipShape:
-        """The largest micro-batch: the longest clips, in all views where steps are joint, else in one."""
-        joint = self.clips.view_weights is None or JOINT in self.clips.view_weights
-        clips, views = (1, self.views) if joint else (self.clips.single_view_factor, self.views[:1])
-        return ClipShape(clips * self.trainer.batch_size, views, max(self.clips.lengths), self.grid)
-
-    @property
-    def upper_bound(self) -> float:
-        """Cheap upper bound on memory, with which most small models need no closer look."""
-        shape, (rows, columns) = self.shape, self.grid
-        # Decoding eight frames of a view keeps some hundreds of values for each of their pixels.
-        pictures = 4000 * 8 * 256 * shape.clips * len(shape.views) * rows * columns if self.perceptual else 0
-        return upper_bound(self.model, shape, self.models + self.scores) + 2 * pictures
-
-    def micro_step(self, step: int, *, sharded: bool) -> Cost:
-        """Cost of one micro-step: the loss and its backward pass."""
+    def turn(self, step: int, *, sharded: bool) -> Cost:
+        """Cost of the loss and the backward pass of a micro-step."""
         trainer = self.trainer.model_copy(update={"device": "cpu"})  # tensors without values follow a CPU's paths
-        half = sharded and trainer.precision == "bf16"
 
         def trace(layers: int) -> Cost:
             with FakeTensorMode():
@@ -354,226 +302,72 @@ class Training:
                 for one in models:
                     if isinstance(one, WorldModel):
                         one.checkpointing = trainer.sharding.checkpointing
-                    if half:
+                    if sharded and trainer.precision == "bf16":
                         to_bfloat16(one)
-                batch = self.batch(self.shape)
+                batch = self.batch()
 
                 def loss() -> Tensor:
                     with autocast(trainer):
                         return objective.loss(batch, torch.Generator(), step)[0]
 
-                cost = traced(loss, [parameter for one in models for parameter in one.parameters()])
-            return cost._replace(gradients=cost.gradients * (1 + half))  # summed in float32
+                return traced(loss, [parameter for one in models for parameter in one.parameters()])
 
         return extrapolated(trace, self.model.num_layers, (3, 4))
 
-    def shards(self, devices: int) -> int:
-        """Parts of every weight on so many devices."""
-        return min(self.trainer.sharding.shards or devices, devices)
+    @cache  # noqa: B019 - a few trainings a process
+    def micro_step(self, *, sharded: bool) -> Cost:
+        """Memory of the largest micro-step, and the operations of a mean one."""
+        turns = [self.turn(step, sharded=sharded) for step, _ in self.turns]
+        for _, cost in self.compared().values():
+            # It comes last in the forward pass, and is over when the backward pass begins.
+            last, held = turns[-1], turns[-1].held + cost.activations
+            forward, peak = max(last.forward, held), max(last.peak, held)
+            turns[-1] = last._replace(forward=forward, peak=peak, flops=last.flops + cost.flops)
+        shares = [turn.repeated(share) for turn, (_, share) in zip(turns, self.turns, strict=True)]
+        cost = reduce(Cost.then, [*(cost for _, cost in self.before().values()), *shares])
+        lengths = [latent_frame_count(n) / latent_frame_count(self.shape.frames) for n in self.clips.lengths]
+        linear, square = (sum(n**power for n in lengths) / len(lengths) for power in (1, 2))
+        return cost._replace(flops=linear * cost.flops, attention_flops=square * cost.attention_flops)
 
     def estimate(self, devices: int) -> Estimate:
         """Memory and operations on each of so many devices that share the training."""
-        trainer, shards = self.trainer, self.shards(devices)
+        trainer, shards = self.trainer, min(self.trainer.sharding.shards or devices, devices)
         micro_steps = trainer.accumulation
         if trainer.global_batch is not None:
             micro_steps = -(-trainer.global_batch // (trainer.batch_size * devices))
-        before, step, flops = self._costs(shards > 1)
+        step = self.micro_step(sharded=shards > 1)
         trained, block = parameter_counts(self.model, self.trained)
-        own, average = 4 * self.models * trained / shards, 4 * trained / shards
-        frozen = {name: size for name, (size, _) in (self.before(self.shape) | self._compared()).items()}
-        parts: dict[str, float] = {"weights": own, "moments": 2 * own, "average": average, **frozen}
-        if torch.device(trainer.device).type == "cpu":
-            parts["state being written"] = 3 * own + average  # elsewhere this copy lies in the host's memory
-        parts["frozen scores"] = 4 * self.scores * trained / shards
-        # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
-        parts["gathered"] = 0 if shards == 1 else block * (2 * 2 + 2 + 4)
-        if shards == 1 and micro_steps == 1:
-            # Gradients come as activations go.
-            during = {"gradients": step.gradients, "activations": step.peak - step.gradients}
-        else:
-            reduced = micro_steps == 1 or trainer.sharding.reduce_every_micro_step
-            gradients = step.gradients / shards if reduced else step.gradients
-            during = {"gradients": gradients, "activations": step.activations}
-        if sum(during.values()) < before:
-            during = {"encoding clips": before}
-        parts = {name: size for name, size in (parts | during).items() if size}
-        lengths = sorted({min(self.clips.lengths), max(self.clips.lengths)})
-        tokens = {str(frames): replace(self.shape, frames=frames).tokens(self.model) for frames in lengths}
-        facts = {"tokens of a clip": tokens, "bytes of a training state": 4 * trained * (3 * self.models + 1)}
-        return Estimate(self.title, self.models * trained, parts, micro_steps * flops, trainer.steps, facts)
-
-    def _compared(self) -> Frozen:
-        return self.perceptual(self.shape) if self.perceptual else {}
-
-    @cache  # noqa: B019 - a few trainings a process
-    def _costs(self, sharded: bool) -> tuple[float, Cost, float]:
-        """Most bytes before the model's own micro-step, its cost at its worst, and the mean operations of both."""
-        first = Cost()
-        for _, cost in self.before(self.shape).values():
-            first = first.then(cost)
-        turns = [self.micro_step(step, sharded=sharded) for step, _ in self.turns]
-        for _, cost in self._compared().values():
-            # It comes last in the forward pass, and is over when the backward pass begins.
-            last, held = turns[-1], turns[-1].held + cost.activations
-            changed = {"forward": max(last.forward, held), "peak": max(last.peak, held)}
-            turns[-1] = last._replace(**changed, flops=last.flops + cost.flops)
-        worst, mean = Cost(), first
-        for (_, share), turn in zip(self.turns, turns, strict=True):
-            worst, mean = worst.then(turn), mean.then(turn.repeated(share))
-        lengths = [latent_frame_count(n) / latent_frame_count(self.shape.frames) for n in self.clips.lengths]
-        linear, square = (sum(n**power for n in lengths) / len(lengths) for power in (1, 2))
-        return first.activations, worst, linear * mean.flops + square * mean.attention_flops
+        own, part = 4 * self.models * trained / shards, 4 * trained / shards
+        summed = micro_steps == 1 or trainer.sharding.reduce_every_micro_step
+        gradients = part if summed else 4 * trained
+        alone = shards == micro_steps == 1 and self.model.num_layers <= _SMALL
+        parts = {
+            "weights": own,
+            "moments": 2 * own,
+            "average": part,
+            **{name: size for name, (size, _) in (self.before() | self.compared()).items()},
+            "frozen scores": self.scores * part,
+            # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
+            "gathered": 0 if shards == 1 else block * (2 * 2 + 2 + 4),
+            "gradients": gradients,
+            # With one micro-step on one device, gradients come as activations go.
+            "activations": step.peak - gradients if alone else step.activations,
+        }
+        parts = {name: size for name, size in parts.items() if size}
+        return Estimate(self.title, self.models * trained, parts, micro_steps * step.all_flops, trainer.steps)
 
     def fitting_setting(self, devices: int, memory: float) -> str:
         """The nearest setting with which this training would fit devices of ``memory`` bytes, in words."""
-        sharding, shards = self.trainer.sharding, self.shards(devices)
         changes = {"checkpointing": "block", "reduce_every_micro_step": True, "shards": None}
-        trainer = self.trainer.model_copy(update={"sharding": sharding.model_copy(update=changes)})
-        block = replace(self, trainer=trainer)
-        for count in (shards * 2**power for power in range(11)):
+        sharding = self.trainer.sharding.model_copy(update=changes)
+        block = replace(self, trainer=self.trainer.model_copy(update={"sharding": sharding}))
+        for count in (devices * 2**power for power in range(11)):
             need = block.estimate(count)
             if need.fits(memory):
-                wider = "" if count == shards else f" over {count} devices"
-                summed = "" if sharding.reduce_every_micro_step or count == 1 else ", reduce_every_micro_step: true"
+                wider = "" if count == devices else f" over {count} devices"
+                summed = "" if count == 1 else ", reduce_every_micro_step: true"
                 return f"trainer.sharding.checkpointing: block{summed}{wider} ({gigabytes(need.total)} GB a device)"
-        for frames in sorted(set(self.clips.lengths), reverse=True)[1:]:
-            shorter = replace(block, clips=self.clips.model_copy(update={"lengths": (frames,)}))
-            if shorter.estimate(shards * 1024).fits(memory):
-                return f"trainer.sharding.checkpointing: block, and clips of at most {frames} frames, over more devices"
-        return "devices of more memory, or a smaller model"
-
-
-def trainings(
-    config: Stage1Config | Stage2Config | DistillConfig, model: WorldModelConfig, source: ClipFrames
-) -> list[Training]:
-    """The trainings of one step, in their order."""
-    if isinstance(config, DistillConfig):
-        return _distillation(config, model.model_copy(update={"towers": "generation"}), source)
-    relational = config.relational if isinstance(config, Stage2Config) else None
-    text = config.text.max_length if isinstance(config, Stage1Config) else 0
-
-    def objective(network: WorldModel) -> FlowMatchingObjective:
-        term = None
-        if relational is not None:
-            term = RelationalTerm(relational, _OutlinedSimilarities(relational), network.config.num_layers)
-            term.layer = max(1, network.config.num_layers // 2)  # it makes no difference which: all are held
-        return FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
-
-    def before(shape: ClipShape) -> Frozen:
-        frozen = {"tokenizer": encoding(source, shape)} if isinstance(config.input, FrameInput) else {}
-        return frozen | ({"teacher": teaching(source, shape)} if relational is not None else {})
-
-    titles = {"base": "base", "stage1": "stage I"}
-    return [
-        Training(
-            titles[config.kind] if isinstance(config, Stage1Config) else "stage II", config.trainer, config.clips,
-            model, model.views, source.grid, objective,
-            lambda shape: shape.batch(model, maps=not text, text=text),
-            trained=is_trained if text else lambda _: True, before=before,
-        )
-    ]  # fmt: skip
-
-
-class _OutlinedSimilarities(ClipSimilarities):
-    """A teacher that has answered already."""
-
-    def __init__(self, config: RelationalConfig) -> None:
-        self.config = config
-
-    def similarities(
-        self, clips: Sequence[Clip], views: Sequence[str], grid: tuple[int, int, int], frames: Tensor | None = None
-    ) -> SimilarityMatrices:
-        shape = bins, rows, columns = common_shape(self.config, grid)
-        clip_views, cells = (len(clips), len(views)), rows * columns
-        intra = torch.empty(*clip_views, bins - 1, cells, cells)
-        return SimilarityMatrices(shape, intra, torch.empty(len(clips), len(views) - 1, bins, cells, cells))
-
-
-def _distillation(config: DistillConfig, model: WorldModelConfig, source: ClipFrames) -> list[Training]:
-    first, regression, matching = config.teacher_forcing, config.trajectory_regression, config.distribution_matching
-    asked = first.teacher_share > 0
-    encodes = isinstance(config.input, FrameInput)
-
-    def trajectory_batch(shape: ClipShape) -> TrajectoryBatch:
-        plain = shape.batch(model)
-        clips, views, channels, frames, *grid = plain.latents.shape
-        nodes = torch.empty(clips, config.spec.steps + 1, views, channels, frames - 1, *grid)
-        mask = torch.ones(clips, views, frames, *grid)
-        return TrajectoryBatch(**vars(plain), nodes=nodes, history=plain.latents, mask=mask)
-
-    def kept(shape: ClipShape) -> Frozen:
-        # Trajectories keep the latents of their clips, so the encoder only lies there.
-        return {"encoder": (encoding(source, shape)[0], Cost())} if encodes else {}
-
-    def perceptual(shape: ClipShape) -> Frozen:
-        return {"tokenizer": comparing(source, shape, config.perceptual.latent_frames, config.perceptual.bfloat16)}
-
-    compared: dict[str, Any] = {} if config.lpips_weights is None else {"perceptual": perceptual}
-    mixed = {"view_weights": first.view_weights, "single_view_factor": first.single_view_factor}
-    of_model = model, tuple(config.views), source.grid
-    return [
-        Training(
-            "distill: teacher forcing", first.trainer, config.clips.model_copy(update=mixed), *of_model,
-            lambda network: TeacherForcingObjective(network, config, WorldModel(network.config) if asked else None),
-            lambda shape: shape.batch(model), scores=int(asked),
-            before=lambda shape: {"encoder": encoding(source, shape)} if encodes else {},
-        ),
-        Training(
-            "distill: trajectory regression", regression.trainer, config.clips, *of_model,
-            lambda network: TrajectoryObjective(network, config, None), trajectory_batch, before=kept, **compared,
-        ),
-        Training(
-            "distill: distribution matching", matching.trainer, config.clips, *of_model,
-            lambda network: DistributionMatchingObjective(
-                network, WorldModel(network.config), WorldModel(network.config), config, None
-            ),
-            trajectory_batch, turns=((0, 1 - 1 / CYCLE), (CYCLE - 1, 1 / CYCLE)), models=2, scores=1, before=kept,
-            **compared,
-        ),
-    ]  # fmt: skip
-
-
-def trajectory_clips(config: DistillConfig, grid: tuple[int, int]) -> ClipShape:
-    """The clips of one shard of the teacher's trajectories, which are made together."""
-    settings = config.trajectory_regression.trajectories
-    return ClipShape(
-        min(settings.clips, settings.clips_per_shard), tuple(config.views), max(config.clips.lengths), grid
-    )
-
-
-def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: ClipFrames) -> Estimate:
-    """A shard of the teacher's trajectories; the teacher lies whole on every device."""
-    model, settings = model.model_copy(update={"towers": "generation"}), config.trajectory_regression
-    trainer, shape = settings.trainer.model_copy(update={"device": "cpu"}), trajectory_clips(config, source.grid)
-
-    def trace(layers: int) -> Cost:
-        with FakeTensorMode():
-            teacher = WorldModel(model.model_copy(update={"num_layers": layers})).requires_grad_(False)
-            batch = shape.batch(model)
-
-            def make() -> Tensor:
-                with autocast(trainer):
-                    return teacher_trajectories(
-                        teacher, batch.latents, maps_of(batch), torch.empty_like(batch.latents), views=batch.views,
-                        spec=config.spec, substeps=(1,) * config.spec.steps,
-                    )  # fmt: skip
-
-            return traced(make)
-
-    cost = extrapolated(trace, model.num_layers, (2, 3))
-    # Each block takes all sub-steps, and one pass more that writes it into the cache.
-    cost = cost.repeated((1 + sum(settings.trajectories.substeps)) / (1 + config.spec.steps))
-    parameters = parameter_counts(model)[0]
-    weights = 4 * parameters
-    if isinstance(config.input, FrameInput):
-        size, before = encoding(source, shape)
-        weights, cost = weights + size, before.then(cost)
-    title = f"distill: trajectories (a shard of {shape.clips} clips)"
-    latents = len(shape.views) * (latent_frame_count(shape.frames) - 1) * model.latent_channels * math.prod(shape.grid)
-    kept = config.spec.steps + 1 + isinstance(config.input, FrameInput)
-    facts = {"clips of a shard": shape.clips, "bytes stored": 2 * shape.clips * kept * latents}
-    parts = {"weights": weights, "activations": cost.activations}
-    return Estimate(title, parameters, parts, cost.all_flops, facts=facts)
+        return "shorter clips, devices of more memory, or a smaller model"
 
 
 @dataclass(frozen=True)
@@ -613,7 +407,7 @@ def encoding(source: ClipFrames, shape: ClipShape) -> tuple[int, Cost]:
 
 
 @cache
-def teaching(source: ClipFrames, shape: ClipShape) -> tuple[int, Cost]:
+def _teaching(source: ClipFrames, shape: ClipShape) -> tuple[int, Cost]:
     """Bytes of the relational teacher, and its cost for the clips of a micro-batch, one by one."""
     with FakeTensorMode():
         network, features = teacher_outline(source.teacher)
@@ -622,7 +416,7 @@ def teaching(source: ClipFrames, shape: ClipShape) -> tuple[int, Cost]:
 
 
 @cache
-def comparing(source: ClipFrames, shape: ClipShape, latent_frames: int, bfloat16: bool) -> tuple[int, Cost]:
+def _comparing(source: ClipFrames, shape: ClipShape, latent_frames: int, bfloat16: bool) -> tuple[int, Cost]:
     """Bytes of the tokenizer and LPIPS, and the cost of the perceptual term, its gradients too, view by view."""
     with FakeTensorMode():
         codec, network = tokenizer_outline(source.tokenizer), LPIPS().requires_grad_(False)
@@ -639,74 +433,181 @@ def comparing(source: ClipFrames, shape: ClipShape, latent_frames: int, bfloat16
         return weight_bytes(codec) + weight_bytes(network), cost.repeated(shape.clips * len(shape.views))
 
 
-def device_memory(device: str, root: Path = Path("/")) -> float:
-    """Bytes that a training may take: all of a card's, or what this machine has available.
+class _OutlinedSimilarities(ClipSimilarities):
+    """A teacher that has answered already."""
 
-    On a CPU: available memory (page cache included), or what the control group leaves where it is less; all of the
-    machine's where the system does not report what is available (it is not Linux).
+    def __init__(self, config: RelationalConfig) -> None:
+        self.config = config
 
-    Args:
-        root: where ``proc`` and ``sys`` are mounted.
-    """
-    if torch.device(device).type == "cuda":
-        return float(torch.cuda.get_device_properties(device).total_memory)
-    meminfo, group = root / "proc/meminfo", root / "sys/fs/cgroup"
-    if not meminfo.is_file():
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    available = 1024 * _numbers(meminfo)["MemAvailable:"]
-    limit = group / "memory.max"
-    if limit.is_file() and (most := limit.read_text(encoding="ascii").strip()) != "max":
-        used, files = int((group / "memory.current").read_text(encoding="ascii")), _numbers(group / "memory.stat")
-        available = min(available, int(most) - used + files["active_file"] + files["inactive_file"])
-    return float(available)
+    def similarities(
+        self, clips: Sequence[Clip], views: Sequence[str], grid: tuple[int, int, int], frames: Tensor | None = None
+    ) -> SimilarityMatrices:
+        shape = bins, rows, columns = common_shape(self.config, grid)
+        clip_views, cells = (len(clips), len(views)), rows * columns
+        intra = torch.empty(*clip_views, bins - 1, cells, cells)
+        return SimilarityMatrices(shape, intra, torch.empty(len(clips), len(views) - 1, bins, cells, cells))
 
 
-def _numbers(path: Path) -> dict[str, int]:
-    rows = (line.split() for line in path.read_text(encoding="ascii").splitlines())
-    return {row[0]: int(row[1]) for row in rows}
+def largest_batch(
+    trainer: TrainerConfig, clips: ClipSampling, views: Sequence[str], grid: tuple[int, int]
+) -> ClipShape:
+    """The longest clips, in all views where steps are joint, else in one."""
+    joint = clips.view_weights is None or JOINT in clips.view_weights
+    count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
+    return ClipShape(count * trainer.batch_size, tuple(views), max(clips.lengths), grid)
+
+
+def trainings(
+    config: Stage1Config | Stage2Config | DistillConfig, model: WorldModelConfig, source: ClipFrames
+) -> list[Training]:
+    """The trainings of one step, in their order."""
+    if isinstance(config, DistillConfig):
+        return _distillation(config, model.model_copy(update={"towers": "generation"}), source)
+    relational = config.relational if isinstance(config, Stage2Config) else None
+    text = config.text.max_length if isinstance(config, Stage1Config) else 0
+    shape = largest_batch(config.trainer, config.clips, model.views, source.grid)
+
+    def objective(network: WorldModel) -> FlowMatchingObjective:
+        term = None
+        if relational is not None:
+            term = RelationalTerm(relational, _OutlinedSimilarities(relational), network.config.num_layers)
+            term.layer = max(1, network.config.num_layers // 2)  # it makes no difference which: all are held
+        return FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
+
+    def before() -> Frozen:
+        frozen = {"tokenizer": encoding(source, shape)} if isinstance(config.input, FrameInput) else {}
+        return frozen | ({"teacher": _teaching(source, shape)} if relational is not None else {})
+
+    title = {"base": "base", "stage1": "stage I"}[config.kind] if isinstance(config, Stage1Config) else "stage II"
+    return [
+        Training(
+            title, config.trainer, config.clips, model, shape, objective,
+            lambda: shape.batch(model, maps=not text, text=text),
+            trained=is_trained if text else lambda _: True, before=before,
+        )
+    ]  # fmt: skip
+
+
+def _distillation(config: DistillConfig, model: WorldModelConfig, source: ClipFrames) -> list[Training]:
+    first, regression, matching = config.teacher_forcing, config.trajectory_regression, config.distribution_matching
+    mixed = config.clips.model_copy(
+        update={"view_weights": first.view_weights, "single_view_factor": first.single_view_factor}
+    )
+    shapes = [
+        largest_batch(one.trainer, clips, config.views, source.grid)
+        for one, clips in ((first, mixed), (regression, config.clips), (matching, config.clips))
+    ]
+
+    def trajectory_batch(shape: ClipShape) -> TrajectoryBatch:
+        plain = shape.batch(model)
+        clips, views, channels, frames, *grid = plain.latents.shape
+        nodes = torch.empty(clips, config.spec.steps + 1, views, channels, frames - 1, *grid)
+        mask = torch.ones(clips, views, frames, *grid)
+        return TrajectoryBatch(**vars(plain), nodes=nodes, history=plain.latents, mask=mask)
+
+    def encoder(shape: ClipShape, used: bool) -> Frozen:
+        if not isinstance(config.input, FrameInput):
+            return {}
+        size, cost = encoding(source, shape)
+        return {"encoder": (size, cost if used else Cost())}  # trajectories keep the latents of their clips
+
+    def compared(shape: ClipShape) -> Frozen:
+        if config.lpips_weights is None:
+            return {}
+        return {"tokenizer": _comparing(source, shape, config.perceptual.latent_frames, config.perceptual.bfloat16)}
+
+    asked = first.teacher_share > 0
+    return [
+        Training(
+            "distill: teacher forcing", first.trainer, mixed, model, shapes[0],
+            lambda network: TeacherForcingObjective(network, config, WorldModel(network.config) if asked else None),
+            lambda: shapes[0].batch(model), scores=int(asked), before=lambda: encoder(shapes[0], used=True),
+        ),
+        Training(
+            "distill: trajectory regression", regression.trainer, config.clips, model, shapes[1],
+            lambda network: TrajectoryObjective(network, config, None), lambda: trajectory_batch(shapes[1]),
+            before=lambda: encoder(shapes[1], used=False), compared=lambda: compared(shapes[1]),
+        ),
+        Training(
+            "distill: distribution matching", matching.trainer, config.clips, model, shapes[2],
+            lambda network: DistributionMatchingObjective(
+                network, WorldModel(network.config), WorldModel(network.config), config, None
+            ),
+            lambda: trajectory_batch(shapes[2]), turns=((0, 1 - 1 / CYCLE), (CYCLE - 1, 1 / CYCLE)), models=2, scores=1,
+            before=lambda: encoder(shapes[2], used=False), compared=lambda: compared(shapes[2]),
+        ),
+    ]  # fmt: skip
+
+
+def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: ClipFrames) -> Estimate:
+    """A shard of the teacher's trajectories, whose clips are made together; the teacher is whole on every device."""
+    model, settings = model.model_copy(update={"towers": "generation"}), config.trajectory_regression
+    clips = min(settings.trajectories.clips, settings.trajectories.clips_per_shard)
+    shape = ClipShape(clips, tuple(config.views), max(config.clips.lengths), source.grid)
+    trainer = settings.trainer.model_copy(update={"device": "cpu"})
+
+    def trace(layers: int) -> Cost:
+        with FakeTensorMode(), autocast(trainer):
+            teacher = WorldModel(model.model_copy(update={"num_layers": layers})).requires_grad_(False)
+            batch = shape.batch(model)
+            return traced(
+                lambda: teacher_trajectories(
+                    teacher, batch.latents, maps_of(batch), torch.empty_like(batch.latents), views=batch.views,
+                    spec=config.spec, substeps=(1,) * config.spec.steps,
+                )
+            )  # fmt: skip
+
+    cost = extrapolated(trace, model.num_layers, (2, 3))
+    # Each block takes all sub-steps, and one pass more that writes it into the cache.
+    cost = cost.repeated((1 + sum(settings.trajectories.substeps)) / (1 + config.spec.steps))
+    parameters, encoder = parameter_counts(model)[0], 0
+    if isinstance(config.input, FrameInput):
+        encoder, before = encoding(source, shape)
+        cost = before.then(cost)
+    parts = {"weights": 4 * parameters + encoder, "activations": cost.activations}
+    steps = -(-settings.trajectories.clips // clips)
+    return Estimate(f"distill: trajectories (a shard of {clips} clips)", parameters, parts, cost.all_flops, steps)
+
+
+def device_memory(device: str) -> float | None:
+    """Bytes of a card; None for a processor, whose memory the system shares out."""
+    on_gpu = torch.device(device).type == "cuda"
+    return float(torch.cuda.get_device_properties(device).total_memory) if on_gpu else None
 
 
 def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
-    """Refuse a training that this process's device cannot hold, before anything is loaded.
-
-    Where a cheap upper bound fits, as with every small preset, nothing is traced.
+    """Refuse a training that this process's card cannot hold, before anything is loaded.
 
     Raises:
         ConfigError: its parts in GB, and the setting that would fit.
     """
-    if not isinstance(config, (Stage1Config, Stage2Config, DistillConfig)) or not (source := _source(config, inputs)):
-        return  # the training itself names the input that is missing
+    if not isinstance(config, (Stage1Config, Stage2Config, DistillConfig)):
+        return
+    device = (config.teacher_forcing if isinstance(config, DistillConfig) else config).trainer.device
+    memory, source = device_memory(device), _source(config, inputs)
     start = inputs.get({Stage1Config: "base", Stage2Config: "stage1", DistillConfig: "stage2"}[type(config)])
-    model = config.model if isinstance(config, Stage1Config) else None
+    if memory is None or source is None or (start is None and not isinstance(config, Stage1Config)):
+        return  # the training itself names the input that is missing
+    model = config.model if isinstance(config, Stage1Config) else WorldModelConfig()
     if start is not None:
         model = read_checkpoint_info(Path(start)).config
-    if model is None:
-        return
     if isinstance(config, Stage2Config):
         model = stage2_model_config(config, model)
-
-    def check(bound: float, device: str, estimate: Callable[[], Estimate], setting: Callable[[float], str]) -> None:
-        memory = device_memory(device)
-        if bound < memory or (need := estimate()).fits(memory):
-            return
-        raise ConfigError(
-            "This training does not fit the device's memory.",
-            where=f"{need.title} on {device}",
-            expected=f"at most {gigabytes(USABLE * memory)} GB",
-            got=f"{gigabytes(need.total)} GB ({need.describe_parts()})",
-            next_step=f"set {setting(memory)}; `worldline plan` shows every stage",
-        )
-
     devices = int(os.environ.get("WORLD_SIZE", "1"))
-    for one in trainings(config, model, source):
-        setting = partial(one.fitting_setting, devices)
-        check(one.upper_bound, one.trainer.device, partial(one.estimate, devices), setting)
+    needs = [(one.estimate(devices), one) for one in trainings(config, model, source)]
+    rows = [(need, "" if need.fits(memory) else one.fitting_setting(devices, memory)) for need, one in needs]
     if isinstance(config, DistillConfig):
-        bound, device = (
-            upper_bound(model, trajectory_clips(config, source.grid)),
-            config.trajectory_regression.trainer.device,
-        )
-        check(bound, device, partial(trajectory_shard, config, model, source), lambda _: "fewer clips_per_shard")
+        shard = trajectory_shard(config, model, source)
+        rows.append((shard, "" if shard.fits(memory) else "fewer clips_per_shard"))
+    for need, setting in rows:
+        if setting:
+            raise ConfigError(
+                "This training does not fit the device's memory.",
+                where=f"{need.title} on {device}",
+                expected=f"at most {gigabytes(USABLE * memory)} GB",
+                got=f"{gigabytes(need.total)} GB ({need.describe_parts()})",
+                next_step=f"set {setting}; `worldline plan` shows every stage",
+            )
 
 
 def _source(config: Stage1Config | Stage2Config | DistillConfig, inputs: Mapping[str, Path]) -> ClipFrames | None:
