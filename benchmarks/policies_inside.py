@@ -31,7 +31,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from benchmarks.harness import command_line
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.environment.environment import WorldLineVectorEnv, judge_of
+from worldline_core.environment.environment import WorldLineVectorEnv, measured_success
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.evaluation.paired import paired_tests
 from worldline_core.evaluation.policy.agreement import STATISTICS, policy_agreement
@@ -111,7 +111,7 @@ class Starts:
     def __init__(self, recordings: Path, env: MujocoEnv, count: int | None) -> None:
         self.episodes = EpisodeSet.open(recordings)
         total = len(env.starts)
-        rows = [env.starts.row(number) for number in range(total if count is None else min(count, total))]
+        rows = [env.starts.rows[number] for number in range(total if count is None else min(count, total))]
         self.names = [row.bank or row.episode_id for row in rows]
         self.recorded: dict[str, dict[str, int]] = {}
         for position, row in enumerate(self.episodes.rows):
@@ -138,7 +138,7 @@ class Worlds:
     def __init__(self, options: argparse.Namespace) -> None:
         self.inside = WorldLineVectorEnv(
             options.batch, model=options.model, recordings=options.recordings, embodiment=options.embodiment,
-            episode_frames=FRAMES, observe_every=options.observe_every, autoreset_mode=AutoresetMode.DISABLED,
+            episode_frames=FRAMES, observe_every=options.observe_every, autoreset=False,
             steps=options.steps,
         )  # fmt: skip
         self.size = self.inside.world.image_size
@@ -148,7 +148,7 @@ class Worlds:
         self.physics = SyncVectorEnv([lambda: world], autoreset_mode=AutoresetMode.DISABLED)
         self.starts = Starts(options.recordings, world, options.starts)
         self._target, self._instruction = world.target, lambda number: world.starts[number].instruction
-        self._judge: Any = judge_of("measured", None, None, self.inside.world, self.inside.views, world.robot.name)
+        self._judge = measured_success()
 
     def attempts(self, name: str, learned: LearnedPolicy | None, missing: list[int]) -> Iterator[dict[str, Any]]:
         """One policy at the starts that are missing, as many at a time as the simulator holds."""

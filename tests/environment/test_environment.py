@@ -10,14 +10,13 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 
 from worldline_core import WorldLine
 from worldline_core.environment import ENVIRONMENT
 from worldline_core.environment.environment import WorldLineEnv, WorldLineVectorEnv
-from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.evaluation.recordings import Trajectory
+from worldline_core.rollout.recorded_starts import RecordedStarts
 
 ROBOT = "ur5e_silver"
 SHORT: dict[str, Any] = {"embodiment": ROBOT, "views": ["head"], "success": None}
@@ -34,17 +33,16 @@ def world(shipped: Path) -> WorldLine:
 
 
 @pytest.fixture(scope="module")
-def starts(shipped: Path) -> EpisodeStarts:
-    return EpisodeStarts(shipped / "recordings", embodiment=ROBOT, splits=("test",), views=("head",), fps=8.0)
+def starts(shipped: Path) -> RecordedStarts:
+    return RecordedStarts(shipped / "recordings", embodiment=ROBOT, splits=("test",), views=("head",), fps=8.0)
 
 
-def commands(starts: EpisodeStarts, seeds: list[int], count: int) -> np.ndarray:
+def commands(starts: RecordedStarts, seeds: list[int], count: int) -> np.ndarray:
     """Recorded commands of the starts that these seeds choose, ``(count, envs, j)``, the second moved a little."""
     rows = []
     for seed in seeds:
-        episode = starts._episodes.episode(starts._positions[seed % len(starts)])
-        index = np.minimum(np.arange(1, count + 1), len(episode.action) - 1)
-        rows.append(episode.action[index])
+        recorded = starts.commands(seed % len(starts)).astype(np.float32)
+        rows.append(recorded[np.minimum(np.arange(count), len(recorded) - 1)])
     return np.stack(rows, axis=1)
 
 
@@ -61,7 +59,7 @@ def test_gymnasiums_checker_finds_nothing(world: WorldLine) -> None:
     assert environment.unwrapped.metadata["render_fps"] == 8
 
 
-def test_episodes_are_simulations_of_recorded_starts(world: WorldLine, starts: EpisodeStarts) -> None:
+def test_episodes_are_simulations_of_recorded_starts(world: WorldLine, starts: RecordedStarts) -> None:
     """Block by block: pictures are new when a block is full, the state at every step; the end is that of a simulation."""
     environment = WorldLineEnv(model=world, render_mode="rgb_array", episode_frames=20, **SHORT)
     observed, info = environment.reset(seed=1)
@@ -89,7 +87,7 @@ def test_episodes_are_simulations_of_recorded_starts(world: WorldLine, starts: E
         environment.step(driven[0])
 
 
-def test_pictures_may_be_asked_for_more_often(world: WorldLine, starts: EpisodeStarts) -> None:
+def test_pictures_may_be_asked_for_more_often(world: WorldLine, starts: RecordedStarts) -> None:
     start, driven = starts[0], commands(starts, [0], 16)[:, 0]
     simulation = world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=0)
     environment = WorldLineEnv(model=world, observe_every=8, episode_frames=16, **SHORT)
@@ -104,66 +102,35 @@ def test_pictures_may_be_asked_for_more_often(world: WorldLine, starts: EpisodeS
         WorldLineEnv(model=world, observe_every=5, **SHORT)
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: EpisodeStarts, mode: AutoresetMode) -> None:
-    """Against Gymnasium's own vector environment, over the end of an episode, with one that ends early on success."""
-
-    def early(video: Trajectory) -> bool:
-        return video.num_frames == 17 and video.instruction == starts[1].instruction
-
-    assert starts[0].instruction != starts[1].instruction
-    options = {"model": world, "episode_frames": 20, "stop_at_success": True, **SHORT, "success": early}
-    command = over = np.zeros(0)
-    ours = gymnasium.make_vec(ENVIRONMENT, num_envs=2, autoreset_mode=mode, **options)
-    theirs = SyncVectorEnv([lambda: WorldLineEnv(**options)] * 2, autoreset_mode=mode)
+def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: RecordedStarts) -> None:
+    """Against Gymnasium's own vector environment, to the end of the episodes and the first frame of the next ones."""
+    options = {"model": world, "episode_frames": 18, **SHORT}
+    succeeds = {starts[1].instruction}
+    assert starts[0].instruction not in succeeds
+    options["success"] = lambda video: video.instruction in succeeds
+    ours = gymnasium.make_vec(ENVIRONMENT, num_envs=2, **options)
+    theirs = SyncVectorEnv([lambda: WorldLineEnv(**options)] * 2)
     assert isinstance(ours, WorldLineVectorEnv)
     assert (ours.action_space, ours.observation_space) == (theirs.action_space, theirs.observation_space)
-    seeds = [0, 1]
-    pair = [environment.reset(seed=seeds) for environment in (ours, theirs)]
-    assert data_equivalence(*pair)
-    for command in commands(starts, seeds, 20):
+    assert data_equivalence(ours.reset(seed=[0, 1]), theirs.reset(seed=[0, 1]))
+    command, mine = np.zeros(0), ()
+    for command in commands(starts, [0, 1], 18):
         mine, other = (environment.step(command.astype(np.float32)) for environment in (ours, theirs))
-        over = mine[2] | mine[3]
-        if mode == AutoresetMode.SAME_STEP and over.any():
-            break  # what follows an autoreset is drawn by each one's own generator
-        for one, another in zip(mine[:4], other[:4], strict=True):
-            assert data_equivalence(one, another)
-        assert data_equivalence(mine[4], other[4])
-        if over.any():
-            break
-    assert over.tolist() == [False, True]
-    final = mine[4]["final_info"] if mode == AutoresetMode.SAME_STEP else mine[4]
-    assert final["is_success"].tolist() == [False, True]
-    assert (mine[1].tolist(), mine[2].tolist(), mine[3].tolist()) == ([0.0, 1.0], [False, True], [False, False])
-    assert sorted(mine[4]) == sorted(other[4])
-    if mode == AutoresetMode.SAME_STEP:
-        assert data_equivalence(mine[4]["final_obs"][1], other[4]["final_obs"][1])
-    after = ours.step(command)
-    fresh = after if mode == AutoresetMode.NEXT_STEP else mine
-    assert fresh[4]["is_success"].tolist() == [False, False]
-    # The one that goes on is not disturbed by the other's new beginning.
-    again = WorldLineEnv(**options)
-    again.reset(seed=0)
-    rows = commands(starts, [0], 20)[:, 0]
-    ends = [again.step(row) for row in [*rows[:16], rows[15]]][-1]
-    assert np.array_equal(after[0]["agent_pos"][0], ends[0]["agent_pos"])
-    assert np.array_equal(after[0]["pixels"]["head"][0], ends[0]["pixels"]["head"])
-    assert ours.call("_max_episode_steps") == (20, 20)
+        assert all(data_equivalence(one, another) for one, another in zip(mine, other, strict=True))
+    assert mine[4]["is_success"].tolist() == [False, True]
+    assert (mine[1].tolist(), mine[2].tolist(), mine[3].tolist()) == ([0.0, 1.0], [False, True], [True, False])
     assert ours.get_attr("task_description")[0] == starts[0].instruction
+    again = ours.step(command)
+    assert (again[1].tolist(), again[4]["is_success"].tolist()) == ([0.0, 0.0], [False, False])
+    assert not (again[2] | again[3]).any()
+    assert ours.call("_max_episode_steps") == (18, 18)
     assert [picture.shape for picture in ours.call("render")] == [(64, 96, 3)] * 2
-    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
-        ours.call("nothing")
 
 
-def test_what_cannot_be_seen_is_no_success(world: WorldLine, starts: EpisodeStarts) -> None:
+def test_what_cannot_be_seen_is_no_success(world: WorldLine, starts: RecordedStarts) -> None:
     for verdict, rewarded in ((None, False), (True, True), (False, False), (np.True_, True)):
         environment = WorldLineVectorEnv(
-            1,
-            model=world,
-            episode_frames=1,
-            embodiment=ROBOT,
-            views=["head"],
-            success=lambda _, verdict=verdict: verdict,
+            1, model=world, episode_frames=1, **SHORT | {"success": lambda _, v=verdict: v}
         )
         environment.reset(seed=0)
         _, reward, terminated, truncated, infos = environment.step(commands(starts, [0], 1)[0])
@@ -180,7 +147,7 @@ def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> N
     """Replayed in the environment, recorded episodes end as they did: 8 of the 10 first ones at least."""
     environment = WorldLineVectorEnv(10, model=world, episode_frames=32, embodiment=ROBOT, splits=("test", "ood_test"))
     count = min(10, len(environment.starts))
-    recorded = [environment.starts._episodes.rows[position] for position in environment.starts._positions[:count]]
+    recorded = environment.starts.rows[:count]
     environment.reset(seed=0)
     driven = commands(environment.starts, list(range(10)), 32)
     for command in driven:
@@ -189,7 +156,7 @@ def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> N
     assert sum(agree) >= 0.8 * count
 
 
-def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: EpisodeStarts) -> None:
+def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: RecordedStarts) -> None:
     environment = WorldLineVectorEnv(2, model=world, **SHORT)
     with pytest.raises(DataError, match="call reset first"):
         environment.step(np.zeros((2, 14)))
@@ -209,14 +176,11 @@ def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: EpisodeStart
     for seed in (np.int64(0), np.array([0, 1]), [0, np.int64(1)]):  # a zero of NumPy counted as no seed
         _, infos = environment.reset(seed=seed)  # type: ignore[arg-type]
         assert infos["episode_id"].tolist() == [starts[number].episode_id for number in (0, 1)]
-    for mask in (np.zeros(2, bool), np.ones(3, bool), [1, 0], "ab"):
-        with pytest.raises(DataError, match="Not a mask"):
-            environment.reset(options={"reset_mask": mask})
     for change in ({"num_envs": -1}, {"episode_frames": 2.5}, {"success": "measurd"}):
         with pytest.raises(ConfigError, match="Not an environment"):
             WorldLineVectorEnv(**{"num_envs": 2, "model": world, **SHORT, **change})
-    with pytest.raises(DataError, match=r"(?s)of one robot.*left out.*of another split"):
-        EpisodeStarts(shipped / "recordings", embodiment=None, splits=("test",), views=("head",), fps=8.0)
-    with pytest.raises(DataError, match=r"(?s)of one robot.*of another rate"):
-        EpisodeStarts(shipped / "recordings", embodiment=ROBOT, splits=("test",), views=("head",), fps=10.0)
+    for fps, reason in ((8.0, "of another split"), (10.0, "of another rate")):
+        found = RecordedStarts(shipped / "recordings", views=("head",), fps=fps, splits=("test",))
+        with pytest.raises(DataError, match=rf"(?s)of one robot.*left out.*{reason}"):
+            _ = found.embodiment
     assert len(starts) > 1

@@ -21,9 +21,9 @@ from worldline_core.config import read_yaml, validate
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.rollout.recorded_starts import RecordedStarts
 
 pytest.importorskip("lerobot")
 
@@ -114,7 +114,7 @@ def test_lerobot_eval_runs_the_same_policy_in_mujoco(
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     recordings = project_root / "artifacts" / "shipped" / "recordings"
-    starts = EpisodeStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
+    starts = RecordedStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
     for number in range(2):
         written: Any = LeRobotDataset("eval", root=next((tmp_path / "out" / "recordings").rglob(f"env_{number}")))
         assert (written.num_episodes, written.num_frames) == (1, 3)
@@ -166,7 +166,7 @@ def check_recorded(project_root: Path, root: Path, views: tuple[str, ...], *, lo
     shipped, driven = project_root / "artifacts" / "shipped", []
     written: Any = LeRobotDataset("local/any", root=root)
     assert (written.num_episodes, written.fps, written.meta.robot_type) == (2, 8, "worldline")
-    starts = EpisodeStarts(shipped / "recordings", embodiment="ur5e_silver", splits=["test"], views=views, fps=8)
+    starts = RecordedStarts(shipped / "recordings", embodiment="ur5e_silver", splits=["test"], views=views, fps=8)
     names = [f"{name.replace('/', '_')}.pos" for name in load_embodiment("ur5e_silver").state_names]
     assert written.features["action"]["names"] == written.features["observation.state"]["names"] == names
     world, threads = WorldLine.from_pretrained(shipped / "models" / "causal"), torch.get_num_threads()
@@ -210,7 +210,7 @@ def test_lerobot_record_writes_what_recorded_commands_lead_to(
     )  # fmt: skip
     assert "Commands come at" not in said
     recordings = project_root / "artifacts" / "shipped" / "recordings"
-    starts = EpisodeStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
+    starts = RecordedStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
     for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", ("head",), lossless=True)):
         np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
 
@@ -226,7 +226,7 @@ def test_lerobot_record_goes_on_with_a_dataset(lerobot: Callable[..., str], proj
     )  # fmt: skip
     lerobot(tmp_path, "lerobot_record", *asked)
     lerobot(tmp_path, "lerobot_record", *asked, "--resume=true")
-    starts = EpisodeStarts(
+    starts = RecordedStarts(
         project_root / "artifacts" / "shipped" / "recordings", embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8
     )  # fmt: skip
     for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", ("head",), lossless=True)):

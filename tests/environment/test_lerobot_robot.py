@@ -20,10 +20,10 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from worldline_core import WorldLine
 from worldline_core.config import read_yaml
 from worldline_core.data.sources.calibration_file import read_calibration
-from worldline_core.environment.starts import EpisodeStarts, read_start
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.rollout.recorded_starts import RecordedStarts, read_start
 from worldline_core.rollout.simulation import Simulation
 
 ROBOT = "ur5e_silver"
@@ -42,9 +42,9 @@ def world(project_root: Path) -> WorldLine:
 
 
 @pytest.fixture(scope="module")
-def starts(project_root: Path) -> EpisodeStarts:
+def starts(project_root: Path) -> RecordedStarts:
     recordings = project_root / "artifacts" / "shipped" / "recordings"
-    return EpisodeStarts(recordings, embodiment=ROBOT, splits=("test",), views=("head",), fps=8.0)
+    return RecordedStarts(recordings, embodiment=ROBOT, splits=("test",), views=("head",), fps=8.0)
 
 
 @pytest.fixture
@@ -64,12 +64,12 @@ def replay(plugin: ModuleType, tmp_path: Path) -> Iterator[Any]:
     made.disconnect()
 
 
-def begun(world: WorldLine, starts: EpisodeStarts, seed: int) -> Simulation:
+def begun(world: WorldLine, starts: RecordedStarts, seed: int) -> Simulation:
     start = starts[seed]
     return world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=seed)
 
 
-def test_a_robot_is_driven_as_a_simulation(robot: Any, replay: Any, world: WorldLine, starts: EpisodeStarts) -> None:
+def test_a_robot_is_driven_as_a_simulation(robot: Any, replay: Any, world: WorldLine, starts: RecordedStarts) -> None:
     assert robot.action_features == replay.action_features
     assert list(robot.action_features)[:2] == ["left_shoulder_pan_joint.pos", "left_shoulder_lift_joint.pos"]
     assert robot.observation_features == {**dict.fromkeys(robot.action_features, float), "head": (64, 96, 3)}
@@ -121,7 +121,7 @@ def test_pictures_are_predicted_when_they_are_looked_at(robot: Any, replay: Any)
 
 
 def test_pictures_may_be_observed_more_often(
-    plugin: ModuleType, robot: Any, world: WorldLine, starts: EpisodeStarts
+    plugin: ModuleType, robot: Any, world: WorldLine, starts: RecordedStarts
 ) -> None:
     robot.config.observe_every = 8
     robot.connect()
@@ -153,7 +153,7 @@ def test_actions_of_other_robots_are_refused(robot: Any, replay: Any) -> None:
 
 
 def test_episodes_begin_where_lerobot_announces_them(
-    robot: Any, replay: Any, world: WorldLine, starts: EpisodeStarts
+    robot: Any, replay: Any, world: WorldLine, starts: RecordedStarts
 ) -> None:
     root = logging.getLogger()
     level = root.level
@@ -179,7 +179,7 @@ def test_episodes_begin_where_lerobot_announces_them(
 
 
 def test_cameras_of_an_episode_are_written_into_its_dataset(
-    robot: Any, replay: Any, starts: EpisodeStarts, tmp_path: Path
+    robot: Any, replay: Any, starts: RecordedStarts, tmp_path: Path
 ) -> None:
     root = logging.getLogger()
     level = root.level
@@ -238,7 +238,7 @@ def test_units_and_names_are_those_of_leader_arms(plugin: ModuleType) -> None:
     np.testing.assert_array_equal(list(plugin.device.Columns(kinematics, use_degrees=False).named(row).values()), row)
 
 
-def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: EpisodeStarts, tmp_path: Path) -> None:
+def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: RecordedStarts, tmp_path: Path) -> None:
     start, folder = starts[1], tmp_path / "observed"
     folder.mkdir()
     Image.fromarray(start.images["head"]).save(folder / "head.png")

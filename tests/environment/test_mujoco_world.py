@@ -21,12 +21,12 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment import MUJOCO_ENVIRONMENT
 from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.environment.mujoco_world import MujocoEnv
-from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.tokenizers import resize_frame
 from worldline_core.recorder.attempts import BankGrid, RecordPoliciesConfig, record_policies
 from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.record import record_with_manifest
+from worldline_core.rollout.recorded_starts import RecordedStarts
 
 ROBOT = "ur5e_silver"
 POLICIES = {
@@ -75,7 +75,7 @@ def test_recorded_commands_lead_where_they_led(world: MujocoEnv, shipped: Path) 
     """Of every task: the recorded first picture, the same states, the same end; twice, because a start leaves nothing behind."""
     recordings = EpisodeSet.open(shipped / "recordings")
     for number in [*range(len(world.starts)), 0]:
-        row, start = world.starts.row(number), world.starts[number]
+        row, start = world.starts.rows[number], world.starts[number]
         first = world.reset(seed=number)[0]["pixels"]
         for view, picture in first.items():
             recorded = np.empty_like(picture)
@@ -121,7 +121,7 @@ def test_it_is_an_environment_with_the_spaces_of_the_simulator(world: MujocoEnv)
 
 @pytest.mark.slow
 def test_attempts_of_one_bank_are_one_start(compared: Path) -> None:
-    starts = EpisodeStarts(compared, embodiment=ROBOT, splits=("test",), views=("head",), fps=8)
+    starts = RecordedStarts(compared, embodiment=ROBOT, splits=("test",), views=("head",), fps=8)
     assert len(EpisodeSet.open(compared)) == 6
     assert len({starts.row(number).bank for number in range(len(starts))}) == len(starts) == 2
 
@@ -203,9 +203,7 @@ def test_a_learned_policy_meets_the_same_start_in_both_worlds(shipped: Path, com
         seen.append(observed)
         return observed["agent_pos"]
 
-    inside = script.WorldLineVectorEnv(
-        1, recordings=compared, success=None, episode_frames=32, autoreset_mode="Disabled"
-    )
+    inside = script.WorldLineVectorEnv(1, recordings=compared, success=None, episode_frames=32, autoreset=False)
     world = MujocoEnv(compared, embodiment=ROBOT)
     physics = script.SyncVectorEnv([lambda: world], autoreset_mode="Disabled")
     for env in (inside, physics):

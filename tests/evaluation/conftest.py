@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,11 +13,8 @@ import pytest
 
 from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, Episode
-from worldline_core.data.episodes.episode_index import read_index
-from worldline_core.data.episodes.episode_index import write_index as write_episode_index
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.rollout.rollout_set import RolloutSetWriter
-from worldline_core.store.artifact_files import write_manifest
 
 NUM_FRAMES = 17
 HEIGHT, WIDTH = 48, 72
@@ -143,25 +139,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
     """Two attempts beside the recordings that the model knows; the second one begins later than any of these."""
     root = tmp_path_factory.mktemp("trained")
     return _write(root, {"prompt": True, "late": True}, split="test", bank=None, training=20, late=("late",))
-
-
-@pytest.fixture(scope="session")
-def attempts(tmp_path_factory: pytest.TempPathFactory) -> tuple[SmallWorld, SmallWorld]:
-    """Thirty attempts beside the recordings that the model knows; and the same without their outcomes."""
-    cases = {f"try-{number:02d}": number % 2 == 0 for number in range(30)}
-    root = tmp_path_factory.mktemp("attempts")
-    made = _write(root, cases, split="test", bank=None, training=20, late=("try-29",))
-    for method in ("good", "copy"):
-        told = {
-            "config": {"sampler": {"kind": "block_causal", "steps": None}},
-            "inputs": {"checkpoint": {"digest": method}},
-        }
-        write_manifest(made.inputs[f"rollouts.{method}"], {"step": "rollout", **told})
-    untold = root / "untold"
-    shutil.copytree(made.inputs["episodes"], untold)
-    rows = read_index(untold)
-    write_episode_index(untold, [replace(row, outcome="unknown") if row.split == "test" else row for row in rows])
-    return made, SmallWorld({**made.inputs, "episodes": untold}, made.outcomes)
 
 
 @pytest.fixture(scope="session")

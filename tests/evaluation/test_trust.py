@@ -6,16 +6,14 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.stats import mannwhitneyu
 
-from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig, TrustConfig
 from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
 from worldline_core.evaluation.policy.evidence import failure_kind
 from worldline_core.evaluation.policy.judge import confidence_of
 from worldline_core.evaluation.policy.trust import (
     TRUST_COLUMNS,
-    TRUST_FILE,
     KnownRecordings,
-    TrustModel,
     control_vectors,
     fit_right,
     halves,
@@ -195,21 +193,17 @@ def path(random: np.random.Generator, *, waits=0, arms=1, body="arm", camera=0.0
     )  # fmt: skip
 
 
-def controls(tracks):
-    return control_vectors(tracks.T_base_tool, tracks.gripper[:, 0])
-
-
 def test_controls_that_wait_are_new_and_those_of_training_are_not():
     random = np.random.default_rng(0)
-    known = KnownRecordings.of([controls(path(random)) for _ in range(100)])
-    usual = [known.novelty(*controls(path(random))) for _ in range(200)]
+    known = KnownRecordings.of([control_vectors(path(random)) for _ in range(100)])
+    usual = [known.novelty(*control_vectors(path(random))) for _ in range(200)]
     assert np.mean(np.array(usual) > 1) < 0.15
-    assert known.novelty(*controls(path(random, waits=12))) > 2
+    assert known.novelty(*control_vectors(path(random, waits=12))) > 2
     # It is known as soon as the robot has not moved with the others.
-    assert known.novelty(*controls(path(random, waits=12, frames=9))) > 2
-    assert known.novelty(*controls(path(random, arms=2))) == float("inf")
+    assert known.novelty(*control_vectors(path(random, waits=12, frames=9))) > 2
+    assert known.novelty(*control_vectors(path(random, arms=2))) == float("inf")
     # What lies after the end of nearly all training recordings is not compared.
-    assert known.novelty(*controls(path(random, frames=65))) < 3
+    assert known.novelty(*control_vectors(path(random, frames=65))) < 3
 
 
 def test_a_new_body_or_place_of_the_head_camera_is_a_new_setup():
@@ -223,9 +217,9 @@ def test_a_new_body_or_place_of_the_head_camera_is_a_new_setup():
 def test_too_few_training_recordings_or_frames_are_refused():
     random = np.random.default_rng(0)
     with pytest.raises(DataError, match="'1': 4"):
-        KnownRecordings.of([controls(path(random))] * 4)
+        KnownRecordings.of([control_vectors(path(random))] * 4)
     with pytest.raises(DataError, match="more than 4"):
-        controls(path(random, frames=4))
+        control_vectors(path(random, frames=4))
 
 
 CONFIG = PolicyEvaluationConfig(
@@ -254,87 +248,6 @@ def test_trust_needs_tracks_and_training_recordings(recordings, trained, tmp_pat
         evaluate_policy(CONFIG, inputs, tmp_path)
     with pytest.raises(DataError, match="Too few training recordings"):
         evaluate_policy(CONFIG, recordings.inputs, tmp_path)
-
-
-def test_evaluations_without_trust_state_none(recordings, tmp_path):
-    evaluate_policy(CONFIG.model_copy(update={"trust": None}), recordings.inputs, tmp_path)
-    rows = pq.read_table(tmp_path / "decisions.parquet").to_pylist()
-    assert not set(TRUST_COLUMNS) & set(rows[0])
-    assert {s["confidence"] for row in rows for s in json.loads(row["evidence"]) if "confidence" in s} == {0.0}
-    assert "trust" not in json.loads((tmp_path / "summary.json").read_text())
-
-
-SAVING = CONFIG.model_copy(update={"views": ("head",)})
-
-
-@pytest.fixture(scope="module")
-def calibrated(attempts, tmp_path_factory):
-    """An evaluation with known outcomes."""
-    output = tmp_path_factory.mktemp("calibrated")
-    evaluate_policy(SAVING, attempts[0].inputs, output)
-    return output
-
-
-def told(folder, method="copy"):
-    rows = pq.read_table(folder / "decisions.parquet").to_pylist()
-    return {row["episode_id"]: row for row in rows if row["method"] == method}
-
-
-def later(calibration):
-    return SAVING.model_copy(update={"trust": TrustConfig(calibration=calibration)})
-
-
-@pytest.mark.slow
-def test_verdicts_without_outcomes_are_trusted_as_verdicts_with_outcomes_taught(calibrated, attempts, tmp_path):
-    """A first frame repeated is judged a failure, rightly of every second attempt."""
-    before = told(calibrated)
-    assert evaluate_policy(later(calibrated), attempts[1].inputs, tmp_path)["accuracy"] == {}
-    after = told(tmp_path)
-    assert {row["outcome"] for row in after.values()} == {"unknown"}
-    names = sorted(after)
-    signals = np.log([
-        [(before[n]["doubt"] + 0.02) / (1.02 - before[n]["doubt"]), np.clip(before[n]["new_controls"], 0.1, 10), np.clip(before[n]["new_setup"], 0.1, 10)]
-        for n in names
-    ])  # fmt: skip
-    right = np.array([before[n]["predicted"] == before[n]["outcome"] for n in names])
-    expected = probability(fit_right(signals, right), signals)
-    assert [after[n]["trust"] for n in names] == pytest.approx(expected, abs=1e-9)
-    assert "new controls" in after["try-29"]["do_not_trust"]
-    # Of the true predictions every verdict is right: nothing could be calibrated, so nothing is claimed.
-    assert {row["trust"] for row in told(tmp_path, "good").values()} == {None}
-    found = json.loads((tmp_path / "summary.json").read_text())
-    assert "no outcome is recorded" in found["trust"]["methods"]["copy"]["reason"]
-    assert "checkpoint='good'" in found["trust"]["methods"]["good"]["reason"]
-    assert found["methods"]["good"]["all"]["predicted_success"]["mean"] == 0.5
-    assert not pq.read_table(tmp_path / "scores.parquet").num_rows
-    page = render("report/policy.html", evaluations=[policy_evaluation(found, list(after.values()))])
-    assert "Recordings with unknown outcomes" in page
-
-
-@pytest.mark.slow
-def test_a_calibration_is_held_against_new_outcomes(calibrated, attempts, tmp_path):
-    evaluate_policy(later(calibrated / TRUST_FILE), attempts[0].inputs, tmp_path)
-    found = json.loads((tmp_path / "summary.json").read_text())["trust"]["methods"]["copy"]
-    assert (found["available"], found["verdicts"], found["error"]["value"]) == (True, 30, 0.5)
-    assert not (tmp_path / TRUST_FILE).exists()
-
-
-@pytest.mark.slow
-def test_a_calibration_of_something_else_is_refused(calibrated, attempts, tmp_path):
-    inputs = attempts[1].inputs
-    with pytest.raises(ConfigError, match="left_wrist"):
-        evaluate_policy(later(calibrated).model_copy(update={"views": ("head", "left_wrist")}), inputs, tmp_path)
-    saved = TrustModel.read(calibrated)
-    with pytest.raises(ConfigError, match="other robots: other_arm"):
-        saved.require(saved.judged_by, ["box_arm", "other_arm"])
-    asked = saved.methods["copy"].predicted_by.model_copy(update={"checkpoint": "d" * 64})
-    assert "dddddddddddd" in str(saved.calibration_of(asked))
-    assert "videos of an unknown model" in str(saved.calibration_of(None))
-    with pytest.raises(ArtifactError, match=TRUST_FILE):
-        evaluate_policy(later(tmp_path), inputs, tmp_path)
-    (tmp_path / TRUST_FILE).write_bytes((calibrated / TRUST_FILE).read_bytes()[:-9])
-    with pytest.raises(ArtifactError, match=TRUST_FILE):
-        TrustModel.read(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,13 @@ robot (``agent_pos``) is new at every step.
 
 Episodes begin at recorded first frames: a seed ``s`` at start ``s`` modulo their number, with noise of seed ``s``. They end after
 ``episode_frames`` steps, where a judge looks at the whole video: ``is_success``, and a reward of 1. What the judge cannot see is no
-success. Environments that began together are stepped together.
+success.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,27 +24,14 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.environment.starts import EpisodeStarts, Start
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.evaluation.policy.judge import confidence_of, judge_trajectory
+from worldline_core.evaluation.policy.judge import judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
-from worldline_core.evaluation.policy.trust import (
-    JudgedBy,
-    PredictedBy,
-    TrustCalibration,
-    TrustModel,
-    content_digest,
-    control_vectors,
-    reasons,
-    setup_vectors,
-)
 from worldline_core.evaluation.recordings import Trajectory, simulated_points
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, Embodiment, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.model.pretrained import pretrained_folder
-from worldline_core.rollout.samplers import FULL_STEPS
+from worldline_core.rollout.recorded_starts import RecordedStart, RecordedStarts
 from worldline_core.rollout.simulation import Frames, Simulation
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.shipped import shipped_folder
@@ -53,140 +40,36 @@ Success = Callable[[Trajectory], bool | None]
 """True for a video that shows its task done; None where that cannot be seen."""
 
 
-class TrustedJudge:
-    """Success by the embedded judge, with its trust by a saved calibration.
-
-    Args:
-        segmenter: its folder.
-        saved: trust.safetensors, or its folder.
-        world, checkpoint: the model, and its folder. views, embodiment: of the simulations.
-
-    Raises:
-        ArtifactError: there is no such calibration.
-        ConfigError: it was made with another judge, robot or checkpoint, or compares the predictions of two models.
-    """
-
-    def __init__(
-        self, segmenter: Path, saved: Path, world: WorldLine, checkpoint: Path, views: Sequence[str], embodiment: str
-    ) -> None:
-        opened = open_segmenter("learned", learned=segmenter, sam3=None)
-        self._judge = MeasuredEvidenceJudge(opened, states_confidence=True)
-        self._saved = TrustModel.read(saved)
-        digest = content_digest(segmenter)
-        self._saved.require(
-            JudgedBy(judge="measured", views=tuple(views), segmenter="learned", segmenter_weights=digest), (embodiment,)
-        )
-        causal = world.info.causal
-        sampler, usual = ("full_clip", FULL_STEPS) if causal is None else ("block_causal", causal.steps)
-        asked = PredictedBy(
-            checkpoint=content_digest(checkpoint), sampler=sampler, steps=world.steps, shift=world.shift
-        )
-        either = [asked, asked.model_copy(update={"steps": None})] if world.steps == usual else [asked]
-        found = [self._saved.calibration_of(made) for made in either]
-        fitting = [calibration for calibration in found if isinstance(calibration, TrustCalibration)]
-        if not fitting or "disagreement" in fitting[0].signals:
-            raise ConfigError(
-                "A saved calibration of trust is not of these simulations", where=saved,
-                got=", ".join(fitting[0].signals) + ": disagreement needs a second model" if fitting else found[0],
-                next_step="calibrate with rollouts of this checkpoint, without compare_with (docs/evaluation.md)",
-            )  # fmt: skip
-        self._calibration = fitting[0]
-        self._confidence: float | None = None
-
-    def __call__(self, trajectory: Trajectory) -> bool:
-        judgement = judge_trajectory(self._judge, trajectory)
-        self._confidence = confidence_of(asdict(judgement))
-        return judgement.success
-
-    def assess(self, tracks: Sequence[EpisodeTracks]) -> dict[str, Any]:
-        """``trust``, the probability that the last verdict is right (NaN where the judge had nothing to judge by), and
-        ``do_not_trust``, the reasons not to rely on it ("" where there are none).
-
-        Args:
-            tracks: action tracks of the episode so far.
-        """
-        poses, openings = (
-            np.concatenate(rows) for rows in zip(*((t.T_base_tool, t.gripper[:, 0]) for t in tracks), strict=True)
-        )
-        row = {
-            "episode_id": "of a simulation", "disagreement": None,
-            "doubt": None if self._confidence is None else 1.0 - self._confidence,
-            "new_controls": self._saved.controls.novelty(*control_vectors(poses, openings)),
-            "new_setup": self._saved.setups.novelty(*setup_vectors(tracks[0])),
-        }  # fmt: skip
-        trust = self._calibration.trust([row])
-        row["trust"] = None if isinstance(trust, str) else float(trust[0])
-        marks = reasons(row, self._saved.least_trust) + (["nothing to judge by"] if row["trust"] is None else [])
-        return {"trust": float("nan") if row["trust"] is None else row["trust"], "do_not_trust": ", ".join(marks)}
-
-
-def judge_of(
-    success: Success | Literal["measured"] | None,
-    trust: Path | str | None,
-    model: Path | str | WorldLine | None,
-    world: WorldLine,
-    views: Sequence[str],
-    embodiment: str,
-) -> Success | None:
-    """The judge of an environment; the measured one tracks the thing that the instruction names by its colour.
-
-    Raises: ConfigError where trust is asked for in another judge, or in a model without a folder; as of :class:`TrustedJudge`.
-    """
-    shipped = shipped_folder() / "models"
-    if trust is not None:
-        if success != "measured" or isinstance(model, WorldLine):
-            raise ConfigError(
-                "Trust is of the measured judge and of a checkpoint's folder", where="trust",
-                got=f"success {success!r}, model {type(model).__name__}",
-            )  # fmt: skip
-        folder = pretrained_folder(model or shipped / "causal")
-        return TrustedJudge(shipped / "segmenter", Path(trust), world, folder, views, embodiment)
-    if success != "measured":
-        return success
-    judge = MeasuredEvidenceJudge(open_segmenter("learned", learned=shipped / "segmenter", sam3=None))
+def measured_success() -> Success:
+    """The measured judge with the shipped segmenter: it tracks the thing that the instruction names by its colour."""
+    segmenter = open_segmenter("learned", learned=shipped_folder() / "models" / "segmenter", sam3=None)
+    judge = MeasuredEvidenceJudge(segmenter)
     return lambda trajectory: judge_trajectory(judge, trajectory).success
 
 
-@dataclass
-class RunningEpisode:
-    """One running episode: its start, its video so far, the tools in the head view, and the controls' tracks."""
+class CommandedSimulation:
+    """A simulation that takes one command at a time, and predicts a block where it is asked to.
 
-    start: Start
-    video: dict[str, list[np.ndarray]]
-    points: list[np.ndarray]
-    picture: dict[str, np.ndarray]
-    state: np.ndarray
-    tracks: list[EpisodeTracks]
-    success: bool = False
-    trust: dict[str, Any] = field(default_factory=dict)
+    Attributes:
+        commands: those that are not behind the simulation yet, ``(b, j)`` each.
+        age: number of commands so far.
+    """
 
-    def trajectory(self, fps: float) -> Trajectory:
-        """The video so far, as a judge sees it."""
-        video: dict[str, Any] = {view: np.concatenate(pieces) for view, pieces in self.video.items()}
-        return Trajectory(self.start.instruction, video, fps, np.concatenate(self.points))
-
-
-@dataclass
-class Together:
-    """Episodes that began together, and the commands since their last finished block."""
-
-    simulation: Simulation
-    slots: list[int]
-    age: int = 0
-    commands: list[np.ndarray] = field(default_factory=list)
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation, self.age = simulation, 0
+        self.commands: list[np.ndarray] = []
 
     def take(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Take one more command for each episode; returns what is executed of it, and the robots' states, ``(b, j)`` each."""
+        """Take one more command for each clip; returns what is executed of it, and the robots' states, ``(b, j)`` each."""
         self.commands.append(commands)
         self.age += 1
         executed, states = self.simulation.follow(np.stack(self.commands, axis=1))
         return executed[:, -1], states[:, -1]
 
     def predict(self) -> tuple[Simulation, Frames]:
-        """The simulation after the commands that are not behind it yet, at most a block of them, and their videos.
+        """The simulation after at most a block of the commands, and their videos.
 
-        An unfinished block is predicted with the last command held, by a copy: it is predicted again when there are more
-        commands. A full one is behind the simulation then.
+        A copy predicts an unfinished block with the last command held: it is predicted again when there are more commands.
         """
         frames = self.simulation.frames_per_step
         block = np.stack(self.commands[:frames], axis=1)
@@ -198,13 +81,22 @@ class Together:
             self.commands = self.commands[frames:]
         return simulation, [{view: video[:count] for view, video in clip.items()} for clip in clips]
 
-    def without(self, slots: Sequence[int]) -> Together | None:
-        """The same without the episodes of some slots; None where none is left."""
-        kept = [index for index, slot in enumerate(self.slots) if slot not in slots]
-        if len(kept) in (0, len(self.slots)):
-            return self if kept else None
-        commands = [rows[kept] for rows in self.commands]
-        return Together(self.simulation.select(kept), [self.slots[index] for index in kept], self.age, commands)
+
+@dataclass
+class RunningEpisode:
+    """One running episode: its start, its video so far, the tools in the head view, the newest picture, and the robot's state."""
+
+    start: RecordedStart
+    video: dict[str, list[np.ndarray]]
+    points: list[np.ndarray]
+    picture: dict[str, np.ndarray]
+    state: np.ndarray
+    success: bool = False
+
+    def trajectory(self, fps: float) -> Trajectory:
+        """The video so far, as a judge sees it."""
+        video: dict[str, Any] = {view: np.concatenate(pieces) for view, pieces in self.video.items()}
+        return Trajectory(self.start.instruction, video, fps, np.concatenate(self.points))
 
 
 def each_seed(given: int | Sequence[int | None] | None, count: int) -> list[int | None]:
@@ -214,9 +106,9 @@ def each_seed(given: int | Sequence[int | None] | None, count: int) -> list[int 
     """
     if isinstance(given, int | np.integer):
         given = [int(given) + number for number in range(count)]
-    seeds: list[int | None] = [None] * count if given is None else []
-    if isinstance(given, Sequence | np.ndarray):
-        seeds = [*given]
+    seeds: list[int | None] = [None] * count
+    if given is not None:
+        seeds = list(given) if isinstance(given, Sequence | np.ndarray) else []
     known = [seed for seed in seeds if seed is not None]
     if len(seeds) != count or not all(isinstance(seed, int | np.integer) and 0 <= seed < 2**63 for seed in known):
         raise DataError("Not the seeds of the episodes", expected=f"one, or {count}, from 0 to 2^63 - 1", got=given)
@@ -259,7 +151,7 @@ def checked_commands(actions: Any, shape: tuple[int, ...] | None, robot: Embodim
 
 
 class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
-    """Episodes of one robot, side by side.
+    """Episodes of one robot, side by side; they begin and end together.
 
     Args:
         model: a Stage II or causal checkpoint, or a ``WorldLine``; by default the shipped causal one.
@@ -268,18 +160,13 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         views: that are simulated, by default all of the model's.
         episode_frames: steps of an episode.
         observe_every: steps between two observations of pictures, a divisor of the block's length; by default the block.
-        success: "measured" (by colour, with the shipped segmenter), a function, or None: then nothing is a success.
-        stop_at_success: ask the judge after every block, and end the episode where it sees success.
-        trust: trust.safetensors of an evaluation of this checkpoint by the measured judge, or its folder: when an episode has
-            been judged, ``info`` has ``trust``, the probability that the judge is right, and ``do_not_trust``, why it should not
-            be relied on ("" where it may).
+        success: "measured" (`measured_success`), a function, or None: then nothing is a success.
         limits: as of ``WorldLine.start``.
-        autoreset_mode: of finished episodes: at the next step, in the same step, or never (``reset`` with ``reset_mask``).
+        autoreset: begin new episodes at the step after the last one, as Gymnasium's "NextStep"; False: ``reset`` is needed.
         options: further arguments of ``WorldLine.from_pretrained``.
 
     Raises:
-        ConfigError: ``observe_every`` does not divide the block, or a number is not positive; ``trust`` was made with another
-            checkpoint, judge or robot.
+        ConfigError: ``observe_every`` does not divide the block, or a number is not positive.
         DataError: no recording fits.
     """
 
@@ -295,10 +182,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         episode_frames: int = 32,
         observe_every: int | None = None,
         success: Literal["measured"] | Success | None = "measured",
-        stop_at_success: bool = False,
-        trust: Path | str | None = None,
         limits: bool = True,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        autoreset: bool = True,
         render_mode: Literal["rgb_array"] | None = "rgb_array",
         **options: Any,
     ) -> None:
@@ -315,24 +200,23 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             else WorldLine.from_pretrained(model or shipped / "models" / "causal", **options)
         )
         self.views = self.world.chosen_views(self.world.views if views is None else views)
-        self.starts = EpisodeStarts(
+        self.starts = RecordedStarts(
             Path(recordings or shipped / "recordings"),
-            embodiment=embodiment, splits=splits, views=self.views, fps=self.world.contract.fps,
+            views=self.views, fps=self.world.contract.fps, embodiment=embodiment, splits=splits,
         )  # fmt: skip
         self.kinematics = ArmKinematics(load_embodiment(self.starts.embodiment))
         self.num_envs, self.episode_frames = num_envs, episode_frames
-        self._limits, self._stop_at_success = limits, stop_at_success
-        self._succeeds = judge_of(success, trust, model, self.world, self.views, self.starts.embodiment)
+        self._limits, self._autoreset = limits, autoreset
+        self._succeeds = measured_success() if success == "measured" else success
         self.render_mode = render_mode
-        self._autoreset = AutoresetMode(autoreset_mode)
         self.metadata = {
-            "render_modes": ["rgb_array"], "render_fps": round(self.world.contract.fps), "autoreset_mode": self._autoreset,
+            "render_modes": ["rgb_array"], "render_fps": round(self.world.contract.fps),
+            "autoreset_mode": AutoresetMode.NEXT_STEP if autoreset else AutoresetMode.DISABLED,
         }  # fmt: skip
-        self._together: list[Together] = []
         self._random = [np.random.default_rng() for _ in range(num_envs)]
-        self._done = np.ones(num_envs, dtype=bool)
         self._episodes: list[RunningEpisode] = []
-        self.frames_per_step = self._begun([self.starts[0]], [0]).frames_per_step
+        self._running = self._begun([0])
+        self.frames_per_step = self._running.simulation.frames_per_step
         self.observe_every = observe_every or self.frames_per_step
         if self.observe_every < 1 or self.frames_per_step % self.observe_every:
             raise ConfigError(
@@ -350,54 +234,27 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin new episodes, at the starts of the seeds (an integer counts up), or else at drawn ones.
 
-        Args:
-            options: ``reset_mask``, bool ``(num_envs)``: which ones begin anew.
-
-        Raises:
-            DataError: other seeds than one, or one for each; a mask that names none, or is of another shape.
+        Raises: DataError: other seeds than one, or one for each.
         """
-        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
-        if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
-            raise DataError("Not a mask of episodes", where="reset_mask", expected=f"bool ({self.num_envs},)", got=mask)
-        self._begin(np.flatnonzero(mask).tolist(), each_seed(seed, self.num_envs))
-        return self._observation(), self._infos([self._info(slot) for slot in range(self.num_envs)])
+        self._begin(each_seed(seed, self.num_envs))
+        return self._observation(), self._infos()
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One command for each episode; see the module's text for when pictures are new.
 
-        Raises:
-            DataError: the commands have another shape or are not finite, or an episode has ended or not begun.
+        Raises: DataError: the commands have another shape or are not finite, or the episodes have ended or not begun.
         """
         commands = checked_commands(actions, self.action_space.shape, self.kinematics.embodiment)
-        restarted: list[int] = []
-        if self._autoreset == AutoresetMode.NEXT_STEP and self._episodes:
-            restarted = [slot for slot in range(self.num_envs) if self._done[slot]]
-        elif self._done.any():
-            ended = np.flatnonzero(self._done).tolist()
-            raise DataError("An episode has ended or not begun", got=ended, next_step="call reset first")
-        if not self._episodes:
-            raise DataError("The environment was not reset", next_step="call reset first")
-        going_on = [rest for group in self._together if (rest := group.without(restarted)) is not None]
-        for group in going_on:
-            self._advance(group, commands[group.slots])
-        ended = np.zeros(self.num_envs, dtype=bool)
-        for group in going_on:
-            ended[group.slots] = group.age == self.episode_frames
+        over = self._running.age == self.episode_frames
+        if not self._episodes or (over and not self._autoreset):
+            raise DataError("An episode has ended or not begun", next_step="call reset first")
+        if over:
+            self._begin([None] * self.num_envs)
+        else:
+            self._advance(commands)
+        last = self._running.age == self.episode_frames
         success = np.array([episode.success for episode in self._episodes])
-        success[restarted] = False
-        self._together, self._done = going_on, ended | success
-        if restarted:
-            self._begin(restarted, [None] * self.num_envs)
-        infos = [self._info(slot) for slot in range(self.num_envs)]
-        observation = self._observation()
-        finished = np.flatnonzero(self._done).tolist()
-        if self._autoreset == AutoresetMode.SAME_STEP and finished:
-            last = [{"final_obs": self._observed(slot), "final_info": infos[slot]} for slot in finished]
-            self._begin(finished, [None] * self.num_envs)
-            for slot, final in zip(finished, last, strict=True):
-                infos[slot] = self._info(slot) | final
-            observation = self._observation()
-        return observation, success.astype(np.float64), success, ended & ~success, self._infos(infos)
+        return self._observation(), success.astype(np.float64), success, last & ~success, self._infos()
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Latest picture of each episode, its views side by side, ``uint8 (H, views * W, 3)``."""
@@ -421,63 +278,52 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         """An attribute of every environment."""
         return self.call(name)
 
-    def _begun(self, starts: Sequence[Start], seeds: Sequence[int]) -> Simulation:
-        return self.world.start(
-            [start.images for start in starts],
-            [start.cameras for start in starts],
-            embodiment=self.kinematics,
-            state=np.stack([start.state for start in starts]),
-            seed=seeds,
-            limits=self._limits,
-        )
+    def _begun(self, seeds: Sequence[int]) -> CommandedSimulation:
+        starts = [self.starts[seed % len(self.starts)] for seed in seeds]
+        return CommandedSimulation(
+            self.world.start(
+                [start.images for start in starts], [start.cameras for start in starts], embodiment=self.kinematics,
+                state=np.stack([start.state for start in starts]), seed=seeds, limits=self._limits,
+            )
+        )  # fmt: skip
 
-    def _begin(self, slots: Sequence[int], seeds: Sequence[int | None]) -> None:
-        chosen: list[int] = []
-        for slot in slots:
-            given = seeds[slot]
-            if given is not None:
-                self._random[slot] = np.random.default_rng(given)
-            chosen.append(int(self._random[slot].integers(2**31)) if given is None else int(given))
-        starts = [self.starts[number % len(self.starts)] for number in chosen]
-        simulation = self._begun(starts, chosen)
-        others = [rest for group in self._together if (rest := group.without(slots)) is not None]
-        self._together = [*others, Together(simulation, list(slots))]
-        episodes = dict(enumerate(self._episodes))
-        for index, slot in enumerate(slots):
-            picture = simulation.pictures[index]
-            video = {view: [frame[None]] for view, frame in picture.items()}
-            points = [simulated_points(simulation, index)]
-            tracks = [simulation.tracks[index]]
-            episodes[slot] = RunningEpisode(starts[index], video, points, picture, simulation.state[index], tracks)
-            self._done[slot] = False
-        if len(episodes) < self.num_envs:
-            raise DataError("Some episodes were never begun", next_step="reset all of them first")
-        self._episodes = [episodes[slot] for slot in range(self.num_envs)]
+    def _begin(self, given: Sequence[int | None]) -> None:
+        """Start at the given seeds; where there is none, at one drawn by the episode's generator."""
+        seeds: list[int] = []
+        for slot, seed in enumerate(given):
+            if seed is not None:
+                self._random[slot] = np.random.default_rng(seed)
+            seeds.append(int(self._random[slot].integers(2**31)) if seed is None else int(seed))
+        self._running = self._begun(seeds)
+        simulation = self._running.simulation
+        self._episodes = [
+            RunningEpisode(
+                self.starts[seed % len(self.starts)], {view: [frame[None]] for view, frame in picture.items()},
+                [simulated_points(simulation, slot)], picture, simulation.state[slot],
+            )
+            for slot, (seed, picture) in enumerate(zip(seeds, simulation.pictures, strict=True))
+        ]  # fmt: skip
 
-    def _advance(self, group: Together, commands: np.ndarray) -> None:
-        """Take one command for each episode of a group; predict and judge when it is time."""
-        for slot, state in zip(group.slots, group.take(commands)[1], strict=True):
-            self._episodes[slot].state = state
-        count, last = len(group.commands), group.age == self.episode_frames
-        full = count == self.frames_per_step
-        if not (full or last or count % self.observe_every == 0):
+    def _advance(self, commands: np.ndarray) -> None:
+        """Take one command for each episode; predict and judge when it is time."""
+        running = self._running
+        for episode, state in zip(self._episodes, running.take(commands)[1], strict=True):
+            episode.state = state
+        count, last = len(running.commands), running.age == self.episode_frames
+        if not last and count % self.observe_every:
             return
-        simulation, clips = group.predict()
-        for index, slot in enumerate(group.slots):
-            episode = self._episodes[slot]
-            episode.picture = {view: video[-1] for view, video in clips[index].items()}
-            if full or last:
-                for view, video in clips[index].items():
+        simulation, clips = running.predict()
+        for slot, (episode, clip) in enumerate(zip(self._episodes, clips, strict=True)):
+            episode.picture = {view: video[-1] for view, video in clip.items()}
+            if last or count == self.frames_per_step:
+                for view, video in clip.items():
                     episode.video[view].append(video)
-                episode.points.append(simulated_points(simulation, index)[:count])
-                episode.tracks.append(simulation.tracks[index].clip(range(count)))
-            if self._succeeds is not None and (last or (full and self._stop_at_success)):
+                episode.points.append(simulated_points(simulation, slot)[:count])
+            if last and self._succeeds is not None:
                 found = self._succeeds(episode.trajectory(self.world.contract.fps))
                 if not isinstance(found, bool | np.bool_ | None):
                     raise DataError("Not a judgement", where="success", expected="True, False or None", got=found)
                 episode.success = bool(found)
-                if isinstance(self._succeeds, TrustedJudge):
-                    episode.trust = self._succeeds.assess(episode.tracks)
 
     def _observed(self, slot: int) -> dict[str, Any]:
         episode = self._episodes[slot]
@@ -491,17 +337,13 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
     def _info(self, slot: int) -> dict[str, Any]:
         episode = self._episodes[slot]
-        return {
-            "is_success": episode.success,
-            "episode_id": episode.start.episode_id,
-            "task": episode.start.instruction,
-            **episode.trust,
-        }
+        start = episode.start
+        return {"is_success": episode.success, "episode_id": start.episode_id, "task": start.instruction}
 
-    def _infos(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def _infos(self) -> dict[str, Any]:
         gathered: dict[str, Any] = {}
-        for slot, info in enumerate(infos):
-            gathered = self._add_info(gathered, info, slot)
+        for slot in range(self.num_envs):
+            gathered = self._add_info(gathered, self._info(slot), slot)
         return gathered
 
 
@@ -511,7 +353,7 @@ class WorldLineEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012
 
     def __init__(self, render_mode: Literal["rgb_array"] | None = None, **options: Any) -> None:
-        self.vector = WorldLineVectorEnv(1, render_mode=render_mode, autoreset_mode=AutoresetMode.DISABLED, **options)
+        self.vector = WorldLineVectorEnv(1, render_mode=render_mode, autoreset=False, **options)
         self.render_mode = render_mode
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": self.vector.metadata["render_fps"]}
         self.action_space = self.vector.single_action_space

@@ -22,7 +22,6 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment.environment import checked_commands, robot_spaces
-from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.model.tokenizers import resize_frame
@@ -39,6 +38,7 @@ from worldline_core.recorder.simulate import (
     place_arms,
     read_state,
 )
+from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.artifact_files import MANIFEST_NAME, read_manifest
 
@@ -80,7 +80,7 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             )  # fmt: skip
         prepare_rendering()
         folder = Path(recordings or shipped_folder() / "recordings")
-        self.starts = EpisodeStarts(folder, embodiment=embodiment, splits=splits, views=views, fps=FRAME_RATE)
+        self.starts = RecordedStarts(folder, views=views, fps=FRAME_RATE, embodiment=embodiment, splits=splits)
         self.views, self.image_size, self.render_mode = tuple(views), image_size, render_mode
         self._max_episode_steps, self._observe_every = episode_frames, observe_every
         self.robot = load_embodiment(self.starts.embodiment)
@@ -89,7 +89,7 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._data = self._recorder.new_data()
         self._recipe = _recipe(folder)
         # Drawing a start again tries every policy that recorded it.
-        self._drawn = lru_cache(maxsize=1024)(lambda number: self._recipe(self._recorder, self.starts.row(number)))
+        self._drawn = lru_cache(maxsize=1024)(lambda number: self._recipe(self._recorder, self.starts.rows[number]))
         self.task = self.task_description = ""
         self._qpos: list[np.ndarray] = []
 

@@ -137,7 +137,7 @@ class VideoEvaluationConfig(StrictModel):
 
 
 class TrustConfig(StrictModel):
-    """Thresholds of the mark "do not trust" on verdicts, and where their calibration comes from."""
+    """Thresholds of the mark "do not trust" on verdicts."""
 
     novelty_level: float = Field(
         default=0.05, gt=0, lt=0.5, description="share of the training recordings whose own novelty is above 1"
@@ -147,10 +147,6 @@ class TrustConfig(StrictModel):
     )
     compare_with: dict[str, str] = Field(
         default={}, description="by method, another one whose verdicts are compared: disagreement lowers trust"
-    )
-    calibration: Path | None = Field(
-        default=None,
-        description="trust.safetensors of an earlier evaluation, or its folder; outcomes may be unknown then",
     )
 
 
@@ -183,8 +179,7 @@ class PolicyEvaluationConfig(StrictModel):
         return self
 
     def weights_read(self) -> Mapping[str, Path | None]:
-        saved = {} if self.trust is None else {"trust": self.trust.calibration}
-        return _judge_weights(self.judge, self) | saved
+        return _judge_weights(self.judge, self)
 
 
 class PlanningConfig(StrictModel):

@@ -24,11 +24,15 @@ from worldline_core.store.atomic import atomic_path, write_json_atomic
 
 SCORES_FILE = "scores.parquet"
 SUMMARY_FILE = "summary.json"
+DECISIONS_FILE = "decisions.parquet"
+"""Verdicts of evaluate_policy."""
 TRUE_METHOD = "true"
 """The method whose videos are the recordings themselves."""
 _TYPES = {
     **dict.fromkeys(("seed", "run", "budget", "frame", "count", "answers", "malformed_answers"), pa.int32()),
-    **dict.fromkeys(("value", "mean", "doubt", "disagreement", "new_controls", "new_setup", "trust"), pa.float64()),
+    **dict.fromkeys(
+        ("value", "mean", "confidence", "doubt", "disagreement", "new_controls", "new_setup", "trust"), pa.float64()
+    ),
 }
 """Columns of the tables that evaluations write; all others are strings."""
 

@@ -43,12 +43,6 @@ def policy_evaluation(summary: JsonObject, verdicts: Sequence[JsonObject] = ()) 
         dots, digits=2, value_label="agreement with the recorded outcome, 95 % interval",
         title=f"Accuracy over {summary.get('trajectories', '?')} trajectories (judge: {summary.get('judge', 'unknown')})",
     ) if dots else None  # fmt: skip
-    unknown = [
-        [m.long_label, found["count"], interval(found)]
-        for m in methods
-        if (found := results[m.name].get(ALL, {}).get("predicted_success"))
-    ]
-    headings = ["Videos of", "Recordings", "Judged a success"]
     shown = [m for m in methods if m.kind in (TRUE_METHOD, "stage2", "causal")]
     return {
         "chart": chart,
@@ -58,9 +52,6 @@ def policy_evaluation(summary: JsonObject, verdicts: Sequence[JsonObject] = ()) 
         "ranking": policy_ranking(summary["policies"]) if summary.get("policies") else None,
         "trust": trust_view(summary["trust"]) if summary.get("trust") else None,
         "failures": failure_tables(verdicts),
-        "unknown": Table(headings, unknown, (1, 2), "Recordings with unknown outcomes", dense=True)
-        if unknown
-        else None,
     }
 
 

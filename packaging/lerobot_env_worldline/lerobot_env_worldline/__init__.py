@@ -50,8 +50,7 @@ class WorldLineEnvConfig(EnvConfig):
     """Options of ``--env.type=worldline``; see ``WorldLineVectorEnv`` for what they mean.
 
     ``world=mujoco`` computes the same starts by physics (``MujocoEnv``; for recordings of ``worldline record``), with new pictures at
-    every step unless ``observe_every`` is given; ``stop_at_success`` plays no part there, and of the model only rate, views and size
-    of pictures.
+    every step unless ``observe_every`` is given; of the model only rate, views and size of pictures count there.
     The policy's ``n_action_steps`` should be ``observe_every`` (by default the model's block, 16).
     """
 
@@ -65,7 +64,6 @@ class WorldLineEnvConfig(EnvConfig):
     views: list[str] | None = None
     episode_length: int = 32
     observe_every: int | None = None
-    stop_at_success: bool = False
     device: str = "cpu"
 
     def __post_init__(self) -> None:
@@ -89,7 +87,7 @@ class WorldLineEnvConfig(EnvConfig):
         return {
             "model": self.model, "recordings": self.recordings, "embodiment": self.embodiment, "splits": self.splits,
             "views": self.views, "episode_frames": self.episode_length, "observe_every": self.observe_every,
-            "stop_at_success": self.stop_at_success, "device": self.device,
+            "device": self.device,
         }  # fmt: skip
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:

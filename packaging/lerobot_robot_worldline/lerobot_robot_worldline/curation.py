@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import yaml
 
-from worldline_core.environment.starts import Start
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.rollout.observation import image_size, project_controls
+from worldline_core.rollout.recorded_starts import RecordedStart
 from worldline_core.store.atomic import write_bytes_atomic
 
 CAMERAS = "meta/cameras/{episode_index:06d}.json"
 
 
 def write_cameras(
-    root: Path, episode: int, start: Start, kinematics: ArmKinematics, commands: np.ndarray, fps: float
+    root: Path, episode: int, start: RecordedStart, kinematics: ArmKinematics, commands: np.ndarray, fps: float
 ) -> None:
     """Cameras of an episode in the form of docs/sources.md.
 

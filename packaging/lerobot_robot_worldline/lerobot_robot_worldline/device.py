@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import CheckpointInfo
+from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.shipped import shipped_folder
 
 
@@ -45,9 +45,9 @@ class Recordings:
         """Folder of the model."""
         return Path(self.model or shipped_folder() / "models" / "causal")
 
-    def starts(self, info: CheckpointInfo) -> EpisodeStarts:
+    def starts(self, info: CheckpointInfo) -> RecordedStarts:
         """First frames of the recordings that the model can go on from."""
-        return EpisodeStarts(
+        return RecordedStarts(
             Path(self.recordings or shipped_folder() / "recordings"),
             embodiment=self.embodiment, splits=self.splits, views=self.views or info.views, fps=info.contract.fps,
         )  # fmt: skip

@@ -16,13 +16,13 @@ from lerobot.utils.errors import DeviceNotConnectedError
 
 from lerobot_robot_worldline.curation import write_cameras, write_source
 from lerobot_robot_worldline.device import Announcements, Columns, Recordings
-from worldline_core.environment.environment import Together
-from worldline_core.environment.starts import EpisodeStarts, Start, read_start
+from worldline_core.environment.environment import CommandedSimulation
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import read_checkpoint_info
 from worldline_core.rollout.observation import ordered_views
+from worldline_core.rollout.recorded_starts import RecordedStart, RecordedStarts, read_start
 from worldline_core.rollout.worldline import WorldLine
 
 LOG = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ class WorldLineRobotConfig(RobotConfig, Recordings):
 
     Attributes:
         observation: begin all episodes here instead of at recordings: a folder with ``<view>.png``, ``calibration.yaml`` and
-            ``state.yaml`` (``worldline_core.environment.starts.read_start``).
+            ``state.yaml`` (``worldline_core.rollout.recorded_starts.read_start``).
         observe_every: commands between two observations of new pictures, a divisor of the model's block; by default the block.
         limits: hold commands within the embodiment's limits.
         dataset_root: that of ``--dataset.root``: the cameras of each episode are written into the dataset, and ``curate.yaml``, by
@@ -70,7 +70,7 @@ class WorldLineRobot(Robot):
         size = (cells[0] * compression, cells[1] * compression, 3)
         self.cameras = dict.fromkeys(ordered_views(self._info.views, config.views or self._info.views), size)
         self._announced = Announcements()
-        self._running: Together | None = None
+        self._running: CommandedSimulation | None = None
         self._executed: list[np.ndarray] = []
 
     @property
@@ -101,7 +101,7 @@ class WorldLineRobot(Robot):
         del calibrate
         config = self.config
         self._world = WorldLine.from_pretrained(config.checkpoint, device=config.device)
-        self._starts: Sequence[Start] | EpisodeStarts = (
+        self._starts: Sequence[RecordedStart] | RecordedStarts = (
             config.starts(self._info)
             if config.observation is None
             else [read_start(Path(config.observation), self._kinematics.embodiment, list(self.cameras))]
@@ -144,7 +144,7 @@ class WorldLineRobot(Robot):
             self._executed.append(executed[0])
         return self._columns.named(executed[0])
 
-    def _begun(self, episode: int) -> Together:
+    def _begun(self, episode: int) -> CommandedSimulation:
         config, seed = self.config, self.config.seed + episode
         self._start = start = self._starts[seed % len(self._starts)]
         simulation = self._world.start(
@@ -158,9 +158,9 @@ class WorldLineRobot(Robot):
             )  # fmt: skip
         self._pictures, self._state, self._unseen = simulation.pictures[0], simulation.state[0], False
         self._episode = episode
-        return Together(simulation, [0])
+        return CommandedSimulation(simulation)
 
-    def _going_on(self) -> Together:
+    def _going_on(self) -> CommandedSimulation:
         """The running episode, begun anew where LeRobot has announced one."""
         if self._running is None:
             raise DeviceNotConnectedError

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
@@ -26,13 +25,7 @@ from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
 from worldline_core.evaluation.policy.agreement import policy_agreement, require_policies
 from worldline_core.evaluation.policy.judge import Judge, VLMJudge, confidence_of, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
-from worldline_core.evaluation.policy.trust import (
-    TRUST_COLUMNS,
-    JudgedBy,
-    TrustModel,
-    assess_trust,
-    content_digest,
-)
+from worldline_core.evaluation.policy.trust import assess_trust
 from worldline_core.evaluation.recordings import (
     open_rollouts,
     open_tracks,
@@ -41,6 +34,7 @@ from worldline_core.evaluation.recordings import (
     trajectory_of,
 )
 from worldline_core.evaluation.scores import (
+    DECISIONS_FILE,
     SUMMARY_FILE,
     TRUE_METHOD,
     Score,
@@ -59,13 +53,12 @@ from worldline_core.store.atomic import write_json_atomic
 
 logger = logging.getLogger(__name__)
 
-DECISIONS_FILE = "decisions.parquet"
 _OUTCOMES = ("success", "failure")
 _ALL = "all"
 _LABELS = ("episode_id", "embodiment", "split", "scene", "task_family", "instruction", "outcome")
 _COLUMNS = (
-    "method", "episode_id", "embodiment", "split", "scene", "task_family", "seed", "instruction", "outcome",
-    "predicted", "evidence_family", "decided_by", "answers", "malformed_answers", "evidence",
+    "method", "episode_id", "embodiment", "split", "scene", "task_family", "seed", "start", "instruction",
+    "outcome", "predicted", "confidence", "evidence_family", "decided_by", "answers", "malformed_answers", "evidence",
 )  # fmt: skip
 
 
@@ -73,8 +66,7 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     """Judge every method's videos and compare with the recorded outcomes.
 
     Inputs: episodes, rollouts.<method>; tracks and segmenter where the judge uses them.
-    Output: scores.parquet (metric ``correct``), decisions.parquet (every verdict with its evidence), summary.json; with ``trust`` also
-    trust.safetensors, for evaluations without outcomes.
+    Output: scores.parquet (metric ``correct``), decisions.parquet (every verdict with its evidence), summary.json.
     """
     episodes, rollouts, tracks = EpisodeSet.open(inputs["episodes"]), open_rollouts(inputs), open_tracks(inputs)
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}
@@ -83,8 +75,12 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     chosen = choose_trajectories(config, rows, times)
     if config.compare_policies and chosen:
         require_policies({row.source for row in chosen})
+    if config.trust and tracks is None:
+        raise ConfigError(
+            "Trust in verdicts needs the controls", where="evaluate_policy.trust", expected="the input tracks",
+            next_step="run render_actions and give its folder as --input tracks=FOLDER",
+        )  # fmt: skip
     judge = open_judge(config, inputs.get("segmenter"))
-    trust = open_trust(config, inputs, judge, episodes, tracks, chosen)
 
     def judge_video(row: EpisodeRow, rollout: RolloutSet | None, seed: int) -> dict[str, Any]:
         video = trajectory_of(episodes, row, config.views, rollout=rollout, seed=seed, tracks=tracks)
@@ -106,51 +102,41 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     verdicts = [verdict for verdict in judged if verdict["whole"]]
     counts = _count(config, rows, chosen, verdicts, inputs["episodes"])
 
-    known = [verdict for verdict in verdicts if verdict["outcome"] in _OUTCOMES]
     resampling = {"resamples": config.resamples, "seed": config.seed}
     summary = summarise_decisions(verdicts, **resampling)
     summary |= {"judge": judge.name, "interval": "95 % bootstrap over trajectories"}
     summary["shorter_than_recording"] = dict(too_short)
-    if config.compare_policies and known:
-        summary["policies"] = policy_agreement(known, **resampling)
-    if config.trust and trust and tracks:
-        verdicts, summary["trust"] = assess_trust(verdicts, config.trust, trust, tracks, rollouts, output, **resampling)
-    verdicts = sorted(verdicts, key=lambda row: (row["method"], row["episode_id"], row["seed"]))
-    write_table(output / DECISIONS_FILE, verdicts, _COLUMNS if trust is None else (*_COLUMNS, *TRUST_COLUMNS))
-    write_scores(output, map(_correctness, known))
+    if config.compare_policies:
+        summary["policies"] = policy_agreement(verdicts, **resampling)
+    verdicts.sort(key=lambda row: (row["method"], row["episode_id"], row["seed"]))
+    write_table(output / DECISIONS_FILE, verdicts, _COLUMNS)
+    write_scores(output, map(_correctness, verdicts))
     write_json_atomic(output / SUMMARY_FILE, summary)
-    overall = {
-        name: found[_ALL]["accuracy"]["mean"] for name, found in summary["methods"].items() if "accuracy" in found[_ALL]
-    }
+    if config.trust and tracks:
+        assess_trust(output, config.trust, episodes, tracks, **resampling)
+    overall = {name: found[_ALL]["accuracy"]["mean"] for name, found in summary["methods"].items()}
     return counts | {"trajectories": summary["trajectories"], "judge": judge.name, "accuracy": overall}
-
-
-def chosen_outcomes(config: PolicyEvaluationConfig) -> tuple[str, ...]:
-    """Outcomes of the recordings that are judged; with a saved calibration of trust also ``unknown``."""
-    saved = config.trust is not None and config.trust.calibration is not None
-    return (*_OUTCOMES, "unknown") if saved else _OUTCOMES
 
 
 def choose_trajectories(
     config: PolicyEvaluationConfig, rows: Sequence[EpisodeRow], times: Mapping[str, int]
 ) -> list[EpisodeRow]:
-    """Draw as many successes as failures in every split and task family (and all unknown outcomes, where they are judged).
+    """Draw as many successes as failures in every split and task family.
 
     Args:
         times: number of methods that predicted each episode; those that more have predicted are taken first.
     """
-    outcomes = chosen_outcomes(config)
-    groups: dict[tuple[str, str], dict[str, list[EpisodeRow]]] = defaultdict(lambda: {name: [] for name in outcomes})
+    groups: dict[tuple[str, str], dict[str, list[EpisodeRow]]] = defaultdict(lambda: {name: [] for name in _OUTCOMES})
     for row in rows:
-        if row.split in config.splits and row.outcome in outcomes:
+        if row.split in config.splits and row.outcome in _OUTCOMES:
             groups[row.split, row.task_family][row.outcome].append(row)
     chosen: list[EpisodeRow] = []
     generator = np.random.default_rng(config.seed)
     for _, group in sorted(groups.items()):
         fewest = min(len(group[outcome]) for outcome in _OUTCOMES)
-        for outcome in outcomes:
+        for outcome in _OUTCOMES:
             members = sorted(group[outcome], key=lambda row: row.episode_id)
-            limit = fewest if config.balanced and outcome in _OUTCOMES else len(members)
+            limit = fewest if config.balanced else len(members)
             limit = limit if config.max_per_group is None else min(limit, config.max_per_group)
             drawn = generator.permutation(len(members))
             picked = sorted(drawn, key=lambda index: -times[members[index].episode_id])[:limit]
@@ -162,7 +148,7 @@ def open_judge(config: PolicyEvaluationConfig, segmenter: Path | None) -> Judge:
     """The judge that the config names."""
     if config.judge == "measured":
         opened = open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights)
-        return MeasuredEvidenceJudge(opened, states_confidence=config.trust is not None)
+        return MeasuredEvidenceJudge(opened)
     return VLMJudge(open_vlm(config.judge, config.vlm))
 
 
@@ -184,31 +170,6 @@ def _decision(row: EpisodeRow, method: str, seed: int, verdict: Mapping[str, Any
     }
 
 
-def open_trust(
-    config: PolicyEvaluationConfig,
-    inputs: Mapping[str, Path],
-    judge: Judge,
-    episodes: EpisodeSet,
-    tracks: ActionTracks | None,
-    chosen: Sequence[EpisodeRow],
-) -> TrustModel | None:
-    """The saved calibration of trust or the training recordings; opened before the judging, which takes long, for they may not fit."""
-    if config.trust is None:
-        return None
-    if tracks is None:
-        raise ConfigError(
-            "Trust in verdicts needs the controls", where="evaluate_policy.trust", expected="the input tracks",
-            next_step="run render_actions and give its folder as --input tracks=FOLDER",
-        )  # fmt: skip
-    weights = content_digest(inputs["segmenter"]) if "segmenter" in inputs else None
-    judged_by = JudgedBy(judge=judge.name, views=config.views, segmenter=config.segmenter, segmenter_weights=weights)
-    if config.trust.calibration is None:
-        return TrustModel.of_training(episodes, tracks, judged_by, config.trust)
-    saved = TrustModel.read(config.trust.calibration)
-    saved.require(judged_by, {row.embodiment for row in chosen})
-    return saved
-
-
 def _count(
     config: PolicyEvaluationConfig,
     rows: Sequence[EpisodeRow],
@@ -221,7 +182,7 @@ def _count(
     Raises: DataError when none is left.
     """
     inside = [row for row in rows if row.split in config.splits]
-    judgeable = [row for row in inside if row.outcome in chosen_outcomes(config)]
+    judgeable = [row for row in inside if row.outcome in _OUTCOMES]
     kept = len({verdict["episode_id"] for verdict in verdicts if verdict["method"] != TRUE_METHOD})
     left_out = {
         "in other splits": len(rows) - len(inside),
@@ -235,8 +196,7 @@ def _count(
             where=where,
             expected=f"predictions of recordings of the splits {', '.join(config.splits)} that ended in success or failure",
             got=f"{len(rows)} predicted episodes: " + ", ".join(f"{n} {reason}" for reason, n in left_out.items() if n),
-            next_step="predict recordings with known outcomes, name a saved calibration (evaluate_policy.trust.calibration), or "
-            "leave the judgement out: evaluate_policy: null",
+            next_step="predict recordings with known outcomes, or leave the judgement out: evaluate_policy: null",
         )
     return {"found": len(rows), "kept": kept, "left_out": left_out}
 
@@ -249,14 +209,14 @@ def _correctness(row: Mapping[str, Any]) -> Score:
 
 
 def summarise_decisions(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) -> dict[str, Any]:
-    """Accuracy of every method and group, and differences between methods; of unknown outcomes the predicted success.
+    """Accuracy of every method and group, and differences between methods.
 
     Args:
         rows: verdicts with method, episode_id, seed, split, task_family, outcome, predicted, answers, malformed_answers.
 
     Returns:
         {"trajectories", "methods": {method: {group: {"accuracy": interval, "seeds": {...}, "confusion": {...}}}},
-         "differences": [...]}, where outcomes are unknown with "predicted_success" (an interval) too; groups are "all", each split, each family, and split/family.
+         "differences": [...]}; groups are "all", each split, each family, and split/family.
     """
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
@@ -264,24 +224,19 @@ def summarise_decisions(rows: Sequence[Mapping[str, Any]], *, resamples: int, se
         for name in dict.fromkeys(names):
             groups[row["method"], name].append(row)
     methods: dict[str, dict[str, Any]] = defaultdict(dict)
-    for (method, group), judged in sorted(groups.items()):
-        members = [row for row in judged if row["outcome"] in _OUTCOMES]
-        found: dict[str, Any] = {}
-        if members:
-            confusion = {"true_success": 0, "false_success": 0, "true_failure": 0, "false_failure": 0}
-            for row in members:
-                right = "true" if row["predicted"] == row["outcome"] else "false"
-                confusion[f"{right}_{row['predicted']}"] += 1
-            accuracy = bootstrap_mean(list(_accuracy(members, "episode_id").values()), resamples=resamples, seed=seed)
-            seeds = {str(name): value for name, value in _accuracy(members, "seed").items()}
-            found = {"accuracy": asdict(accuracy), "seeds": seeds, "confusion": confusion}
-        if unknown := [{**row, "outcome": "success"} for row in judged if row["outcome"] not in _OUTCOMES]:
-            shares = list(_accuracy(unknown, "episode_id").values())
-            found["predicted_success"] = asdict(bootstrap_mean(shares, resamples=resamples, seed=seed))
-        found |= {name: sum(row[name] for row in judged) for name in ("malformed_answers", "answers")}
-        methods[method][group] = found
-    known = {method: [row for row in groups[method, _ALL] if row["outcome"] in _OUTCOMES] for method in methods}
-    by_method = {method: _accuracy(rows, "episode_id") for method, rows in known.items()}
+    for (method, group), members in sorted(groups.items()):
+        confusion = {"true_success": 0, "false_success": 0, "true_failure": 0, "false_failure": 0}
+        for row in members:
+            right = "true" if row["predicted"] == row["outcome"] else "false"
+            confusion[f"{right}_{row['predicted']}"] += 1
+        accuracy = bootstrap_mean(list(_accuracy(members, "episode_id").values()), resamples=resamples, seed=seed)
+        methods[method][group] = {
+            "accuracy": asdict(accuracy),
+            "seeds": {str(name): value for name, value in _accuracy(members, "seed").items()},
+            "confusion": confusion,
+            **{name: sum(row[name] for row in members) for name in ("malformed_answers", "answers")},
+        }
+    by_method = {method: _accuracy(groups[method, _ALL], "episode_id") for method in methods}
     return {
         "trajectories": len({row["episode_id"] for row in rows}),
         "methods": dict(methods),

@@ -380,15 +380,13 @@ def _robot_late(segmenter: Segmenter, head: np.ndarray, points: np.ndarray | Non
 class MeasuredEvidenceJudge:
     """Colour tracking in the head view, agreement of the wrist views, robot mask by a segmenter.
 
-    Args:
-        states_confidence: distance of the measurement from the thresholds, by its soft score.
+    The stated confidence is the distance of the measurement from the thresholds, by its soft score.
     """
 
     name = "measured"
 
-    def __init__(self, segmenter: Segmenter, *, states_confidence: bool = False) -> None:
+    def __init__(self, segmenter: Segmenter) -> None:
         self.segmenter = segmenter
-        self.states_confidence = states_confidence
 
     def extract(
         self, trajectory: Trajectory, family: EvidenceFamily, indices: tuple[int, ...], height_px: int
@@ -416,7 +414,7 @@ class MeasuredEvidenceJudge:
         points = None if trajectory.points is None else trajectory.points[chosen]
         measured = measure(self.segmenter, trajectory.instruction, family, frames, points)
         evidence = facts(measured, trajectory.instruction, family)
-        if not self.states_confidence or measured is None:
+        if measured is None:
             return evidence
         done = measured.score()
         return evidence.model_copy(update={"confidence": done if establishes_success(evidence) else 1.0 - done})

@@ -1,9 +1,9 @@
 """Trust in verdicts on predicted videos: how likely each one is right, and how new its recording is to the model.
 
-Signals of a verdict are the judge's doubt (averaged over the seeds of an episode), the disagreement of verdicts on another model's
-predictions, and the novelty of the controls and of the setup (body and head camera). A logistic model whose weights are never
-positive turns them into a probability. Starts are halved and each half is calibrated with the other one. ``trust.safetensors`` keeps
-the calibration for evaluations whose outcomes are unknown.
+`assess_trust` works on the tables of a finished evaluation. Signals of a verdict are the judge's doubt (averaged over the seeds of an
+episode), the disagreement of verdicts on another model's predictions, and the novelty of the controls and of the setup (body and head
+camera). A logistic model whose weights are never positive turns them into a probability. Starts are halved and each half is calibrated
+with the other one.
 
 Novelty is the distance to the nearest training recording, of the farthest window, in units of what a share ``1 - level`` of the
 training recordings stay within among themselves (conformal anomaly detection, Laxhammar and Falkman 2010).
@@ -13,7 +13,6 @@ Axis legend: n verdicts, s signals, r recordings, w windows, f features, a arms.
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,24 +22,20 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from pydantic import ConfigDict, Field, ValidationError
-from safetensors import SafetensorError, safe_open
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 from scipy.stats import rankdata
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import HEAD_VIEW, ActionTracks, EpisodeTracks
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import TRAINING_SPLITS
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import TrustConfig
-from worldline_core.rollout.rollout_set import RolloutSet
-from worldline_core.store.artifact_files import digest_folder, is_artifact, read_manifest
-from worldline_core.store.atomic import write_arrays_atomic
+from worldline_core.evaluation.scores import DECISIONS_FILE, SUMMARY_FILE, TRUE_METHOD, write_table
+from worldline_core.store.artifact_files import read_json, read_rows
+from worldline_core.store.atomic import write_json_atomic
 
-TRUST_FILE = "trust.safetensors"
 SIGNALS = ("doubt", "disagreement", "new_controls", "new_setup")
 TRUST_COLUMNS = (*SIGNALS, "trust", "do_not_trust")
 LEAST_OF_EACH = 5
@@ -112,19 +107,17 @@ def _nearest(rows: np.ndarray, known: np.ndarray, *, others: bool = False) -> np
     return apart.min(axis=1)
 
 
-def control_vectors(
-    T_base_tool: Float[np.ndarray, "n a 4 4"], gripper: Float[np.ndarray, "n a"]
-) -> tuple[str, Float[np.ndarray, "w f"]]:
-    """Number of arms, and vectors of the controls in windows of two latent frames: where the tools are from where they began, how
-    fast they move, and how far the grippers are open.
+def control_vectors(tracks: EpisodeTracks) -> tuple[str, Float[np.ndarray, "w f"]]:
+    """Number of arms, and vectors of the controls in windows of two latent frames: tool places relative to the first, tool speeds, and
+    gripper openings.
 
     Raises: DataError for fewer frames than a window has.
     """
-    place = np.asarray(T_base_tool, dtype=np.float64)[::TEMPORAL_FACTOR, :, :3, 3]
-    opening = np.asarray(gripper, dtype=np.float64)[::TEMPORAL_FACTOR] / OPENING
+    place = np.asarray(tracks.T_base_tool, dtype=np.float64)[::TEMPORAL_FACTOR, :, :3, 3]
+    opening = np.asarray(tracks.gripper[:, 0], dtype=np.float64)[::TEMPORAL_FACTOR] / OPENING
     if len(place) < 2:
         raise DataError(
-            "Too few frames to compare their controls", expected=f"more than {TEMPORAL_FACTOR}", got=len(T_base_tool)
+            "Too few frames to compare their controls", expected=f"more than {TEMPORAL_FACTOR}", got=tracks.num_frames
         )
     away, way = (place - place[:1]) / PLACE_M, np.diff(place, axis=0, prepend=place[:1]) / SPEED_M
     rows = np.concatenate([away.reshape(len(place), -1), opening, way.reshape(len(place), -1)], axis=1)
@@ -140,211 +133,54 @@ def setup_vectors(tracks: EpisodeTracks) -> tuple[str, Float[np.ndarray, "1 f"]]
     return tracks.embodiment, np.concatenate([pose[:3, 3] / PLACE_M, pose[:3, :3].ravel(), lens / PLACE_M])[None]
 
 
-class JudgedBy(StrictModel):
-    """A judge, and the views, the segmenter and the weights (a digest) that it sees by."""
+def assess_trust(
+    folder: Path, config: TrustConfig, episodes: EpisodeSet, tracks: ActionTracks, *, resamples: int, seed: int
+) -> None:
+    """Add TRUST_COLUMNS to the decisions of a finished evaluation (None on recorded videos), and ``trust`` to its summary.
 
-    judge: str
-    views: tuple[str, ...]
-    segmenter: str
-    segmenter_weights: str | None
-
-
-class PredictedBy(StrictModel):
-    """A checkpoint (its digest) and how it was sampled; ``steps`` None is the sampler's usual number."""
-
-    checkpoint: str | None
-    sampler: str
-    steps: int | None
-    shift: float = 1.0
-    actions: str = "true"
-    stride: int = 1
-
-
-class TrustCalibration(StrictModel):
-    """Logistic model of a right verdict on one model's videos: weights of the intercept and of each signal."""
-
-    predicted_by: PredictedBy
-    signals: tuple[str, ...]
-    weights: tuple[float, ...]
-
-    def trust(self, rows: Sequence[Mapping[str, Any]]) -> Float[np.ndarray, " n"] | str:
-        """The trust in each verdict, or the reason why there is none."""
-        values, known = _signals(rows)
-        if missing := [name for name in self.signals if name not in known]:
-            return f"the calibration reads {', '.join(missing)}, which not all of these verdicts have"
-        return probability(np.array(self.weights), values[:, [known.index(name) for name in self.signals]])
-
-
-class TrustModel(StrictModel):
-    """The training recordings that novelty is measured against, and calibrations by method where they were made before.
-
-    Calibrations hold for the judge, the embodiments and the models that they were made with.
+    Args:
+        episodes, tracks: of the judged recordings and of the training recordings that novelty is measured against.
     """
-
-    model_config = ConfigDict(arbitrary_types_allowed=True)
-
-    judged_by: JudgedBy
-    embodiments: tuple[str, ...] = ()
-    least_trust: float
-    novelty_level: float
-    training_recordings: int
-    methods: dict[str, TrustCalibration] = Field(default={})
-    controls: KnownRecordings = Field(exclude=True)
-    setups: KnownRecordings = Field(exclude=True)
-
-    @classmethod
-    def of_training(
-        cls, episodes: EpisodeSet, tracks: ActionTracks, judged_by: JudgedBy, config: TrustConfig
-    ) -> TrustModel:
-        """The recordings of the training splits that have action tracks, not yet calibrated.
-
-        Raises: DataError for too few.
-        """
-        rows = [row for row in episodes.rows if row.split in TRAINING_SPLITS and row.episode_id in tracks]
-        known = [tracks.tracks(row.episode_id) for row in rows]
-        controls = (control_vectors(t.T_base_tool, t.gripper[:, 0]) for t in known)
-        level = config.novelty_level
-        return cls(
-            judged_by=judged_by, least_trust=config.least_trust, novelty_level=level, training_recordings=len(known),
-            controls=KnownRecordings.of(controls, level),
-            setups=KnownRecordings.of(map(setup_vectors, filter(_has_head_camera, known)), level),
-        )  # fmt: skip
-
-    @classmethod
-    def read(cls, path: Path) -> TrustModel:
-        """Read ``trust.safetensors``, or that of an evaluate_policy artifact.
-
-        Raises: ArtifactError when it is missing or damaged.
-        """
-        file = path / TRUST_FILE if path.is_dir() else path
-        if not file.is_file():
-            raise ArtifactError(
-                "There is no saved calibration of trust", where=file,
-                next_step="run evaluate_policy with trust on recordings with known outcomes, and name its folder",
-            )  # fmt: skip
-        try:
-            with safe_open(file, framework="np") as opened:
-                header = json.loads((opened.metadata() or {})["trust"])
-                arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-            known: dict[str, Any] = {
-                part: KnownRecordings(
-                    {n.removeprefix(f"{part}/"): a for n, a in arrays.items() if n.startswith(f"{part}/")},
-                    header["novelty_level"],
-                )
-                for part in ("controls", "setups")
-            }
-            model = cls.model_validate({**header, **known})
-        except (SafetensorError, ValidationError, ValueError, KeyError, TypeError) as error:
-            raise ArtifactError("Not a saved calibration of trust", where=file, got=error) from error
-        sized = all(len(made.weights) == 1 + len(made.signals) for made in model.methods.values())
-        if not sized or any(
-            array.ndim != 3 or (np.isfinite(array).all(-1).sum(0) < LEAST_RECORDINGS).any() for array in arrays.values()
-        ):
-            raise ArtifactError("A saved calibration of trust is damaged", where=file)
-        return model
-
-    def write(self, folder: Path) -> None:
-        """Write ``trust.safetensors``."""
-        known = {"controls": self.controls, "setups": self.setups}
-        arrays = {f"{part}/{kind}": array for part, found in known.items() for kind, array in found.kinds.items()}
-        write_arrays_atomic(folder / TRUST_FILE, arrays, {"trust": self.model_dump_json()})
-
-    def require(self, judged_by: JudgedBy, embodiments: Iterable[str]) -> None:
-        """Raises: ConfigError when verdicts are of another judge, or on robots that the calibration was not made with."""
-        unknown = sorted(set(embodiments) - set(self.embodiments))
-        if judged_by != self.judged_by or unknown:
-            raise ConfigError(
-                "A saved calibration of trust is not of these verdicts", where="trust",
-                expected=f"{self.judged_by}; robots {', '.join(self.embodiments)}",
-                got=f"{judged_by}; " + (f"other robots: {', '.join(unknown)}" if unknown else "the same robots"),
-                next_step="calibrate with this judge where outcomes of these robots are known",
-            )  # fmt: skip
-
-    def calibration_of(self, predicted_by: PredictedBy | None) -> TrustCalibration | str:
-        """The calibration for such videos, or the reason why there is none."""
-        fitting = (made for made in self.methods.values() if predicted_by and made.predicted_by == predicted_by)
-        known = "; ".join(f"{name}: {made.predicted_by}" for name, made in self.methods.items()) or "none"
-        asked = predicted_by or "videos of an unknown model"
-        return next(fitting, f"the saved calibration is of other videos than these ({asked}); it has {known}")
-
-    def novelties(self, tracks: ActionTracks, episode_id: str) -> dict[str, float | None]:
-        """``new_controls`` and ``new_setup`` of an episode; None without its tracks, or without its head camera."""
-        if episode_id not in tracks:
-            return {"new_controls": None, "new_setup": None}
-        found = tracks.tracks(episode_id)
-        setup = self.setups.novelty(*setup_vectors(found)) if _has_head_camera(found) else None
-        controls = self.controls.novelty(*control_vectors(found.T_base_tool, found.gripper[:, 0]))
-        return {"new_controls": controls, "new_setup": setup}
+    training = [
+        tracks.tracks(row.episode_id)
+        for row in episodes.rows
+        if row.split in TRAINING_SPLITS and row.episode_id in tracks
+    ]
+    controls = KnownRecordings.of(map(control_vectors, training), config.novelty_level)
+    setups = KnownRecordings.of(map(setup_vectors, filter(_has_head_camera, training)), config.novelty_level)
+    rows = read_rows(folder / DECISIONS_FILE)
+    predicted = [row for row in rows if row["method"] != TRUE_METHOD]
+    news: dict[str, dict[str, float | None]] = {}
+    for name in {row["episode_id"] for row in predicted}:
+        found = tracks.tracks(name) if name in tracks else None
+        news[name] = {
+            "new_controls": None if found is None else controls.novelty(*control_vectors(found)),
+            "new_setup": None
+            if found is None or not _has_head_camera(found)
+            else setups.novelty(*setup_vectors(found)),
+        }
+    trusted, methods = trust_verdicts(
+        [{**row, **news[row["episode_id"]]} for row in predicted], config, resamples=resamples, seed=seed
+    )
+    trusted += [{**dict.fromkeys(TRUST_COLUMNS), **row} for row in rows if row["method"] == TRUE_METHOD]
+    trusted.sort(key=lambda row: (row["method"], row["episode_id"], row["seed"]))
+    write_table(folder / DECISIONS_FILE, trusted, tuple(trusted[0]))
+    facts = {"settings": config.model_dump(mode="json"), "training_recordings": len(training), "methods": methods}
+    write_json_atomic(folder / SUMMARY_FILE, read_json(folder / SUMMARY_FILE) | {"trust": facts})
 
 
 def _has_head_camera(tracks: EpisodeTracks) -> bool:
     return tracks.camera_motion[tracks.views.index(HEAD_VIEW)] != "absent"
 
 
-def content_digest(folder: Path) -> str:
-    """Digest of a folder of weights, as in manifests of what was made with it."""
-    return str(read_manifest(folder)["digest"]) if is_artifact(folder) else digest_folder(folder, everything=True)
-
-
-def predicted_by(rollouts: Path) -> PredictedBy | None:
-    """The model and sampler of a finished RolloutSet; None for imported videos."""
-    manifest: dict[str, Any] = read_manifest(rollouts)
-    config = manifest.get("config", {})
-    if "sampler" not in config:
-        return None
-    found = {**config, **config["sampler"], "sampler": config["sampler"]["kind"]}
-    used = {name: found[name] for name in PredictedBy.model_fields if name in found}
-    return PredictedBy(checkpoint=manifest.get("inputs", {}).get("checkpoint", {}).get("digest"), **used)
-
-
-def assess_trust(
-    verdicts: Sequence[Mapping[str, Any]],
-    config: TrustConfig,
-    model: TrustModel,
-    tracks: ActionTracks,
-    rollouts: Mapping[str, RolloutSet],
-    output: Path,
-    *,
-    resamples: int,
-    seed: int,
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The verdicts of a finished evaluation with :data:`TRUST_COLUMNS` (None on recorded videos), and how reliable trust is.
-
-    Calibrates and writes ``trust.safetensors``, unless ``config.calibration`` names an earlier one.
-    """
-    predicted = [row for row in verdicts if row["method"] in rollouts]
-    news = {name: model.novelties(tracks, name) for name in {row["episode_id"] for row in predicted}}
-    made_by = {method: predicted_by(rollout.root) for method, rollout in rollouts.items()}
-    saved = None if config.calibration is None else {name: model.calibration_of(by) for name, by in made_by.items()}
-    rows = [{**row, **news[row["episode_id"]]} for row in predicted]
-    rows, methods = trust_verdicts(rows, config, saved=saved, resamples=resamples, seed=seed)
-    if saved is None:
-        calibrations = {
-            name: calibrated([row for row in rows if row["method"] == name], by)
-            for name, by in made_by.items()
-            if by is not None and methods.get(name, {}).get("available")
-        }
-        robots = tuple(sorted({row["embodiment"] for row in predicted}))
-        model.model_copy(update={"methods": calibrations, "embodiments": robots}).write(output)
-    rows += [{**dict.fromkeys(TRUST_COLUMNS), **row} for row in verdicts if row["method"] not in rollouts]
-    facts = {"settings": config.model_dump(mode="json"), "training_recordings": model.training_recordings}
-    return rows, {**facts, "methods": methods}
-
-
 def trust_verdicts(
-    rows: Sequence[Mapping[str, Any]],
-    config: TrustConfig,
-    *,
-    saved: Mapping[str, TrustCalibration | str] | None = None,
-    resamples: int,
-    seed: int,
+    rows: Sequence[Mapping[str, Any]], config: TrustConfig, *, resamples: int, seed: int
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Verdicts with their signals, trust and marks, and by method how reliable trust is, or the ``reason`` why there is none.
 
     Args:
         rows: verdicts on predicted videos with method, episode_id, start, outcome, predicted, confidence (None where the judge stated
             none) and novelties.
-        saved: calibration of each method, or the reason why there is none (outcomes may be ``unknown``); None calibrates here.
 
     Raises:
         ConfigError: ``compare_with`` names a method without verdicts.
@@ -362,31 +198,16 @@ def trust_verdicts(
     for method, own in by_method.items():
         _add_doubt("doubt", own, own)
         _add_doubt("disagreement", own, by_method.get(config.compare_with.get(method, ""), ()))
-        made = None if saved is None else saved[method]
-        trust = _cross_calibrated(own, seed) if made is None else made if isinstance(made, str) else made.trust(own)
+        trust = _cross_calibrated(own, seed)
         for row, value in zip(own, [None] * len(own) if isinstance(trust, str) else trust.tolist(), strict=True):
             row["trust"] = value
-            row["do_not_trust"] = ", ".join(reasons(row, config.least_trust))
-        known = [row for row in own if row["outcome"] in ("success", "failure")]
-        if not isinstance(trust, str) and not known:
-            trust = "no outcome is recorded, so the reliability of the saved calibration is unknown here"
-        found = {"reason": trust} if isinstance(trust, str) else _reliability(known, resamples, seed)
+            marks = [name.replace("_", " ") for name in ("new_controls", "new_setup") if (row[name] or 0.0) > 1.0]
+            marks += ["doubtful verdict"] if value is not None and value < config.least_trust else []
+            row["do_not_trust"] = ", ".join(marks)
+        found = {"reason": trust} if isinstance(trust, str) else _reliability(own, resamples, seed)
         marked = sum(bool(row["do_not_trust"]) for row in own)
         methods[method] = {"available": "reason" not in found, "marked": marked, **found}
     return [row for own in by_method.values() for row in own], methods
-
-
-def calibrated(rows: Sequence[Mapping[str, Any]], predicted_by: PredictedBy) -> TrustCalibration:
-    """The calibration by all verdicts of a method with known outcomes."""
-    signals, known = _signals(rows)
-    weights = fit_right(signals, _right(rows))
-    return TrustCalibration(predicted_by=predicted_by, signals=tuple(known), weights=tuple(weights))
-
-
-def reasons(row: Mapping[str, Any], least_trust: float) -> list[str]:
-    """The reasons not to rely on a verdict; empty for one that may be trusted."""
-    new = [name.replace("_", " ") for name in ("new_controls", "new_setup") if (row[name] or 0.0) > 1.0]
-    return new + (["doubtful verdict"] if row["trust"] is not None and row["trust"] < least_trust else [])
 
 
 def _add_doubt(name: str, rows: Sequence[dict[str, Any]], others: Sequence[Mapping[str, Any]]) -> None:

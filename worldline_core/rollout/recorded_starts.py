@@ -1,4 +1,4 @@
-"""Starts of simulated episodes: first observations of recordings, or one given as files."""
+"""First frames to start a simulation from: of recordings, or one given as files."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from worldline_core.rollout.observation import Camera
 
 
 @dataclass(frozen=True)
-class Start:
-    """The first frame of a recording, with its instruction.
+class RecordedStart:
+    """The first frame of a recording.
 
     Attributes:
         images: ``uint8 (H, W, 3)`` by view, with a camera each.
@@ -37,83 +37,101 @@ class Start:
     state: np.ndarray
 
 
-class EpisodeStarts:
-    """Starts of the recordings of one robot that a model can go on from, in the order of the set; each bank (attempts from
-    one initial state) is one start, that of its first recording.
+class RecordedStarts:
+    """Starts of the recordings that a model can go on from, in the order of the set; each bank (attempts from one initial
+    state) is one start, that of its first recording.
 
     Args:
-        embodiment: of the recordings; None where all that fit have one.
-        splits: of the recordings.
-        views: of the model; each must be recorded and calibrated.
+        views: of the model; each must be recorded and calibrated, or the first one where ``partial``.
         fps: of the model's controls.
-
-    Raises:
-        DataError: no recording fits, or those that do are of several robots.
+        embodiment, splits: of the recordings; None: all.
     """
 
     def __init__(
-        self, recordings: Path, *, embodiment: str | None, splits: Sequence[str], views: Sequence[str], fps: float
+        self,
+        recordings: Path,
+        *,
+        views: Sequence[str],
+        fps: float,
+        embodiment: str | None = None,
+        splits: Sequence[str] | None = None,
+        partial: bool = False,
     ) -> None:
-        self._episodes = EpisodeSet.open(recordings)
-        self._views = tuple(views)
-        self._positions: list[int] = []
-        left_out: Counter[str] = Counter()
-        robots: set[str] = set()
+        self._episodes, self._views = EpisodeSet.open(recordings), tuple(views)
+        required = set(views[:1] if partial else views)
+        positions: list[int] = []
+        self._left_out: Counter[str] = Counter()
         banks: set[str] = set()
         for position, row in enumerate(self._episodes.rows):
             reasons = {
                 "of another robot": embodiment is not None and row.embodiment != embodiment,
-                "of another split": row.split not in splits,
-                "without all views": not set(views) <= set(row.views),
+                "of another split": splits is not None and row.split not in splits,
+                "without all views": not required <= set(row.views),
                 "of another rate": row.fps != fps,
-                "without calibration or commands": not row.stage2_ok,
+                "without calibration or commands": row.stage2_reason not in (None, "missing_view"),
                 "from the same start as another": row.bank in banks,
             }
             reason = next((reason for reason, holds in reasons.items() if holds), None)
             if reason is None:
-                self._positions.append(position)
-                robots.add(row.embodiment)
+                positions.append(position)
                 banks |= {row.bank} if row.bank else set()
             else:
-                left_out[reason] += 1
+                self._left_out[reason] += 1
+        self.rows = [self._episodes.rows[position] for position in positions]
+        self._positions = positions
+        self._start = lru_cache(maxsize=64)(self._read)
+
+    @property
+    def embodiment(self) -> str:
+        """The one robot of the recordings.
+
+        Raises: DataError when no recording fits, or those that do are of several robots.
+        """
+        robots = {row.embodiment for row in self.rows}
         if len(robots) != 1:
             recorded = ", ".join(sorted({row.embodiment for row in self._episodes.rows}))
             raise DataError(
-                "An environment is of one robot",
-                where=recordings,
-                expected=f"recordings of {embodiment or 'one embodiment'} in {', '.join(splits)} with {', '.join(views)}",
-                got=f"{', '.join(sorted(robots)) or 'none'}; left out: {dict(left_out)}",
+                "Starts are needed of one robot", where=self._episodes.root,
+                got=f"{', '.join(sorted(robots)) or 'none'}; left out: {dict(self._left_out)}",
                 next_step=f"name an embodiment of the recordings ({recorded}), or give others",
-            )
-        self.embodiment = robots.pop()
-        self._read = lru_cache(maxsize=64)(self._start)
+            )  # fmt: skip
+        return robots.pop()
 
     def __len__(self) -> int:
-        return len(self._positions)
+        return len(self.rows)
 
-    def __getitem__(self, number: int) -> Start:
-        return self._read(self._positions[number])
+    def __getitem__(self, number: int) -> RecordedStart:
+        return self._start(number)
 
-    def row(self, number: int) -> EpisodeRow:
-        """The recording of a start, as the set lists it."""
-        return self._episodes.rows[self._positions[number]]
+    def named(self, episode_id: str) -> tuple[EpisodeRow, RecordedStart]:
+        """The recording of this name and its start.
+
+        Raises: DataError when there is none.
+        """
+        for number, row in enumerate(self.rows):
+            if row.episode_id == episode_id:
+                return row, self[number]
+        raise DataError(
+            "No recording of this name to start from", where=self._episodes.root, got=episode_id,
+            expected=f"one of {', '.join(row.episode_id for row in self.rows[:8])} ...",
+        )  # fmt: skip
 
     def commands(self, number: int) -> np.ndarray:
         """``(n, state size)``: what was commanded after the first frame of the recording of a start."""
         return np.asarray(self._episodes.episode(self._positions[number]).action[1:], np.float64)
 
-    def _start(self, position: int) -> Start:
+    def _read(self, number: int) -> RecordedStart:
+        position = self._positions[number]
         episode = self._episodes.episode(position)
-        cameras = {
-            view: Camera(episode.cameras[view].K, episode.cameras[view].T_base_camera[0]) for view in self._views
-        }
-        images = {view: self._episodes.frames(position, view, [0])[0] for view in self._views}
-        return Start(
+        views = [view for view in self._views if view in episode.cameras]
+        cameras = {view: Camera(episode.cameras[view].K, episode.cameras[view].T_base_camera[0]) for view in views}
+        images = {view: self._episodes.frames(position, view, [0])[0] for view in views}
+        return RecordedStart(
             episode.episode_id, episode.instruction, images, cameras, np.asarray(episode.action[0], np.float64)
         )
 
 
-def read_start(folder: Path, embodiment: Embodiment, views: Sequence[str]) -> Start:
+def read_start(folder: Path, embodiment: Embodiment, views: Sequence[str]) -> RecordedStart:
     """An observation as files: ``<view>.png`` of each view, ``calibration.yaml`` (docs/sources.md), and ``state.yaml``, the
     command that belongs to the pictures: a number for each name of the embodiment's state, in its units.
 
@@ -148,7 +166,7 @@ def read_start(folder: Path, embodiment: Embodiment, views: Sequence[str]) -> St
             expected=f"a number each: {', '.join(names)}",
             got=state,
         )
-    return Start(
+    return RecordedStart(
         folder.name, "", images, {view: Camera(track.K, track.T_base_camera[0]) for view, track in cameras.tracks.items()},
         np.array([state[name] for name in names], np.float64),
     )  # fmt: skip
