@@ -12,8 +12,8 @@ from flows.serve_commands import serve_command
 from worldline_core import WorldLine
 from worldline_core.errors import UnavailableError
 from worldline_core.serving.app import listening_socket
-from worldline_core.serving.recorded_starts import RecordedStarts
 from worldline_core.serving.serve_config import ServeConfig
+from worldline_core.serving.session_host import SessionHost
 
 
 def test_a_port_that_is_taken_is_told_before_the_model_is_loaded() -> None:
@@ -33,7 +33,8 @@ def test_a_free_port_is_known_before_the_server_runs() -> None:
 
 
 def test_what_no_model_has_seen_is_listed_last(shipped: Path, small_world: WorldLine) -> None:
-    names = [row["id"] for row in RecordedStarts(shipped / "recordings", small_world).listed()]
+    host = SessionHost(small_world, ServeConfig.model_validate({"episodes": shipped / "recordings"}))
+    names = [row["id"] for row in host.metadata()["episodes"]]
     unseen = ["ood_test" in name for name in names]
     assert 0 < sum(unseen) < len(unseen)
     assert unseen == sorted(unseen)

@@ -21,11 +21,11 @@ from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import unpack
 from worldline_core.policies.openpi import is_healthy
 from worldline_core.rollout.observation import Camera
-from worldline_core.serving import app
+from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.serving.app import server_token
 from worldline_core.serving.client import RemoteSimulation, SimulatorClient
-from worldline_core.serving.recorded_starts import RecordedStarts
 from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig
+from worldline_core.serving.session_host import SessionHost
 
 TOKEN, EPISODE = "correct horse", "ur5e_silver-test-s1-00000"
 
@@ -50,8 +50,7 @@ def drive(simulation: RemoteSimulation, steps: int, seed: int) -> str:
 
 
 def test_a_session_is_the_simulation_of_one_process(url: str, small_world: WorldLine, shipped) -> None:
-    starts = RecordedStarts(shipped / "recordings", small_world)
-    here = starts.simulate(starts.read(EPISODE), [3])
+    here = SessionHost(small_world, ServeConfig(episodes=shipped / "recordings")).simulate(EPISODE, [3])  # pyright: ignore[reportCallIssue]
     with SimulatorClient(url) as client:
         assert is_healthy(url)
         assert client.metadata["views"] == list(small_world.views)
@@ -86,12 +85,12 @@ def test_a_session_is_the_simulation_of_one_process(url: str, small_world: World
 
 
 def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world: WorldLine, shipped) -> None:
-    start = RecordedStarts(shipped / "recordings", small_world).read(EPISODE)
+    start = RecordedStarts(shipped / "recordings", views=small_world.views, fps=8).named(EPISODE)[1]
     given = {
         "images": start.images,
         "cameras": start.cameras,
         "embodiment": "ur5e_silver",
-        "state": start.episode.action[0],
+        "state": start.state,
     }
 
     def posed(**values: np.ndarray) -> dict[str, Camera]:
@@ -252,27 +251,6 @@ def test_who_may_connect(serving: Callable, monkeypatch: pytest.MonkeyPatch) -> 
         server_token(ServeConfig(host="0.0.0.0"))  # noqa: S104  # pyright: ignore[reportCallIssue]
     monkeypatch.setenv(TOKEN_VARIABLE, "abc\r\n")  # no header can carry the end of a line
     assert server_token(ServeConfig(host="0.0.0.0")) == "abc"  # noqa: S104  # pyright: ignore[reportCallIssue]
-
-
-def test_connections_that_say_nothing_are_closed_and_bounded(
-    serving: Callable, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(app, "TAKE_S", 0.3)
-    with serving(max_connections=4) as url:
-        host, _, port = url.removeprefix("ws://").partition(":")
-        slow = [socket.create_connection((host, int(port))) for _ in range(7)]
-        for connection in slow:
-            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX: ")
-        with SimulatorClient(url) as client:  # the eighth
-            with pytest.raises(httpx.TransportError):  # as many as there may be
-                httpx.get(url.replace("ws", "http") + "/healthz")
-            begin = time.monotonic()
-            for connection in slow:
-                connection.settimeout(5)
-                assert connection.recv(100) == b""
-            assert time.monotonic() - begin < 2
-            assert is_healthy(url)
-            client.start(EPISODE)  # a websocket stays
 
 
 def test_another_server_is_no_simulator() -> None:

@@ -189,7 +189,7 @@ socket.addEventListener("message", ({ data }) => {
     say("The simulator is behind: commands wait until its pictures have caught up.");
   } else if (message.type === "saved") {
     play.saved = message;
-    say(`Saved ${message.frames} frames: ${message.paths.join(", ")}`);
+    say(`Saved ${message.frames} frames: ${message.path}`);
   } else if (message.type === "error") {
     play.error = message; asked = false; behind = false; due = [];
     run(false);
@@ -242,6 +242,4 @@ $("run").addEventListener("click", () => { run(!running); $("run").blur(); });
 $("back").addEventListener("click", back);
 $("driver").addEventListener("change", () => { go(play.node); $("driver").blur(); });
 $("arm").addEventListener("change", () => { arm = Number($("arm").value); $("arm").blur(); });
-for (const button of document.querySelectorAll("[data-save]")) {
-  button.addEventListener("click", () => { run(false); say("Saving …"); tell({ type: "save", formats: [button.dataset.save] }); button.blur(); });
-}
+$("save").addEventListener("click", () => { run(false); say("Saving …"); tell({ type: "save" }); $("save").blur(); });

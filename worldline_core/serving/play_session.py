@@ -11,23 +11,32 @@ import asyncio
 import json
 import os
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
-from worldline_core.data.video.frames import MadeFrames
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.errors import DataError, WorldLineError
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.transforms import nearest_rotation
 from worldline_core.pictures import jpeg_bytes
 from worldline_core.policies.openpi import OpenpiPolicy
+from worldline_core.rollout.observation import image_size, project_controls
+from worldline_core.rollout.recorded_starts import RecordedStart
 from worldline_core.rollout.simulation import Simulation
-from worldline_core.serving.recorded_starts import RecordedStart, save_played
 from worldline_core.serving.session_host import Seed, SessionHost, error_message
 from worldline_core.serving.teleoperation import ArmInput, Teleoperation, frame_marks
 
@@ -69,10 +78,9 @@ class Advance(_Message):
 
 
 class Save(_Message):
-    """Save the way from the start to the current node."""
+    """Save the way from the start to the current node as an EpisodeSet."""
 
     type: Literal["save"]
-    formats: tuple[Literal["episodes", "mcap", "rrd"], ...] = Field(max_length=3)
 
 
 Message = StartMessage | Tick | Go | Advance | Save
@@ -107,6 +115,7 @@ class PlaySession:
 
     def __init__(self, host: SessionHost, send: Callable[[str | bytes], Awaitable[None]]) -> None:
         self._host, self._send = host, send
+        self._row: EpisodeRow
         self._start: RecordedStart
         self._hand: Teleoperation | None = None
         self._nodes: list[Node] = []
@@ -152,25 +161,26 @@ class PlaySession:
             await self._send_marks(self._hand)
         else:
             await self._settled()
-            await self._save(message)
+            await self._save()
 
     async def _begin(self, message: StartMessage) -> None:
         begin = time.monotonic()
         self._host.admit(self)
         await self._settled()
         self._hand = None
-        self._start = await self._host.compute(lambda: self._host.starts.read(message.episode))
-        start, seed = self._start, message.seed
-        simulation = await self._host.compute(lambda: self._host.starts.simulate(start, [seed]))
-        hand = await asyncio.to_thread(Teleoperation, start, simulation.fps)
+        seed = message.seed
+        self._row, self._start = row, start = await self._host.compute(lambda: self._host.starts.named(message.episode))
+        simulation = await self._host.compute(lambda: self._host.simulate(message.episode, [seed]))
+        kinematics = self._host.kinematics.get(row.embodiment)
+        hand = await asyncio.to_thread(Teleoperation, start, kinematics, simulation.fps)
         first = {view: picture[None] for view, picture in simulation.pictures[0].items()}
         self._nodes = [Node(None, simulation, first, simulation.states[0], simulation.commands[0], "recording")]
         self._current, self._seed, self._hand = 0, seed, hand
         self._pending.clear()
-        arms = [arm.name for arm in start.kinematics.embodiment.arms]
+        arms = [arm.name for arm in kinematics.embodiment.arms]
         await self._send(json.dumps({
-            "type": "started", "episode": message.episode, "embodiment": start.episode.embodiment, "arms": arms,
-            "instruction": start.episode.instruction, "frames_per_step": simulation.frames_per_step,
+            "type": "started", "episode": message.episode, "embodiment": row.embodiment, "arms": arms,
+            "instruction": row.instruction, "frames_per_step": simulation.frames_per_step,
             "views": list(first), "seconds": time.monotonic() - begin,
         }))  # fmt: skip
         await self._send_block(0, time.monotonic() - begin, [hand.marks()["views"]])
@@ -262,7 +272,7 @@ class PlaySession:
             if view in policy.image_keys
         }
         observation[policy.state_key] = simulation.state[0].astype(np.float32)
-        observation[policy.prompt_key] = self._start.episode.instruction
+        observation[policy.prompt_key] = self._row.instruction
 
         def ask() -> np.ndarray:
             if name not in self._policies:
@@ -286,7 +296,7 @@ class PlaySession:
         hand.take_over(self._nodes[self._current].commands[-1])
         await self._send_marks(hand)
 
-    async def _save(self, message: Save) -> None:
+    async def _save(self) -> None:
         way: list[Node] = []
         number: int | None = self._current
         while number is not None:
@@ -294,9 +304,7 @@ class PlaySession:
             number = way[0].parent
         if len(way) < 2:
             raise DataError("There is nothing to save yet", expected="a predicted block", got="the start")
-        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")[:-3]
-        start, config = self._start, self._host.config
-        drivers = ", ".join(dict.fromkeys(node.driver for node in way[1:]))
+        config = self._host.config
         blocks = {view: [node.frames[view] for node in way] for view in way[0].frames}
         frames = {
             view: MadeFrames(
@@ -305,12 +313,15 @@ class PlaySession:
             for view, videos in blocks.items()
         }
         states, commands = (np.concatenate([getattr(node, name) for node in way]) for name in ("states", "commands"))
-        paths = await asyncio.to_thread(
-            save_played, config.output, f"{start.episode.episode_id}-played-{stamp}", start, frames, states, commands,
-            fps=way[0].simulation.fps, formats=message.formats,
-            notes={"driven_by": drivers, "model": config.model.name, "seed": self._seed},
+        notes = {
+            "driven_by": ", ".join(dict.fromkeys(node.driver for node in way[1:])), "model": config.model.name,
+            "seed": self._seed,
+        }  # fmt: skip
+        path = await asyncio.to_thread(
+            save_played, config.output, self._row, self._start, self._host.kinematics.get(self._row.embodiment), frames,
+            states, commands, fps=way[0].simulation.fps, notes=notes,
         )  # fmt: skip
-        await self._send(json.dumps({"type": "saved", "paths": [str(path) for path in paths], "frames": len(states)}))
+        await self._send(json.dumps({"type": "saved", "path": str(path), "frames": len(states)}))
 
     async def close(self) -> None:
         """Cancel the running block; free the session's room and the policies."""
@@ -319,3 +330,49 @@ class PlaySession:
             self._working.cancel()
         for policy in self._policies.values():
             await asyncio.to_thread(policy.close)
+
+
+def save_played(
+    folder: Path,
+    recorded: EpisodeRow,
+    start: RecordedStart,
+    kinematics: ArmKinematics,
+    frames: Mapping[str, Frames],
+    states: np.ndarray,
+    commands: np.ndarray,
+    *,
+    fps: float,
+    notes: Mapping[str, str | int],
+) -> Path:
+    """Write one played episode as an EpisodeSet below ``folder``, and return where.
+
+    Args:
+        frames: by view ``uint8 (n, H, W, 3)``, the observed frame first.
+        states, commands: ``(n, j)``.
+        notes: conventions of the episode: who drove, the model, the seed.
+    """
+    embodiment = kinematics.embodiment
+    given = image_size(start.images, start.cameras)
+    tracks = project_controls(start.cameras, given, kinematics, controls=commands, fps=fps)
+    height, width = next(iter(frames.values())).shape[1:3]
+    cameras = {}
+    for view in frames:
+        v = tracks.views.index(view)
+        poses = tracks.T_base_camera[:, v].astype(np.float64)
+        poses[:, :3, :3] = nearest_rotation(poses[:, :3, :3])
+        poses = poses[:1] if tracks.camera_motion[v] == "static" else poses
+        track = CameraTrack(view, tracks.K[v].astype(np.float64), poses, given[1], given[0])
+        cameras[view] = track.resized(width, height)
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")[:-3]
+    name = safe_stem(f"{recorded.episode_id}-played-{stamp}")
+    episode = Episode(
+        episode_id=name, source="worldline_play", embodiment=embodiment.name, scene=recorded.scene,
+        task_family=recorded.task_family, instruction=recorded.instruction, outcome="unknown", split="test", fps=fps,
+        state=states.astype(np.float32), action=commands.astype(np.float32), timestamps=np.arange(len(states)) / fps,
+        cameras=cameras, state_names=embodiment.state_names, primary_view=next(iter(frames)),
+        conventions={"pictures": "predicted", "started_at": recorded.episode_id, **notes},
+    )  # fmt: skip
+    with EpisodeSetWriter(folder / name, pixel_format="yuv444p", video_preset="veryfast") as writer:
+        views = {view: RecordedView(pictures.__iter__, len(pictures)) for view, pictures in frames.items()}
+        writer.add(episode, views)
+    return folder / name

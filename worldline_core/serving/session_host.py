@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -19,10 +19,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 
 from worldline_core.errors import DataError, UnavailableError, WorldLineError
 from worldline_core.geometry.embodiment import check_embodiment_name
+from worldline_core.geometry.kinematics import KinematicsByName
 from worldline_core.rollout.observation import Camera
+from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.rollout.simulation import Simulation
 from worldline_core.rollout.worldline import WorldLine
-from worldline_core.serving.recorded_starts import RecordedStarts
 from worldline_core.serving.serve_config import PROTOCOL, ServeConfig
 from worldline_core.untrusted_text import shown
 
@@ -113,26 +114,47 @@ class SessionHost:
     def __init__(self, world: WorldLine, config: ServeConfig) -> None:
         self.world = world
         self.config = config
-        self.starts = RecordedStarts(config.episodes, world)
+        self.starts = RecordedStarts(config.episodes, views=world.views, fps=world.contract.fps, partial=True)
+        self.kinematics = KinematicsByName({})
         self._running: dict[str, _Running] = {}
         self._players: set[object] = set()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="simulator")
 
     def warm_up(self) -> None:
         """Begin one simulation, so that the first client does not wait for what is imported and built once."""
-        for row in self.starts.listed()[:1]:
-            self.starts.simulate(self.starts.read(row["id"]), [0])
+        for row in self.starts.rows[:1]:
+            self.simulate(row.episode_id, [0])
+
+    def simulate(self, episode_id: str, seeds: Sequence[int]) -> Simulation:
+        """Clips that begin at a recording, one for each seed.
+
+        Raises: DataError when there is no such recording.
+        """
+        row, start = self.starts.named(episode_id)
+        count = len(seeds)
+        return self.world.start(
+            [start.images] * count, [start.cameras] * count, embodiment=self.kinematics.get(row.embodiment),
+            state=np.repeat(start.state[None], count, axis=0), seed=list(seeds),
+        )  # fmt: skip
 
     def metadata(self) -> dict[str, Any]:
-        """Facts that a client needs: views, rate, size of pictures, recordings, policies."""
-        world = self.world
+        """Facts that a client needs: views, rate, size of pictures, recordings (unseen bodies and cameras last), policies."""
+        world, rows = self.world, sorted(self.starts.rows, key=lambda row: row.split == "ood_test")
         return {
             "protocol": PROTOCOL,
             "views": list(world.views),
             "fps": world.contract.fps,
             "frames_per_step": world.frames_per_unit if world.causal is not None else None,
             "image_size": list(world.image_size),
-            "episodes": self.starts.listed(),
+            "episodes": [
+                {
+                    "id": row.episode_id,
+                    "embodiment": row.embodiment,
+                    "task": row.task_family,
+                    "instruction": row.instruction,
+                }
+                for row in rows
+            ],
             "policies": list(self.config.policies),
         }
 
@@ -186,14 +208,14 @@ class SessionHost:
                 got=", ".join([*present, *(["episode"] if request.episode is not None else [])]) or "neither",
             )  # fmt: skip
         if request.episode is not None:
-            return self.starts.simulate(self.starts.read(request.episode), request.seeds)
+            return self.simulate(request.episode, request.seeds)
         images, cameras, name = request.images or {}, request.cameras or {}, request.embodiment or ""
         check_embodiment_name(name)  # a path would name a file of this machine
         posed = {view: Camera(camera.K, camera.T_base_camera) for view, camera in cameras.items()}
         rows = np.asarray(request.state, np.float64)
         rows = np.repeat(rows[None], len(request.seeds), axis=0) if rows.ndim == 1 else rows
         return self.world.start(
-            [images] * len(request.seeds), [posed] * len(request.seeds), embodiment=self.starts.kinematics.get(name),
+            [images] * len(request.seeds), [posed] * len(request.seeds), embodiment=self.kinematics.get(name),
             state=rows, seed=request.seeds,
         )  # fmt: skip
 

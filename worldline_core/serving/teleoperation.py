@@ -17,8 +17,9 @@ from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.overlays import axis_tips
 from worldline_core.errors import DataError
 from worldline_core.geometry.inverse_kinematics import InverseKinematics
-from worldline_core.rollout.observation import project_controls
-from worldline_core.serving.recorded_starts import RecordedStart
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.rollout.observation import image_size, project_controls
+from worldline_core.rollout.recorded_starts import RecordedStart
 
 SPEED_M_S, TURN_RAD_S, GRIPPER_S = 0.2, 1.0, 2.0
 """At a full wish; a gripper's whole way takes half a second."""
@@ -58,17 +59,17 @@ class Teleoperation:
         command: (j) of the last frame.
     """
 
-    def __init__(self, start: RecordedStart, fps: float) -> None:
-        self._start, self._fps = start, fps
-        self._solver = InverseKinematics(start.kinematics)
-        self._first = np.asarray(start.episode.action[0], np.float64)
+    def __init__(self, start: RecordedStart, kinematics: ArmKinematics, fps: float) -> None:
+        self._start, self._kinematics, self._fps = start, kinematics, fps
+        self._solver = InverseKinematics(kinematics)
         self._axes = self._level_axes()
-        self.take_over(self._first)
+        self.take_over(start.state)
 
     def _level_axes(self) -> np.ndarray:
         """(3, 3) columns: right, away and up of the first camera in the base frame."""
         view = next(iter(self._start.cameras))
-        pose = self._tracks(self._first[None]).T_base_camera[0, self._tracks(self._first[None]).views.index(view)]
+        tracks = self._tracks(self._start.state[None])
+        pose = tracks.T_base_camera[0, tracks.views.index(view)]
         away = pose[:3, 2] + 1e-3 * -pose[:3, 1]  # of a camera that looks straight down: where its picture's top is
         away = np.array([away[0], away[1], 0.0]) / max(float(np.hypot(away[0], away[1])), 1e-9)
         up = np.array([0.0, 0.0, 1.0])
@@ -77,8 +78,8 @@ class Teleoperation:
     def _tracks(self, rows: np.ndarray) -> EpisodeTracks:
         """Tracks of these commands, which follow the start."""
         tracks = project_controls(
-            self._start.cameras, self._start.image_size, self._start.kinematics,
-            controls=np.concatenate((self._first[None], rows)), fps=self._fps,
+            self._start.cameras, image_size(self._start.images, self._start.cameras), self._kinematics,
+            controls=np.concatenate((self._start.state[None], rows)), fps=self._fps,
         )  # fmt: skip
         return tracks.clip(range(1, tracks.num_frames), start=0)
 
@@ -89,14 +90,14 @@ class Teleoperation:
         self._seen = self._tracks(self.command[None])
 
     def _poses(self) -> np.ndarray:
-        return self._solver.kinematics.tool_poses(self.command[None])[0].numpy()
+        return self._kinematics.tool_poses(self.command[None])[0].numpy()
 
     def tick(self, arms: Sequence[ArmInput]) -> np.ndarray:
         """The command (j) of the next frame.
 
         Raises: DataError: the wishes are not of this robot's arms, or a goal is in a view that is not there.
         """
-        described = self._start.kinematics.embodiment.arms
+        described = self._kinematics.embodiment.arms
         if len(arms) != len(described):
             raise DataError("Wishes are given for each arm", expected=[arm.name for arm in described], got=len(arms))
         wanted = self._wanted.copy()
@@ -110,7 +111,7 @@ class Teleoperation:
         found = self._solver.solve(self.command, wanted, iterations=ITERATIONS)
         self.command = found.state
         for arm, wish in zip(described, arms, strict=True):
-            column, gripper = self._solver.kinematics.embodiment.gripper_column(arm), arm.gripper
+            column, gripper = self._kinematics.embodiment.gripper_column(arm), arm.gripper
             step = wish.grip * GRIPPER_S / self._fps * (gripper.open - gripper.closed)
             low, high = sorted((gripper.closed, gripper.open))
             self.command[column] = np.clip(self.command[column] + step, low, high)
