@@ -123,7 +123,7 @@ def test_it_is_an_environment_with_the_spaces_of_the_simulator(world: MujocoEnv)
 def test_attempts_of_one_bank_are_one_start(compared: Path) -> None:
     starts = RecordedStarts(compared, embodiment=ROBOT, splits=("test",), views=("head",), fps=8)
     assert len(EpisodeSet.open(compared)) == 6
-    assert len({starts.row(number).bank for number in range(len(starts))}) == len(starts) == 2
+    assert len({row.bank for row in starts.rows}) == len(starts) == 2
 
 
 @pytest.mark.slow
