@@ -67,7 +67,7 @@ def _card(arguments: argparse.Namespace) -> None:
             f"wrote {write_model_card(arguments.artifact, read_checkpoint_info(arguments.artifact), arguments.license)}"
         )
         return
-    from worldline_core.report.dataset_card import write_card
+    from worldline_core.report.data import write_card
 
     for path in write_card(
         arguments.artifact, arguments.output or arguments.artifact / "run" / "card", arguments.title

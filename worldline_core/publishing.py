@@ -160,7 +160,7 @@ def set_files(folder: Path) -> dict[str, Path]:
 
 def _card_files(folder: Path, taken: Iterable[str]) -> dict[str, Path]:
     """The dataset card, unless the set has a README.md of its own."""
-    from worldline_core.report.dataset_card import write_card
+    from worldline_core.report.data import write_card
 
     if "README.md" in taken:
         return {}

@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
@@ -304,6 +306,8 @@ def write_all(root: Path) -> dict[str, Path]:
     inputs |= {f"rollout.{method}": root / method for method in METHODS}
     write_episode_set(inputs["curate"], EPISODES)
     write_episode_set(inputs["filter"], EPISODES[1:], name=EPISODES[0][0], reason="static")
+    finding = {"episode_id": EPISODES[1][0], "detector": "blur", "cut_frames": 0}
+    pq.write_table(pa.Table.from_pylist([finding]), inputs["filter"] / "findings.parquet")
     write_tracks(inputs["render_actions"])
     for folder in (
         inputs["train_stage1"],

@@ -11,15 +11,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
-from rerun.chunk import RrdReader
 
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.pictures import KEPT_COLOUR, reason_colour
-from worldline_core.report.data import CUT, QUARANTINED, episode_of, filter_refusals, read_outcomes
-from worldline_core.report.inspect import FilteredSet, inspect
+from worldline_core.report.inspect import FilteredSet, episode_of, inspect
 from worldline_core.store.atomic import write_json_atomic
 
 CONFIG = FilterConfig(min_segment_frames=8)
@@ -56,12 +54,15 @@ def test_every_clip_stands_under_its_reasons(filtered: Path) -> None:
     found = FilteredSet(filtered, filtered.parent.parent / "curate" / "key")
     assert found.outcomes["healthy"].reasons == ["kept"]
     assert found.outcomes["black"].reasons == ["too_dark"]
-    assert found.segments("black") == []
     assert found.outcomes["dark"].reasons == ["too_dark"]
-    assert found.segments("dark") == [(0, 12), (18, 33)]
-    assert found.outcomes["dark"].cut_by == {"too_dark": 6}
-    assert found.outcomes["turned"].stage2_reason is not None
-    assert found.segments("turned") == [(0, 33)]
+    first = found.episodes.rows[found.episodes.position("dark")].start
+    assert [(row.start - first, row.stop - first) for row in found.outcomes["dark"].kept] == [(0, 12), (18, 33)]
+    assert found.outcomes["dark"].cut == {"too_dark": 6}
+    assert found.outcomes["turned"].reasons != ["kept"]
+    assert {name: len(episode.kept) for name, episode in found.outcomes.items()} == {
+        "black": 0, "dark": 2, "healthy": 1, "turned": 1,
+    }  # fmt: skip
+    assert [episode_of(name) for name in ("a@00012", "a@b", "a", "a@b@00001")] == ["a", "a@b", "a", "a@b"]
     assert next(iter(found.by_reason())) == "too_dark"
     assert list(found.by_reason())[-1] == "kept"
     assert found.config == CONFIG
@@ -71,7 +72,7 @@ def test_a_page_shows_kept_and_dropped_clips(filtered: Path, tmp_path: Path) -> 
     result = inspect(filtered, tmp_path)
     html = (tmp_path / "index.html").read_text()
     assert "4 episodes: 3 kept in 4 segments, 1 dropped whole" in html
-    assert "1 dropped whole, 1 lost frames" in html
+    assert "2 episodes, 1 dropped whole" in html
     pictures = [path for path in result.written if path.name.startswith("reason_")]
     assert {"reason_too_dark.jpg", "reason_kept.jpg"} <= {path.name for path in pictures}
     for path in pictures:
@@ -81,8 +82,8 @@ def test_a_page_shows_kept_and_dropped_clips(filtered: Path, tmp_path: Path) -> 
 
 
 def test_the_timeline_has_the_dropped_frames_at_their_place(filtered: Path, tmp_path: Path) -> None:
-    result = inspect(filtered, tmp_path, episode_id="dark", rerun=True)
-    assert [path.name for path in result.written] == ["index.html", "dark_filters.jpg", "dark_filters.rrd"]
+    result = inspect(filtered, tmp_path, episode_id="dark")
+    assert [path.name for path in result.written] == ["index.html", "dark_filters.jpg"]
     with Image.open(tmp_path / "dark_filters.jpg") as image:
         picture = np.asarray(image.convert("RGB"))
     row = next(r for r in picture if (np.abs(r.astype(int) - KEPT_COLOUR).max(axis=-1) < 8).mean() > 0.6)
@@ -90,9 +91,6 @@ def test_the_timeline_has_the_dropped_frames_at_their_place(filtered: Path, tmp_
     width = len(row) - 24
     assert abs((dropped[0] - 12) / width - 12 / 33) < 0.02
     assert abs((dropped[-1] - 12) / width - 18 / 33) < 0.02
-    entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "dark_filters.rrd").stream()}
-    assert {"/segments/kept", "/segments/too_dark", "/views/head", "/curves/too_dark/head/bright_level"} <= entities
-    assert "/segments/static" not in entities
 
 
 def test_a_kept_episode_is_shown_with_its_controls_as_well(filtered: Path, tmp_path: Path) -> None:
@@ -113,17 +111,6 @@ def test_without_the_curated_set_it_is_said(filtered: Path, tmp_path: Path) -> N
         assert "dropped clips are not shown" in str(inspect(filtered, tmp_path))
     finally:
         (tmp_path / "manifest.json").rename(filtered / "manifest.json")
-
-
-def test_the_report_knows_which_episode_a_segment_is_of(filtered: Path) -> None:
-    outcomes = read_outcomes(filtered)
-    found = {(item.episode_id, item.effect) for episode in outcomes.values() for item in filter_refusals(episode)}
-    assert ("dark", CUT) in found
-    assert ("black", QUARANTINED) in found
-    assert {name: len(episode.kept) for name, episode in outcomes.items()} == {
-        "black": 0, "dark": 2, "healthy": 1, "turned": 1,
-    }  # fmt: skip
-    assert [episode_of(name) for name in ("a@00012", "a@b", "a", "a@b@00001")] == ["a", "a@b", "a", "a@b"]
 
 
 def test_hostile_reasons_stay_text(filtered: Path, hostile_text: str, tmp_path: Path) -> None:

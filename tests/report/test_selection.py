@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from worldline_core.report.context import VideoScores, in_order, method
-from worldline_core.report.data import with_unit
 from worldline_core.report.videos import best_median_worst, choose_episodes
 
 
@@ -47,18 +46,6 @@ def test_without_scores_episodes_are_taken_by_name() -> None:
     chosen = choose_episodes(VideoScores([], [], []), None, ["c", "a", "b"])
     assert [item.episode_id for item in chosen] == ["a", "b", "c"]
     assert "no scores" in chosen[0].reason
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "text"),
-    [
-        ("longest_still_s", 2.125, "longest still 2.12 s"),
-        ("max_joint_speed_rad_s", 1.4338, "max joint speed 1.43 rad/s"),
-        ("frames", 12, "frames 12"),
-    ],
-)
-def test_evidence_is_written_with_its_unit(key: str, value: float, text: str) -> None:
-    assert with_unit(key, value) == text
 
 
 def test_another_number_of_steps_is_not_shown_as_the_usual_method() -> None:

@@ -22,7 +22,7 @@ from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.pages.page import Table, environment, markdown
 from worldline_core.pictures import fit_text, text_width_px
-from worldline_core.report.dataset_card import markdown_table, plain
+from worldline_core.report.data import markdown_table, plain
 from worldline_core.report.progress import write_progress_page
 from worldline_core.store.remote import parse_location
 from worldline_core.untrusted_text import LONGEST, shown, visible, without_credentials

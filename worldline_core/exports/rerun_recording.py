@@ -1,6 +1,6 @@
-"""Rerun recordings: an episode and its predictions in 3-D, in every view and as time series; and the filters' findings.
+"""Rerun recordings: an episode and its predictions in 3-D, in every view and as time series.
 
-Entities of an episode (all poses in the robot's base frame, metres, z up; cameras have OpenCV axes, x right, y down, z forward):
+Entities (all poses in the robot's base frame, metres, z up; cameras have OpenCV axes, x right, y down, z forward):
 
     world/cameras/<view>            camera pose and pinhole (K), shown as a frustum
     world/cameras/<view>/true       recorded frames
@@ -10,13 +10,6 @@ Entities of an episode (all poses in the robot's base frame, metres, z up; camer
     predicted/<method>/<view>       predicted frames
     signals/{state,action}/<joint>  joint and gripper values
 
-Entities of a filter recording:
-
-    views/<view>                        recorded frames
-    segments/<kept or reason>           a coloured dot per frame, one row per reason: the episode's timeline
-    curves/<detector>/<view>/<name>     a detector's measure over its threshold: above or below 1 decides
-    verdict                             the findings, as text
-
 The bytes of a recording differ between runs (chunk identifiers are random), so recordings are written outside the
 digested part of an artifact. Importing this module imports Rerun.
 """
@@ -25,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import batched
 from pathlib import Path
@@ -38,14 +31,13 @@ from numpy.typing import NDArray
 
 from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.overlays import arm_colour, heat_layer
-from worldline_core.pictures import KEPT_COLOUR, jpeg_bytes, png_bytes, reason_colour
+from worldline_core.pictures import jpeg_bytes, png_bytes
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks
     from worldline_core.data.episodes.episode import Episode
     from worldline_core.data.video.frames import Frames
-    from worldline_core.filters.verdict import Finding
 
 PIECE_FRAMES = 64
 """So many pictures are logged together."""
@@ -54,8 +46,6 @@ FRUSTUM_M = {"fixed": 0.25, "moving": 0.08}
 ROBOT_COLOUR = (190, 194, 202)
 ROBOT_LINE_M = 0.01
 FRUSTUM_COLOUR = (220, 222, 228)
-LARGEST_RATIO = 5.0
-"""Filter curves are clipped there, or one outlier would flatten all others."""
 
 
 @dataclass(frozen=True)
@@ -221,84 +211,5 @@ def _blueprint(content: RecordingContent) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(top, series, row_shares=[4, 1]),
         rrb.TimePanel(timeline="frame", fps=content.episode.fps, state="collapsed"),
-        collapse_panels=True,
-    )
-
-
-def write_filter_recording(
-    path: Path,
-    frames: Mapping[str, Frames],
-    dropped: Mapping[str, NDArray[np.bool_]],
-    findings: Sequence[Finding],
-    fps: float,
-    summary: str,
-) -> None:
-    """Write one `.rrd` with a blueprint; opens with `rerun <file>`.
-
-    Args:
-        frames: by view, (n, H, W, 3).
-        dropped: by reason, bool (n,) frames that were dropped for it.
-        findings: of the detectors, with their curves.
-        summary: Markdown.
-    """
-    stream = rr.RecordingStream("worldline_filters", send_properties=False)
-    with atomic_path(path) as temporary:
-        stream.save(temporary, default_blueprint=_filter_blueprint(list(frames), _shown_curves(findings), fps))
-        for view, images in frames.items():
-            _log_frames(stream, f"views/{view}", images, fps)
-        _log_segments(stream, dropped, len(next(iter(frames.values()))), fps)
-        for finding in findings:
-            _log_curves(stream, finding, fps)
-        stream.log("verdict", rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN), static=True)
-        stream.disconnect()
-
-
-def _log_segments(stream: rr.RecordingStream, dropped: Mapping[str, NDArray[np.bool_]], count: int, fps: float) -> None:
-    lost = np.logical_or.reduce([*dropped.values(), np.zeros(count, dtype=bool)])
-    rows = [("kept", ~lost, KEPT_COLOUR), *[(r, flags, reason_colour(r)) for r, flags in dropped.items()]]
-    for height, (name, flags, colour) in enumerate(rows):
-        at = np.flatnonzero(flags)
-        if len(at) == 0:
-            continue
-        entity = f"segments/{name}"
-        stream.log(
-            entity, rr.SeriesPoints(colors=[colour], markers=["square"], marker_sizes=[5], names=[name]), static=True
-        )
-        times = [rr.TimeColumn("frame", sequence=at), rr.TimeColumn("time", duration=at / fps)]
-        stream.send_columns(entity, times, rr.Scalars.columns(scalars=np.full(len(at), -float(height))))
-
-
-def _log_curves(stream: rr.RecordingStream, finding: Finding, fps: float) -> None:
-    for name, curve in finding.verdict.curves.items():
-        if curve.threshold <= 0:
-            continue
-        entity = f"curves/{finding.detector}/{finding.view or 'all'}/{name}"
-        label = f"{finding.detector}, {finding.view or 'all'}: {name.replace('_', ' ')} / {curve.threshold:g}"
-        colour = reason_colour(finding.verdict.reason)
-        stream.log(entity, rr.SeriesLines(colors=[colour], names=[label], widths=[1.5]), static=True)
-        ratio = np.clip(curve.values / curve.threshold, -LARGEST_RATIO, LARGEST_RATIO)
-        stream.send_columns(entity, _timeline(len(ratio), fps), rr.Scalars.columns(scalars=ratio))
-
-
-def _shown_curves(findings: Sequence[Finding]) -> list[str]:
-    """Curves of the detectors that found something; of all where none did. The others can be switched on."""
-    shown = [f for f in findings if not f.verdict.clean and f.verdict.curves] or findings
-    return [f"curves/{f.detector}/{f.view or 'all'}/**" for f in shown if f.verdict.curves]
-
-
-def _filter_blueprint(views: Sequence[str], curves: Sequence[str], fps: float) -> rrb.Blueprint:
-    pictures = [rrb.Spatial2DView(origin=f"views/{view}", name=view.replace("_", " ")) for view in views]
-    series = rrb.Vertical(
-        rrb.TimeSeriesView(origin="segments", name="kept and dropped frames"),
-        rrb.TimeSeriesView(
-            origin="curves", contents=[f"+ /{name}" for name in curves], name="detectors: measured over threshold"
-        ),
-        row_shares=[1, 3],
-    )
-    return rrb.Blueprint(
-        rrb.Vertical(
-            rrb.Horizontal(*pictures, rrb.TextDocumentView(origin="verdict", name="verdict")), series, row_shares=[2, 3]
-        ),
-        rrb.TimePanel(timeline="frame", fps=fps, state="collapsed"),
         collapse_panels=True,
     )

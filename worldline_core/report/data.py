@@ -1,256 +1,295 @@
-"""Page "Data and filters": recorded episodes, what the filters did with each, and the controls over the pictures."""
+"""The recordings: counts of an EpisodeSet, its dataset card as the Hugging Face hub reads it, and the page "Data and filters"."""
 
 from __future__ import annotations
 
-import json
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import re
+from bisect import bisect_right
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from huggingface_hub import DatasetCard, DatasetCardData
 from markupsafe import Markup
-from PIL import Image
 
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
-from worldline_core.actions.overlays import OverlayStyle, draw_overlay, overlay_sheet
-from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, read_index, read_quarantine
+from worldline_core.actions.overlays import OverlayStyle, overlay_sheet
+from worldline_core.data.curation.rules import CURATION_FILE
+from worldline_core.data.curation.source_table import WEIGHTS_FILE, SourceFacts, read_source_table
+from worldline_core.data.episodes.episode_index import (
+    INDEX_FILE,
+    EpisodeRow,
+    QuarantineRow,
+    read_index,
+    read_quarantine,
+)
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.episodes.instructions import mentions_outcome
 from worldline_core.errors import DataError
-from worldline_core.pages.charts import funnel_chart
-from worldline_core.pages.page import Table, code, number, percent, with_note, words
-from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pages.page import Table, duration, render, words
+from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
 from worldline_core.report.context import ReportContext, Section
-from worldline_core.report.dataset_card import DatasetFacts, choose_rows, sheet_rows
-from worldline_core.store.artifact_files import JsonObject, read_json, read_rows
+from worldline_core.store.artifact_files import JsonObject, linked_folder, read_json, read_rows
+from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.untrusted_text import cut, visible
 
 TITLE = "Data and filters"
-SHEET_ROWS = 12
-OVERLAYS = 4
-MOMENTS = 5
-SHOWN_HEIGHT = 128
-QUARANTINED, NOT_STAGE2, CUT = EFFECTS = ("quarantined", "kept for Stage I only", "frames cut")
-KEPT = "kept"
-NUMBERS_SHOWN = 6
-UNITS = {"_rad_s": " rad/s", "_deg": "°", "_rad": " rad", "_px": " px", "_s": " s", "_m": " m"}
-"""Longest suffixes first."""
-CAUSES = ("valid", "behind_camera", "outside_image", "invalid_calibration")
+FINDINGS_FILE = "findings.parquet"
+UNKNOWN = "unknown"
+PICTURES = "pictures"
+PAGE_ROWS, ROWS_PER_SOURCE, MOMENTS, OVERLAYS = 12, 6, 6, 4
+SHEET_WIDTH = 1180
+MOST_INSTRUCTIONS, MOST_LEAKS = 15, 12
+LONGEST_CELL = 300
+"""Characters of one cell of a Markdown table."""
+HUB_LICENSES = re.compile(
+    r"apache-2\.0|mit|bsd-[23]-clause|cc0-1\.0|cc-by(-nc)?(-sa|-nd)?-[234]\.[05]|odc-by|odbl|unknown"
+)
+"""Licences that the hub knows by name; every other one is "other" with its name beside it."""
+_SIZES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "10M<n<100M", "100M<n<1B", "1B<n<10B")
+"""The hub's classes of size, a factor of ten each."""
 
 
 @dataclass(frozen=True)
-class FilteredEpisode:
-    """One curated episode after the filters.
+class DatasetFacts:
+    """Tables of a finished EpisodeSet, curated or filtered, and of the set that it was filtered from.
 
     Attributes:
-        dropped: the reason why it was dropped whole; None for a kept one.
-        kept: its segments in the filtered set.
-        findings: rows of findings.parquet, their numbers parsed.
+        rows: its episodes, or segments of episodes; curated: the episodes before the filters.
+        curation: curation.json; weights: source_weights.json.
     """
 
-    episode_id: str
-    dropped: QuarantineRow | None
-    kept: Sequence[EpisodeRow]
-    findings: Sequence[JsonObject]
+    rows: list[EpisodeRow]
+    curated: list[EpisodeRow]
+    refused_by_curation: list[QuarantineRow]
+    refused_by_filters: list[QuarantineRow]
+    filtered: bool
+    sources: list[SourceFacts]
+    curation: JsonObject
+    weights: JsonObject
+    findings: list[JsonObject]
+
+    @classmethod
+    def read(cls, folder: Path, curated: Path | None = None) -> DatasetFacts:
+        """Read the tables of an EpisodeSet; ``curated`` is the set that it was filtered from (default: by its manifest).
+
+        Raises: DataError when it is none; ArtifactError when a table is damaged.
+        """
+        rows, refused = read_index(folder), read_quarantine(folder)
+        filtered = (folder / FINDINGS_FILE).is_file()
+        origin = (curated or _origin(folder, rows)) if filtered else folder
+        return cls(
+            rows=rows,
+            curated=read_index(origin) if filtered and origin else rows,
+            refused_by_curation=read_quarantine(origin) if origin else [],
+            refused_by_filters=refused if filtered else [],
+            filtered=filtered,
+            sources=read_source_table(origin) if origin else [],
+            curation=read_json(origin / CURATION_FILE) if origin else {},
+            weights=read_json(origin / WEIGHTS_FILE) if origin else {},
+            findings=read_rows(folder / FINDINGS_FILE),
+        )
 
     @property
-    def stage2_reason(self) -> str | None:
-        """The reason why a kept one is barred from Stage II."""
-        return next((row.stage2_reason or "unfit for Stage II" for row in self.kept if not row.stage2_ok), None)
+    def num_frames(self) -> int:
+        return sum(row.video_frames for row in self.rows)
 
     @property
-    def cut_by(self) -> Counter[str]:
-        """Frames cut out of a kept episode, by reason."""
-        counts: Counter[str] = Counter()
-        for finding in self.findings if self.dropped is None else ():
-            counts[finding["detector"]] += finding["cut_frames"]
-        return +counts
+    def num_episodes(self) -> int:
+        """Recorded episodes of which something was kept."""
+        return len({(row.dataset, row.episode_index) for row in self.rows})
 
     @property
-    def reasons(self) -> list[str]:
-        """Every reason that it is an example of; `kept` for one without any."""
-        if self.dropped is not None:
-            return [self.dropped.reason]
-        return list(dict.fromkeys([*self.cut_by, *filter(None, [self.stage2_reason])])) or [KEPT]
+    def summary(self) -> str:
+        """Two sentences about size and outcomes."""
+        rows, outcomes = self.rows, Counter(row.outcome for row in self.rows)
+        return (
+            f"{recorded_time(rows)} in {self.num_episodes} episodes ({len(rows)} segments), {self.num_frames} frames per view;"
+            f" {len({row.embodiment for row in rows})} embodiments, {len({row.scene for row in rows})} scenes,"
+            f" {len({row.instruction for row in rows if row.instruction})} instructions. Outcomes: {outcomes['success']} successes,"
+            f" {outcomes['failure']} failures, {outcomes['unknown']} unknown; they are labels for evaluation and never reach a model."
+        )
+
+    @property
+    def split_note(self) -> str:
+        """Scenes that training and test share, counted."""
+        learnt = {row.scene for row in self.rows if row.split in ("train", "validation")}
+        tested = {row.scene for row in self.rows if row.split in ("test", "ood_test")}
+        shared = sorted(learnt & tested)
+        if shared:
+            return f"Warning: {len(shared)} scenes are in training and in test ({', '.join(shared[:4])})."
+        return f"None of the {len(tested)} test scenes is among the {len(learnt)} scenes of training and validation."
+
+    @property
+    def funnel(self) -> Table:
+        """Numbers left after each step, in episodes, then in segments."""
+        filtered = [("kept by the filters", self.num_episodes), ("segments of these", len(self.rows))]
+        steps = [
+            ("episodes found", len(self.curated) + len(self.refused_by_curation)),
+            ("kept by curation", len(self.curated)),
+            *(filtered if self.filtered else []),
+            ("fit for Stage I", sum(row.stage1_ok for row in self.rows)),
+            ("fit for Stage II", sum(row.stage2_ok for row in self.rows)),
+        ]
+        return Table(("Step", "Number"), steps, [1])
+
+    @property
+    def reason_table(self) -> Table:
+        """Step, reason, count and an example's detail of everything that was refused, the most frequent first."""
+        rows: list[list[object]] = []
+        for step, refused in {
+            "curation": [(row.reason, f"{row.episode_id}: {row.detail}") for row in self.refused_by_curation],
+            "filters": [(row.reason, f"{row.episode_id}: {row.detail}") for row in self.refused_by_filters],
+            "filters, frames cut": [
+                (f["detector"], f"{f['episode_id']}: {f['cut_frames']} frames")
+                for f in self.findings
+                if f["cut_frames"]
+            ],
+            "kept for Stage I only": [
+                (r.stage2_reason, r.episode_id) for r in self.rows if r.stage2_reason is not None
+            ],
+        }.items():
+            first = dict(reversed(refused))
+            for reason, count in most_frequent(reason for reason, _ in refused):
+                rows.append([step, reason, count, first[reason].partition("\n")[0]])
+        return Table(("Step", "Reason", "Number", "For example"), rows, [2])
+
+    @property
+    def names(self) -> list[str]:
+        """Sources by name, those without a kept episode included."""
+        unseen = [facts.label for facts in self.sources if not facts.names]
+        return sorted({row.source for row in self.rows} | set(unseen))
+
+    def source_facts(self, name: str) -> SourceFacts | None:
+        """The configured source of this name; None where it is not noted."""
+        return next((facts for facts in self.sources if name in facts.names or name == facts.label), None)
+
+    def licenses(self) -> dict[str, list[str]]:
+        """Sources by licence, "unknown" among them."""
+        found: dict[str, list[str]] = {}
+        for name in self.names:
+            facts = self.source_facts(name)
+            found.setdefault(UNKNOWN if facts is None else facts.license, []).append(name)
+        return dict(sorted(found.items()))
+
+    @property
+    def source_table(self) -> Table:
+        """Origin of the episodes, their numbers, and what their licences allow."""
+        rows = []
+        for name in self.names:
+            own = [row for row in self.rows if row.source == name]
+            noted, weight = self.source_facts(name), self.weights.get(name)
+            share = f"{100 * float(weight['share']):.1f} %" if isinstance(weight, dict) else None
+            kind, found = (None, None) if noted is None else (noted.kind, noted.found)
+            kept = len({(row.dataset, row.episode_index) for row in own})
+            rates = ", ".join(sorted({f"{row.fps:g}" for row in own})) or None
+            rights = (UNKNOWN, UNKNOWN) if noted is None else (noted.license, noted.redistribution)
+            rows.append([name, kind, found, kept, recorded_time(own), rates, share, *rights])
+        headings = (
+            "Source", "Kind", "Found", "Kept", "Recorded", "fps", "Share in training", "Licence", "Redistribution",
+        )  # fmt: skip
+        return Table(headings, rows, range(2, 7))
+
+    def count_table(self, heading: str, value_of: Callable[[EpisodeRow], str]) -> Table:
+        """Scenes, episodes, recorded time and outcomes by a property of the rows."""
+        groups: dict[str, list[EpisodeRow]] = defaultdict(list)
+        for row in self.rows:
+            groups[value_of(row)].append(row)
+        rows: list[list[object]] = []
+        for value, own in sorted(groups.items()):
+            outcomes = Counter(row.outcome for row in own)
+            counts = [outcomes[name] for name in ("success", "failure", "unknown")]
+            rows.append([value, len({row.scene for row in own}), len(own), recorded_time(own), *counts])
+        headings = (heading, "Scenes", "Episodes", "Recorded", "Success", "Failure", "Unknown")
+        return Table(headings, rows, range(1, 7))
+
+    @property
+    def contents(self) -> list[tuple[str, Table]]:
+        """Counts by embodiment, task and split, each with a heading."""
+        return [
+            ("Embodiments", self.count_table("Embodiment", lambda row: row.embodiment)),
+            ("Tasks", self.count_table("Task family", lambda row: words(row.task_family))),
+            ("Splits", self.count_table("Split", lambda row: words(row.split))),
+        ]
+
+    @property
+    def instructions(self) -> Table:
+        """The most frequent instructions."""
+        found = most_frequent(row.instruction for row in self.rows)[:MOST_INSTRUCTIONS]
+        return Table(("Instruction", "Episodes"), [(text or "(none)", count) for text, count in found], [1])
+
+    @property
+    def revealing(self) -> int:
+        """Rows whose instruction reveals the outcome, which models must not see."""
+        return sum(mentions_outcome(row.instruction) for row in self.rows)
+
+    @property
+    def leakage(self) -> tuple[str, Table]:
+        """Scenes on both sides of the split that look alike, in words and as a table."""
+        leaks = self.curation.get("scene_leaks", [])
+        rows = [(leak["learning_scene"], leak["testing_scene"], leak["distance"]) for leak in leaks[:MOST_LEAKS]]
+        if self.curation.get("leakage_action", "off") == "off":
+            text = "Leakage was not looked for (curate.leakage.action)."
+        else:
+            text = f"{len(leaks)} pairs of scenes across the split look alike (first images; bits of 256)."
+        return text, Table(("Learnt from", "Tested on", "Differing bits"), rows, [2])
 
 
-def read_outcomes(folder: Path) -> dict[str, FilteredEpisode]:
-    """Every episode that a filter step has judged, by id.
-
-    Raises: DataError, ArtifactError: a table of the step is missing or damaged.
-    """
-    dropped = {row.episode_id: row for row in read_quarantine(folder)}
-    kept: dict[str, list[EpisodeRow]] = {}
-    for row in read_index(folder):
-        kept.setdefault(episode_of(row.episode_id), []).append(row)
-    findings: dict[str, list[JsonObject]] = {}
-    for row in read_rows(folder / "findings.parquet"):
-        findings.setdefault(row["episode_id"], []).append(row | {"numbers": json.loads(row["numbers"])})
-    return {
-        name: FilteredEpisode(name, dropped.get(name), kept.get(name, ()), findings.get(name, ()))
-        for name in sorted({*dropped, *kept, *findings})
-    }
+def _origin(folder: Path, rows: Sequence[EpisodeRow]) -> Path | None:
+    """The curated set that a filtered one was made from: by its manifest, else by the place of its datasets."""
+    linked = linked_folder(folder, "episodes")
+    if linked is None and rows:
+        holder = (folder / rows[0].dataset).resolve().parents[1]
+        linked = holder if (holder / INDEX_FILE).is_file() else None
+    return linked
 
 
-def episode_of(name: str) -> str:
-    """The episode that a kept row was cut from: `episode@00120` is a segment of `episode`."""
-    episode, _, start = name.rpartition("@")
-    return episode if episode and len(start) == 5 and start.isdigit() else name
+def most_frequent[T: Any](values: Iterable[T]) -> list[tuple[T, int]]:
+    """Values and their counts, the most frequent first, ties in their own order."""
+    return sorted(Counter(values).items(), key=lambda item: (-item[1], item[0]))
 
 
-def numbers_text(numbers: Mapping[str, Any]) -> str:
-    """The first measured values in one line, each with its unit."""
-    shown = [
-        with_unit(key, value)
-        for key, value in numbers.items()
-        if isinstance(value, (int, float, str)) and not isinstance(value, bool) and key != "picture"
+def recorded_time(rows: Iterable[EpisodeRow]) -> str:
+    """Duration of the images of some rows."""
+    return duration(sum(row.video_frames / row.fps for row in rows))
+
+
+# Pictures
+
+
+def choose_rows(rows: Sequence[EpisodeRow], positions: Iterable[int], most: int) -> list[int]:
+    """Up to `most` positions, taken in turn from every pair of embodiment and task; failures and successes in turn come first."""
+    groups: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for position in positions:
+        groups[rows[position].embodiment, rows[position].task_family].append(position)
+    ordered = [
+        sorted(group, key=lambda i: (rows[i].outcome != ("failure" if turn % 2 else "success"), rows[i].episode_id))
+        for turn, (_, group) in enumerate(sorted(groups.items()))
     ]
-    return " · ".join(shown[:NUMBERS_SHOWN])
+    if len(ordered) > most:
+        return sorted(ordered[i][0] for i in evenly_spaced(len(ordered), most))
+    depths = range(max(map(len, ordered), default=0))
+    return sorted([group[depth] for depth in depths for group in ordered if depth < len(group)][:most])
 
 
-def with_unit(key: str, value: float | str) -> str:
-    """`longest_still_s: 2.1` as `longest still 2.1 s`: names end in their unit."""
-    suffix, unit = next(((end, unit) for end, unit in UNITS.items() if key.endswith(end)), ("", ""))
-    shown = f"{value:.3g}" if isinstance(value, float) else str(value)
-    return f"{key.removesuffix(suffix).replace('_', ' ')} {shown}{unit}"
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """One episode, the reason, its effect, and the numbers that show it; `view` is None where no single view is concerned."""
-
-    step: str
-    reason: str
-    effect: str
-    episode_id: str
-    detail: str
-    numbers: Mapping[str, Any] = field(default_factory=dict)
-    view: str | None = None
-
-
-def filter_refusals(episode: FilteredEpisode) -> list[Refusal]:
-    """Refusals of one episode: dropped whole, barred from Stage II, frames cut."""
-    name, dropped = episode.episode_id, episode.dropped
-    if dropped is not None:
-        view = next((f["view"] for f in episode.findings if f["detector"] == dropped.reason), None)
-        return [Refusal("filter", dropped.reason, QUARANTINED, name, dropped.detail, dropped.numbers, view)]
-    found: list[Refusal] = []
-    if episode.stage2_reason is not None:
-        failed = [f for f in episode.findings if not f["passed"] and f["stage"] == 2]
-        detectors = ", ".join(dict.fromkeys(str(f["detector"]).replace("_", " ") for f in failed))
-        detail = f"found by {detectors}" if detectors else "see the step's findings"
-        numbers = failed[0]["numbers"] if failed else {}
-        found.append(Refusal("filter", episode.stage2_reason, NOT_STAGE2, name, detail, numbers, "head"))
-    for f in episode.findings:
-        if f["cut_frames"]:
-            detail = f"{f['cut_frames']} frames cut"
-            found.append(Refusal("filter", f["detector"], CUT, name, detail, f["numbers"], f["view"]))
-    return found
-
-
-def data_section(context: ReportContext) -> Section:
-    """Counts of the curated episodes, the way from source to training, reasons with examples, overlays."""
-    curated, filtered = context.inputs.get("curate"), context.inputs.get("filter")
-    folder = curated or filtered
-    if folder is None:
-        return Section("data", TITLE, missing="no EpisodeSet was given (inputs curate or filter).")
-    facts = DatasetFacts.read(folder)
-    rows, unreadable = sheet_rows(EpisodeSet.open(folder), choose_rows(facts.rows, range(len(facts.rows)), SHEET_ROWS))
-    sheet = context.picture("contact_sheet", contact_sheet(rows), alt="Recorded episodes") if rows else None
-    stages: list[tuple[str, int]] = []
-    refusals: list[Refusal] = []
-    kept = None
-    if curated is not None:
-        refused = read_quarantine(curated)
-        stages = [("found in the sources", len(facts.rows) + len(refused)), ("readable and complete", len(facts.rows))]
-        refusals += [Refusal("curate", r.reason, QUARANTINED, r.episode_id, r.detail, r.numbers) for r in refused]
-    if filtered is not None:
-        outcomes = read_outcomes(filtered).values()
-        episodes = [episode.kept for episode in outcomes if episode.kept]
-        stages.append(("kept, fit for Stage I", sum(segments[0].stage1_ok for segments in episodes)))
-        stages.append(("fit for Stage II", sum(segments[0].stage2_ok for segments in episodes)))
-        refusals += [refusal for episode in outcomes for refusal in filter_refusals(episode)]
-        frames = sum(row.num_frames for segments in episodes for row in segments)
-        kept = (len(episodes), sum(map(len, episodes)), frames)
-    overlays, problems = overlay_pictures(context)
-    return context.section(
-        "data",
-        TITLE,
-        facts.summary,
-        facts=facts,
-        sheet=sheet,
-        chart=funnel_chart(stages, title="Episodes from source to training"),
-        kept=kept,
-        reasons=reason_table(refusals),
-        examples=examples(context, refusals),
-        overlays=overlays,
-        samples=sample_table(context),
-        problems=[*(f"No picture of {line}" for line in unreadable), *problems],
-    )
-
-
-def reason_table(refusals: Sequence[Refusal]) -> Table | None:
-    """Counts by reason and effect, with one detail each."""
-    counted = Counter((item.effect, item.step, item.reason) for item in refusals)
-    rows: list[list[object]] = []
-    order = sorted(counted.items(), key=lambda entry: (EFFECTS.index(entry[0][0]), -entry[1], entry[0]))
-    for (effect, step, reason), count in order:
-        first = next(item for item in refusals if (item.effect, item.step, item.reason) == (effect, step, reason))
-        rows.append([code(reason), step, effect, count, f"{first.episode_id}: {first.detail}"])
-    return Table(("Reason", "Step", "Effect", "Episodes", "For example"), rows, [3], "Reasons") if rows else None
-
-
-def examples(context: ReportContext, refusals: Sequence[Refusal]) -> list[dict[str, object]]:
-    """One picture for each reason whose episode can still be decoded."""
-    cards: dict[str, dict[str, object]] = {}
-    for item in sorted(refusals, key=lambda r: (EFFECTS.index(r.effect), r.reason, r.episode_id)):
-        if item.reason in cards:
+def sheet_rows(episodes: EpisodeSet, positions: Iterable[int]) -> tuple[list[SheetRow], list[str]]:
+    """Six moments of each episode's primary view, titled; and a line on each one that could not be read."""
+    shown: list[SheetRow] = []
+    unreadable: list[str] = []
+    for position in positions:
+        row = episodes.rows[position]
+        try:
+            moments = evenly_spaced(row.video_frames, MOMENTS)
+            frames = np.asarray(episodes.frames(position, row.primary_view, moments))
+        except DataError as error:
+            unreadable.append(f"No picture of {row.episode_id}: {error.what}")
             continue
-        picture = example_picture(context, item)
-        if picture is not None:
-            image = context.picture(f"refused_{safe_stem(item.reason)}", picture, alt=f"Example for {item.reason}")
-            cards[item.reason] = {"image": image, "item": item, "numbers": numbers_text(item.numbers)}
-    return list(cards.values())
-
-
-def example_picture(context: ReportContext, item: Refusal) -> Picture | None:
-    """The picture kept as evidence, or moments of the episode; None where nothing can be decoded."""
-    folder = context.inputs.get(item.step)
-    kept = item.numbers.get("picture")
-    if folder is not None and isinstance(kept, str):
-        path = (folder / kept).resolve()
-        if path.is_file() and path.is_relative_to(folder.resolve()):
-            with Image.open(path) as image:
-                return np.asarray(image.convert("RGB"), dtype=np.uint8)
-    if item.step != "filter" or "curate" not in context.inputs:
-        return None
-    try:
-        return moments(context, item)
-    except DataError:
-        return None
-
-
-def moments(context: ReportContext, item: Refusal) -> Picture:
-    """A row of moments of a curated episode, with the projected tools where calibration or clocks are at fault.
-
-    Raises:
-        DataError: the set does not hold the episode, or cannot decode it.
-    """
-    episodes = EpisodeSet.open(context.inputs["curate"])
-    index = episodes.position(item.episode_id)
-    row = episodes.rows[index]
-    view = item.view if item.view in row.views else row.primary_view
-    chosen = evenly_spaced(row.video_frames, MOMENTS)
-    frames = np.asarray(episodes.frames(index, view, chosen))
-    if item.effect == NOT_STAGE2 and "render_actions" in context.inputs:
-        tracks = ActionTracks.open(context.inputs["render_actions"])
-        if item.episode_id in tracks:
-            found = tracks.tracks(item.episode_id)
-            if view in found.views and max(chosen) < found.num_frames:
-                drawn = zip(frames, chosen, strict=True)
-                frames = np.stack([draw_overlay(f, found, n, view, tile_height=SHOWN_HEIGHT) for f, n in drawn])
-    return contact_sheet([SheetRow("", frames)], tile_height=SHOWN_HEIGHT, column_titles=[f"frame {i}" for i in chosen])
+        title = f"{row.embodiment}  ·  {row.instruction or '(no instruction)'}"
+        note = f"{row.episode_id}  ·  {row.scene}  ·  {words(row.split)}  ·  {row.outcome}"
+        shown.append(SheetRow(title, frames, note))
+    return shown, unreadable
 
 
 def episode_overlay(
@@ -267,45 +306,105 @@ def episode_overlay(
     return overlay_sheet(frames, tracks, chosen, style=OverlayStyle(sigma_px_ref), title=title)
 
 
-def overlay_pictures(context: ReportContext) -> tuple[list[tuple[Markup, EpisodeRow]], list[str]]:
+# The dataset card
+
+
+def write_card(folder: Path, output: Path, title: str | None = None) -> list[Path]:
+    """Write the card of a finished EpisodeSet; equal sets give equal bytes.
+
+    Args:
+        output: gets README.md and pictures/.
+        title: default: "EpisodeSet" and the folder's name.
+
+    Returns: the files written.
+
+    Raises: DataError when the folder is no EpisodeSet; ArtifactError when one of its tables is damaged.
+    """
+    facts, episodes = DatasetFacts.read(folder), EpisodeSet.open(folder)
+    heading = title or f"EpisodeSet {folder.resolve().name}"
+    pictures: list[tuple[str, Path]] = []
+    for number, name in enumerate(facts.names):
+        own = [i for i, row in enumerate(facts.rows) if row.source == name and row.primary_view in row.views]
+        rows, _ = sheet_rows(episodes, choose_rows(facts.rows, own, ROWS_PER_SOURCE))
+        if rows:
+            pictures.append((name, output / PICTURES / f"source_{number:02d}.jpg"))
+            write_bytes_atomic(pictures[-1][1], jpeg_bytes(contact_sheet(rows, min_width=SHEET_WIDTH)))
+    text = render("report/card.md", facts=facts, heading=heading, pictures=pictures, plain=plain, table=markdown_table)
+    card = DatasetCard(f"---\n{hub_metadata(facts, heading).to_yaml()}\n---\n\n{text}\n")
+    write_bytes_atomic(output / "README.md", str(card).encode())
+    return [output / "README.md", *(path for _, path in pictures)]
+
+
+def hub_metadata(facts: DatasetFacts, title: str) -> DatasetCardData:
+    """The header for the hub's dataset pages and searches."""
+    name = re.sub(r"[^a-z0-9.+-]+", "-", " and ".join(facts.licenses()).lower()).strip("-") or UNKNOWN
+    known = HUB_LICENSES.fullmatch(name)
+    datasets = sorted({row.dataset for row in facts.rows if not row.dataset.startswith("..")})
+    return DatasetCardData(
+        pretty_name=title,
+        license=name if known else "other",
+        license_name=None if known else name,
+        task_categories=["robotics"],
+        tags=["LeRobot", "WorldLine", "robotics", *sorted({row.embodiment for row in facts.rows})],
+        size_categories=[_SIZES[bisect_right([10**power for power in range(3, 10)], facts.num_frames)]],
+        configs=[{"config_name": Path(d).name, "data_files": f"{d}/data/*/*.parquet"} for d in datasets] or None,
+    )
+
+
+def plain(text: str) -> str:
+    """Recorded text in Markdown without markup, entities or line breaks, cut to a readable length."""
+    escaped = re.sub(r"([\\`*\[\]<>#|&])", r"\\\1", visible(cut(" ".join(text.split()))))
+    return re.sub(r"(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])", r"\\_", escaped)  # within a word it is no markup
+
+
+def markdown_table(table: Table) -> str:
+    """A table in Markdown, or nothing where it has no rows."""
+    numeric = set(table.numeric)
+    rule = ["---:" if position in numeric else "---" for position in range(len(table.headings))]
+    rows = [["-" if cell is None else plain(cut(str(cell), LONGEST_CELL)) for cell in row] for row in table.rows]
+    lines = [[plain(heading) for heading in table.headings], rule, *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) if rows else ""
+
+
+# The page "Data and filters"
+
+
+def data_section(context: ReportContext) -> Section:
+    """Counts of the recordings, the way from source to training with its reasons, and controls over the pictures."""
+    folder = context.inputs.get("filter") or context.inputs.get("curate")
+    if folder is None:
+        return Section("data", TITLE, missing="no EpisodeSet was given (inputs curate or filter).")
+    facts, episodes = DatasetFacts.read(folder, context.inputs.get("curate")), EpisodeSet.open(folder)
+    rows, problems = sheet_rows(episodes, choose_rows(facts.rows, range(len(facts.rows)), PAGE_ROWS))
+    sheet = context.picture("contact_sheet", contact_sheet(rows), alt="Recorded episodes") if rows else None
+    overlays, unreadable = overlay_pictures(context, episodes)
+    return context.section(
+        "data", TITLE, facts.summary, facts=facts, sheet=sheet, overlays=overlays, problems=[*problems, *unreadable]
+    )
+
+
+def overlay_pictures(context: ReportContext, episodes: EpisodeSet) -> tuple[list[tuple[Markup, EpisodeRow]], list[str]]:
     """The controls over one episode of each embodiment, held-out scenes preferred; and a line on each unreadable one."""
-    folder, episodes = context.inputs.get("render_actions"), context.episodes
-    if folder is None or episodes is None:
+    folder = context.inputs.get("render_actions")
+    if folder is None:
         return [], ["No action tracks were given (input render_actions)."]
     tracks = ActionTracks.open(folder)
     first: dict[str, int] = {}
-    order = sorted(range(len(episodes)), key=lambda i: episodes.rows[i].episode_id)
-    for index in sorted(order, key=lambda i: episodes.rows[i].split not in ("test", "ood_test")):
-        row = episodes.rows[index]
-        if row.bank is None and len(row.views) > 1:
-            first.setdefault(row.embodiment, index)
+    rows = episodes.rows
+    for index in sorted(
+        range(len(rows)), key=lambda i: (rows[i].split not in ("test", "ood_test"), rows[i].episode_id)
+    ):
+        if rows[index].bank is None and len(rows[index].views) > 1 and rows[index].episode_id in tracks:
+            first.setdefault(rows[index].embodiment, index)
     shown: list[tuple[Markup, EpisodeRow]] = []
     unreadable: list[str] = []
     for _, index in sorted(first.items())[:OVERLAYS]:
-        row = episodes.rows[index]
-        if row.episode_id not in tracks:
-            continue
+        name = rows[index].episode_id
         try:
-            picture = episode_overlay(episodes, index, tracks.tracks(row.episode_id), tracks.sigma_px_ref)
+            picture = episode_overlay(episodes, index, tracks.tracks(name), tracks.sigma_px_ref)
         except DataError as error:
-            unreadable.append(f"No overlay of {row.episode_id}: {error.what}")
+            unreadable.append(f"No overlay of {name}: {error.what}")
             continue
-        alt = f"Action maps over {row.episode_id}"
-        shown.append((context.picture(f"actions_{len(shown)}", picture, alt=alt), row))
+        alt = f"Action maps over {name}"
+        shown.append((context.picture(f"actions_{len(shown)}", picture, alt=alt), rows[index]))
     return shown, unreadable
-
-
-def sample_table(context: ReportContext) -> Table | None:
-    """Valid samples (frame, view, arm) of the action tracks, and the causes of the others, by embodiment."""
-    folder = context.inputs.get("render_actions")
-    counts = {} if folder is None else read_json(folder / "summary.json").get("by_embodiment", {})
-    causes = [cause for cause in CAUSES if any(cause in numbers for numbers in counts.values())]
-    rows = []
-    for name, numbers in sorted(counts.items()):
-        found = [numbers.get(cause, 0) for cause in causes]
-        total = sum(found) or 1
-        shares = [with_note(number(count), percent(count / total)) for count in found]
-        rows.append([name, numbers.get("episodes"), *shares])
-    headings = ["Embodiment", "Episodes", *[words(cause).capitalize() for cause in causes]]
-    caption = "Samples of the action maps (one per frame, view and arm). Only valid ones are drawn; the others are masked to zero."
-    return Table(headings, rows, range(1, len(headings)), caption) if causes else None
