@@ -60,12 +60,9 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
 
 def _card(arguments: argparse.Namespace) -> None:
     if (arguments.artifact / "checkpoint.json").is_file():
-        from worldline_core.model.checkpoint import read_checkpoint_info
         from worldline_core.model.pretrained import write_model_card
 
-        print(
-            f"wrote {write_model_card(arguments.artifact, read_checkpoint_info(arguments.artifact), arguments.license)}"
-        )
+        print(f"wrote {write_model_card(arguments.artifact, arguments.license)}")
         return
     from worldline_core.report.data import write_card
 

@@ -12,9 +12,9 @@ from huggingface_hub import ModelCard
 
 from flows.command_line import main
 from tests.hub.conftest import Hub, Repository
-from worldline_core import PretrainedWorldModel, WorldLine
-from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
-from worldline_core.model.checkpoint import save_checkpoint
+from worldline_core import WorldLine
+from worldline_core.errors import CheckpointError, UnavailableError
+from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.pretrained import pretrained_folder
 from worldline_core.store.artifact_files import write_manifest
 
@@ -33,26 +33,6 @@ def publish(hub: Hub, folder: Path, name: str = "ORG/NAME") -> Repository:
     return hub.repositories[name]
 
 
-def test_a_model_is_saved_as_it_was_opened(folder: Path, tmp_path: Path) -> None:
-    model = PretrainedWorldModel.from_pretrained(folder)
-    assert (model.info.kind, model.training) == ("stage2", False)
-    model.save_pretrained(tmp_path / "one")
-    for name in ("model.safetensors", "checkpoint.json"):
-        assert (tmp_path / "one" / name).read_bytes() == (folder / name).read_bytes()
-    model.save_pretrained(tmp_path / "many", max_shard_bytes=8_000)
-    assert len(list((tmp_path / "many").glob("model-*.safetensors"))) > 2
-    again = PretrainedWorldModel.from_pretrained(tmp_path / "many", expect_kind="stage2")
-    assert all(torch.equal(value, again.state_dict()[name]) for name, value in model.state_dict().items())
-    with pytest.raises(CheckpointError, match="wrong kind"):
-        PretrainedWorldModel.from_pretrained(folder, expect_kind="causal")
-    with pytest.raises(CheckpointError, match="no description to save"):
-        PretrainedWorldModel(model.config).save_pretrained(tmp_path / "none")
-    main(["card", str(folder), "--license", "apache-2.0"])
-    card = (folder / "run" / "card" / "README.md").read_text()
-    assert "license: apache-2.0" in card
-    assert "Of the weights: apache-2.0." in card
-
-
 def test_the_card_says_what_the_manifest_and_the_description_say(tmp_path: Path, folder: Path) -> None:
     store = tmp_path / "artifacts"
     trained, filtered, curated = (store / step / "0" for step in ("train_stage2", "filter", "curate"))
@@ -68,15 +48,15 @@ def test_the_card_says_what_the_manifest_and_the_description_say(tmp_path: Path,
     environment = {"packages": {"torch": "2.11"}}
     inputs = {"episodes": {"path": "filter/0", "digest": "2"}}
     write_manifest(trained, {"step": "train_stage2", "version": 1, "inputs": inputs, "environment": environment})
-    PretrainedWorldModel.from_pretrained(trained).save_pretrained(tmp_path / "out")
-    card = (tmp_path / "out" / "README.md").read_text()
+    main(["card", str(trained), "--license", "apache-2.0"])
+    card = (trained / "run" / "card" / "README.md").read_text()
     assert card.startswith("---\nlibrary_name: worldline\n")
     for said in (
-        "A Stage II model", "source agibot: 2 episodes, licence CC-BY-NC-SA-4.0", "source galaxea: 1 episodes, licence not stated",
-        "steps: 20, seed 0", "- loss: 0.25", "- sigma_px_ref: 40.0", "- fps: 8.0", "torch 2.11", "Of the weights: not stated",
+        "license: apache-2.0", "source agibot: 2 episodes, licence CC-BY-NC-SA-4.0", "source galaxea: 1 episodes, licence not stated",
+        "steps: 20, seed 0", "- loss: 0.25", "- sigma_px_ref: 40.0", "- fps: 8.0", "torch 2.11", "Of the weights: apache-2.0",
     ):  # fmt: skip
         assert said in card
-    results = ModelCard.load(tmp_path / "out" / "README.md").data.eval_results
+    results = ModelCard.load(trained / "run" / "card" / "README.md").data.eval_results
     assert ("loss", 0.25) in [(found.metric_type, found.metric_value) for found in results]
 
 
@@ -92,8 +72,8 @@ def test_the_card_reads_nothing_outside_of_the_store(tmp_path: Path, folder: Pat
     folder.rename(trained)
     place = str(outside) if absolute else "../outside"
     write_manifest(trained, {"step": "train_stage2", "inputs": {"episodes": {"path": place, "digest": "1"}}})
-    PretrainedWorldModel.from_pretrained(trained).save_pretrained(tmp_path / "out")
-    assert "private" not in (tmp_path / "out" / "README.md").read_text()
+    main(["card", str(trained)])
+    assert "private" not in (trained / "run" / "card" / "README.md").read_text()
 
 
 def test_the_hub_gives_the_same_model_and_nothing_that_could_run(hub: Hub, folder: Path) -> None:
@@ -102,8 +82,7 @@ def test_the_hub_gives_the_same_model_and_nothing_that_could_run(hub: Hub, folde
     publish(hub, folder)
     found = pretrained_folder("ORG/NAME")
     assert sorted(path.name for path in found.iterdir()) == ["checkpoint.json", "model.safetensors"]
-    model = PretrainedWorldModel.from_pretrained("ORG/NAME", revision="main")
-    here = PretrainedWorldModel.from_pretrained(folder)
+    model, here = load_checkpoint(found)[0], load_checkpoint(folder)[0]
     assert all(torch.equal(value, here.state_dict()[name]) for name, value in model.state_dict().items())
     assert hub.tokens == {"hf_test"}
     assert not any(path.endswith((".bin", ".py")) for _, path in hub.requests if "resolve" in path)
@@ -133,18 +112,16 @@ def test_without_the_hub_it_is_said_what_to_do(
     with pytest.raises(
         UnavailableError, match=r"(?s)hub does not give this model.*ORG/OTHER.*next step: check the name"
     ):
-        PretrainedWorldModel.from_pretrained("ORG/OTHER")
-    PretrainedWorldModel.from_pretrained("ORG/NAME")
+        pretrained_folder("ORG/OTHER")
+    pretrained_folder("ORG/NAME")
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
-    PretrainedWorldModel.from_pretrained("ORG/NAME")  # of the local cache
+    pretrained_folder("ORG/NAME")  # of the local cache
     with pytest.raises(UnavailableError, match=r"(?s)hub does not give this model.*ORG/UNSEEN.*offline"):
-        PretrainedWorldModel.from_pretrained("ORG/UNSEEN")
+        pretrained_folder("ORG/UNSEEN")
     with pytest.raises(CheckpointError, match="No model here"):
-        PretrainedWorldModel.from_pretrained(tmp_path / "nothing")
+        pretrained_folder(tmp_path / "nothing")
     with pytest.raises(CheckpointError, match="No model here"):
-        PretrainedWorldModel.from_pretrained("three/part/name")
-    with pytest.raises(ConfigError, match="no revisions"):
-        PretrainedWorldModel.from_pretrained(folder, revision="main")
+        pretrained_folder("three/part/name")
 
 
 def test_a_damaged_repository_is_refused(hub: Hub, folder: Path) -> None:
@@ -152,4 +129,4 @@ def test_a_damaged_repository_is_refused(hub: Hub, folder: Path) -> None:
     content, large = repository.files["model.safetensors"]
     repository.files["model.safetensors"] = (content[:-1], large)
     with pytest.raises(CheckpointError, match="not those that are described"):
-        PretrainedWorldModel.from_pretrained("ORG/NAME")
+        load_checkpoint(pretrained_folder("ORG/NAME"))

@@ -164,7 +164,7 @@ def test_a_decoder_of_another_tokenizer_or_a_damaged_one_is_refused(patch: Patch
         SmallDecoder.load(tmp_path / "b", patch, name)
     content["config"]["width"] = 0
     description.write_text(json.dumps(content))
-    with pytest.raises(CheckpointError, match="config is not valid"):
+    with pytest.raises(CheckpointError, match="not valid"):
         SmallDecoder.load(tmp_path / "b", patch, name)
 
 

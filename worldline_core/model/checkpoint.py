@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -32,81 +32,63 @@ MAX_SHARD_BYTES = 5_000_000_000
 _AGAIN = "fetch the folder again; what makes a checkpoint here writes its description last"
 
 
-def write_weights(
-    path: Path, tensors: Mapping[str, Tensor], max_shard_bytes: int = MAX_SHARD_BYTES, dtype: torch.dtype | None = None
-) -> str:
-    """Write ``path``, or, above ``max_shard_bytes``, ``NAME-00001-of-0000N.safetensors`` and so on with an index.
+def write_weights(path: Path, tensors: Mapping[str, Tensor], dtype: torch.dtype) -> str:
+    """Write ``path``, or, above `MAX_SHARD_BYTES`, ``NAME-00001-of-0000N.safetensors`` and so on with an index.
 
-    Equal tensors give equal bytes. They are cast to ``dtype`` file by file. Files of an earlier, larger or smaller write of
-    the same name are removed.
+    Equal tensors give equal bytes. They are cast file by file. Files of an earlier write of the same name are removed.
 
     Returns:
         SHA-256 of the one file, or of the index.
     """
-    sizes = {name: tensors[name].numel() * (dtype or tensors[name].dtype).itemsize for name in sorted(tensors)}
-    shards = _shards(sizes, max_shard_bytes)
-    index = path.with_name(path.name + INDEX_SUFFIX)
-    kept = {path.name}
-    if len(shards) == 1:
-        content = _content(tensors, shards[0], dtype)
-        write_bytes_atomic(path, content)
-        digest = hashlib.sha256(content).hexdigest()
-    else:
-        weight_map: dict[str, str] = {}
-        digests: dict[str, str] = {}
-        for number, names in enumerate(shards, start=1):
-            name = f"{path.stem}-{number:05d}-of-{len(shards):05d}{path.suffix}"
-            content = _content(tensors, names, dtype)
-            write_bytes_atomic(path.with_name(name), content)
-            digests[name] = hashlib.sha256(content).hexdigest()
-            weight_map |= dict.fromkeys(names, name)
-        write_json_atomic(
-            index, {"metadata": {"total_size": sum(sizes.values()), "sha256": digests}, "weight_map": weight_map}
-        )
-        digest = hashlib.sha256(index.read_bytes()).hexdigest()
-        kept = {index.name, *digests}
-    for old in (path, index, *path.parent.glob(f"{path.stem}-*-of-*{path.suffix}")):
-        if old.name not in kept:
-            old.unlink(missing_ok=True)
-    return digest
-
-
-def _content(tensors: Mapping[str, Tensor], names: Sequence[str], dtype: torch.dtype | None) -> bytes:
-    """A file of some tensors. Those that share memory are copied: a file holds each."""
-    return save({name: tensors[name].detach().to("cpu", dtype).contiguous().clone() for name in names})
-
-
-def _shards(sizes: Mapping[str, int], most: int) -> list[list[str]]:
-    """Names of the tensors of each file, in order; a tensor above ``most`` bytes has a file of its own."""
     shards: list[list[str]] = [[]]
-    size = 0
-    for name, own in sizes.items():
-        if shards[-1] and size + own > most:
+    size = total = 0
+    for name in sorted(tensors):
+        own = tensors[name].numel() * dtype.itemsize
+        if shards[-1] and size + own > MAX_SHARD_BYTES:
             shards.append([])
             size = 0
         shards[-1].append(name)
-        size += own
-    return shards
+        size, total = size + own, total + own
+    files = {path.name: shards[0]}
+    if len(shards) > 1:
+        places = enumerate(shards, start=1)
+        files = {f"{path.stem}-{n:05d}-of-{len(shards):05d}{path.suffix}": names for n, names in places}
+    digests: dict[str, str] = {}
+    for file, names in files.items():
+        # Clones: tensors that share memory are in every file.
+        content = save({name: tensors[name].detach().to("cpu", dtype).contiguous().clone() for name in names})
+        write_bytes_atomic(path.with_name(file), content)
+        digests[file] = hashlib.sha256(content).hexdigest()
+    digest, index = digests.get(path.name, ""), path.with_name(path.name + INDEX_SUFFIX)
+    if len(shards) > 1:
+        weight_map = {name: file for file, names in files.items() for name in names}
+        write_json_atomic(index, {"metadata": {"total_size": total, "sha256": digests}, "weight_map": weight_map})
+        digest = digest_file(index)
+        digests[index.name] = digest
+    for old in (path, index, *path.parent.glob(f"{path.stem}-*-of-*{path.suffix}")):
+        if old.name not in digests:
+            old.unlink(missing_ok=True)
+    return digest
 
 
 def read_weights(path: Path, sha256: str | None) -> dict[str, Tensor]:
     """The tensors of a safetensors file, or of those that its index names where ``path`` itself is not there.
 
     Args:
-        sha256: digest that the description gives, of the file or of the index; None where it gives none.
+        sha256: digest of the file or of the index; None: not known.
 
     Raises:
         CheckpointError: a file is missing or damaged, or holds other weights; the index names a file outside of the folder,
             or disagrees with the files. The message names the file.
     """
     index = path.with_name(path.name + INDEX_SUFFIX)
-    if path.is_file() or not index.is_file():
-        if not path.is_file():
-            raise CheckpointError(
-                "The checkpoint has no weights", where=path, expected=f"{path.name}, or {index.name} and its files",
-                next_step=_AGAIN,
-            )  # fmt: skip
+    if path.is_file():
         return _read(path, sha256)
+    if not index.is_file():
+        raise CheckpointError(
+            "The checkpoint has no weights", where=path, expected=f"{path.name}, or {index.name} and its files",
+            next_step=_AGAIN,
+        )  # fmt: skip
     content = index.read_bytes()
     _check_digest(index, hashlib.sha256(content).hexdigest(), sha256)
     tensors: dict[str, Tensor] = {}
@@ -125,7 +107,7 @@ def read_weights(path: Path, sha256: str | None) -> dict[str, Tensor]:
 
 
 def _indexed(index: Path, content: bytes) -> Iterator[tuple[Path, set[str], str | None]]:
-    """Each file of an index, with the tensors that it holds and its digest where that is stated.
+    """Each file of an index, with its tensors and its digest where that is stated.
 
     Raises: CheckpointError when the index is damaged, or names something else than a file beside it.
     """
@@ -184,11 +166,10 @@ SINGLE_PRECISION = ("time_embedder.",)
 
 
 class CheckpointInfo(StrictModel):
-    """The content of ``checkpoint.json``, read strictly.
+    """The content of ``checkpoint.json``.
 
     Attributes:
         action_contract: meaning of the action maps in training; None for models that have seen none.
-        causal: blocks, window and nodes of a block-causal model.
         trained: views and strides of the clips that it was trained on; None: all views, at stride 1.
         metadata: where it comes from; nothing is computed from it.
     """
@@ -225,11 +206,7 @@ class CheckpointInfo(StrictModel):
 
     @property
     def contract(self) -> ActionContract:
-        """The action contract of a model that takes actions.
-
-        Raises:
-            CheckpointError: it has none.
-        """
+        """The action contract. Raises: CheckpointError when the model takes no actions."""
         if self.action_contract is None:
             raise CheckpointError("The model takes no actions", expected="a Stage II or causal model", got=self.kind)
         return self.action_contract
@@ -246,13 +223,8 @@ def save_checkpoint(
     metadata: Mapping[str, Any] | None = None,
     dtype: torch.dtype = CHECKPOINT_DTYPE,
     state_dict: Mapping[str, Tensor] | None = None,
-    max_shard_bytes: int = MAX_SHARD_BYTES,
 ) -> None:
-    """Write a model. Equal weights and metadata give equal bytes.
-
-    Args:
-        max_shard_bytes: weights above this go into several files with an index.
-        state_dict: weights to store instead of the model's own (an averaged copy).
+    """Write a model, or ``state_dict`` (an averaged copy) in its place. Equal weights and metadata give equal bytes.
 
     Raises:
         CheckpointError: the kind is unknown or lacks its contract, or a weight is not finite in ``dtype``.
@@ -263,7 +235,8 @@ def save_checkpoint(
             raise CheckpointError(
                 "A weight is not finite", where=name, next_step=f"it may overflow {dtype}; check training"
             )
-    info = _checked(
+    info = described(
+        CheckpointInfo,
         {
             "kind": kind,
             "config": model.config,
@@ -274,12 +247,12 @@ def save_checkpoint(
             "dtype": str(dtype).removeprefix("torch."),
             "weights_sha256": "",
         },
-        where=folder,
+        folder,
     )
     # The description goes last: until then the folder is no checkpoint.
-    digest = write_weights(folder / WEIGHTS, source, max_shard_bytes, dtype)
-    described = info.model_copy(update={"weights_sha256": digest}).model_dump(mode="json")
-    write_json_atomic(folder / DESCRIPTION, {"format": FORMAT, "version": VERSION, **described})
+    digest = write_weights(folder / WEIGHTS, source, dtype)
+    stated = info.model_copy(update={"weights_sha256": digest}).model_dump(mode="json")
+    write_json_atomic(folder / DESCRIPTION, {"format": FORMAT, "version": VERSION, **stated})
 
 
 def read_checkpoint_info(folder: Path) -> CheckpointInfo:
@@ -289,24 +262,11 @@ def read_checkpoint_info(folder: Path) -> CheckpointInfo:
         CheckpointError: the file is missing, damaged, of another format, or lacks a field; the message names it.
     """
     path = folder / DESCRIPTION
-    content = read_description(path, FORMAT, "checkpoint", version=VERSION)
-    return _checked({key: value for key, value in content.items() if key not in ("format", "version")}, where=path)
+    content = read_description(path, FORMAT, "checkpoint", VERSION)
+    return described(CheckpointInfo, {k: v for k, v in content.items() if k not in ("format", "version")}, path)
 
 
-def _checked(content: Mapping[str, Any], *, where: object) -> CheckpointInfo:
-    try:
-        return CheckpointInfo.model_validate(content)
-    except ValidationError as error:
-        problems = [f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}" for problem in error.errors()]
-        raise CheckpointError(
-            "The checkpoint description is not valid",
-            where=where,
-            got="; ".join(problems),
-            next_step="train it again with this version",
-        ) from error
-
-
-def load_checkpoint[Model: WorldModel](
+def load_checkpoint(
     folder: Path,
     *,
     expect_kind: CheckpointKind | tuple[CheckpointKind, ...] | None = None,
@@ -314,12 +274,10 @@ def load_checkpoint[Model: WorldModel](
     action_frames: Literal[1, 4] | None = None,
     dtype: torch.dtype = torch.float32,
     weights: bool = True,
-    model_class: Callable[[WorldModelConfig], Model] = WorldModel,
-) -> tuple[Model, CheckpointInfo]:
+) -> tuple[WorldModel, CheckpointInfo]:
     """Build the model and fill it; nothing may be missing, left over, or of another shape.
 
     Args:
-        model_class: what is built.
         expect_kind: kind or kinds the caller can use.
         towers: ``generation`` drops the understanding tower of a checkpoint that has it; None keeps what is stored.
         action_frames: control frames per latent frame that the model shall take. Those that the checkpoint does not
@@ -327,7 +285,7 @@ def load_checkpoint[Model: WorldModel](
         weights: False gives an empty model (on the meta device), for a process that gets its weights from another one.
 
     Raises:
-        CheckpointError: anything that does not fit, saying what was expected and what was found.
+        CheckpointError: anything that does not fit, with what was expected.
     """
     info = read_checkpoint_info(folder)
     kinds = (expect_kind,) if isinstance(expect_kind, str) else expect_kind
@@ -350,36 +308,28 @@ def load_checkpoint[Model: WorldModel](
             got=action_frames,
             next_step=f"set action_frames to {config.action_frames}, or start from another checkpoint",
         )
-    if not weights:
-        with torch.device("meta"):
-            model = model_class(config)
-            if action_frames not in (None, config.action_frames) and MAPS_IN in model.state_dict():
-                model = model_class(config.model_copy(update={"action_frames": action_frames}))
-        return model, info
-    path = folder / WEIGHTS
-    tensors = read_weights(path, info.weights_sha256)
-    if action_frames not in (None, config.action_frames) and MAPS_IN in tensors:
-        added = (action_frames - config.action_frames) * config.action_channels * config.patch_size**2
-        tensors[MAPS_IN] = torch.nn.functional.pad(tensors[MAPS_IN], (0, added))
+    widened = action_frames is not None and action_frames != config.action_frames
+    if widened and config.action_conditioning == "maps":
         config = config.model_copy(update={"action_frames": action_frames})
-    if config.towers == "generation":
-        tensors = {name: tensor for name, tensor in tensors.items() if not is_text_parameter(name)}
     with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
-        model = model_class(config)
-    fill(model, tensors, where=path, dtype=dtype)
+        model = WorldModel(config)
+    if weights:
+        path = folder / WEIGHTS
+        tensors = read_weights(path, info.weights_sha256)
+        if widened and MAPS_IN in tensors:
+            added = (config.action_frames - info.config.action_frames) * config.action_channels * config.patch_size**2
+            tensors[MAPS_IN] = torch.nn.functional.pad(tensors[MAPS_IN], (0, added))
+        if config.towers == "generation":
+            tensors = {name: tensor for name, tensor in tensors.items() if not is_text_parameter(name)}
+        fill(model, tensors, where=path, dtype=dtype)
     return model, info
 
 
-def read_description(path: Path, form: str, noun: str, *, version: int | None = None) -> dict[str, Any]:
-    """The JSON object that describes some weights.
-
-    Args:
-        form: what its ``format`` must say.
-        noun: what it describes, for messages.
-        version: what its ``version`` must be, where it has one.
+def read_description(path: Path, form: str, noun: str, version: int) -> dict[str, Any]:
+    """The JSON object that describes some weights (``noun``).
 
     Raises:
-        CheckpointError: it is missing, damaged, or of another format or version.
+        CheckpointError: it is missing, damaged, or of another ``format`` or ``version``.
     """
     if not path.is_file():
         raise CheckpointError(f"No {noun} here", where=path.parent, expected=f"a folder with {path.name}")
@@ -388,24 +338,28 @@ def read_description(path: Path, form: str, noun: str, *, version: int | None = 
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"The {noun} description is not JSON", where=path, got=str(error)) from error
     found = (content.get("format"), content.get("version")) if isinstance(content, dict) else type(content)
-    if not isinstance(content, dict) or found != (form, version):
+    if found != (form, version):
         raise CheckpointError(f"Not a {noun} of this version", where=path, expected=(form, version), got=found)
     return content
 
 
-def described[M: BaseModel](model: type[M], values: object, what: str, path: Path) -> M:
+def described[M: BaseModel](model: type[M], values: object, where: object) -> M:
     """Values of a description as a model. Raises: CheckpointError where they are not valid."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise CheckpointError(f"{what} is not valid", where=path, got=str(error)) from error
+        problems = [f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}" for problem in error.errors()]
+        raise CheckpointError(
+            "The description of the weights is not valid", where=where, got="; ".join(problems),
+            next_step="train it again with this version",
+        ) from error  # fmt: skip
 
 
 def fill(model: torch.nn.Module, tensors: Mapping[str, Tensor], *, where: object, dtype: torch.dtype) -> None:
     """Load ``tensors`` into ``model`` in ``dtype``, strictly; each takes the parameter's place as soon as it is cast.
 
-    ``model`` may be on the meta device: then nothing takes memory but the weights themselves, in ``dtype``. Embedders of
-    the noise level stay in float32, as they are computed.
+    ``model`` may be on the meta device: then nothing takes memory but the weights themselves. Embedders of the noise level
+    stay in float32, as they are computed.
 
     Raises:
         CheckpointError: keys are missing or left over, a shape differs, or values are not finite floating-point numbers.

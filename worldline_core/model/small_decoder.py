@@ -192,8 +192,8 @@ class SmallDecoder(nn.Module):
             CheckpointError: the folder holds none, or a damaged one, or one for latents of another tokenizer.
         """
         path, weights = folder / DESCRIPTION, folder / WEIGHTS
-        content = read_description(path, FORMAT, "decoder", version=VERSION)
-        config = described(SmallDecoderConfig, content.get("config"), "The decoder's config", path)
+        content = read_description(path, FORMAT, "decoder", VERSION)
+        config = described(SmallDecoderConfig, content.get("config"), path)
         layout = {"tokenizer": fingerprint, **{name: getattr(tokenizer, name) for name in _LAYOUT}}
         found = {name: getattr(config, name) for name in layout}
         if found != layout:
@@ -214,8 +214,8 @@ class SmallDecoder(nn.Module):
         """
         size, path = dict[str, int](), folder / DESCRIPTION
         if path.is_file():
-            content = read_description(path, FORMAT, "decoder", version=VERSION)
-            config = described(SmallDecoderConfig, content.get("config"), "The decoder's config", path)
+            content = read_description(path, FORMAT, "decoder", VERSION)
+            config = described(SmallDecoderConfig, content.get("config"), path)
             size = {"width": config.width, "depth": config.depth}
         return cls(SmallDecoderConfig.of(tokenizer, "", **size), tokenizer).eval().requires_grad_(False)
 

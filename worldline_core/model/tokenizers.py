@@ -379,10 +379,10 @@ class PatchTokenizer(nn.Module):
             CheckpointError: the description is damaged, or of another kind.
         """
         path = folder / DESCRIPTION
-        content = read_description(path, FORMAT, "tokenizer", version=VERSION)
+        content = read_description(path, FORMAT, "tokenizer", VERSION)
         if content.get("kind") != cls.KIND:
             raise CheckpointError("Unknown kind of tokenizer", where=path, expected=cls.KIND, got=content.get("kind"))
-        tokenizer = cls(described(PatchTokenizerConfig, content.get("config"), "The tokenizer's config", path))
+        tokenizer = cls(described(PatchTokenizerConfig, content.get("config"), path))
         tokenizer.weights_sha256 = content["weights_sha256"]
         return tokenizer.eval().requires_grad_(False)
 
