@@ -1,14 +1,12 @@
 """How often the calibration check names a mistake, and how large a camera error it sees: both injected into healthy recordings.
 
-    python benchmarks/calibration.py mistakes [--splits test,ood_test] [--every 1] [--imperfect] [--without-mounts]
-    python benchmarks/calibration.py cameras [--every 2] [--seeds 0,1] [--imperfect]
+    python benchmarks/calibration.py mistakes [--splits test,ood_test] [--every 1]
+    python benchmarks/calibration.py cameras [--every 2] [--seeds 0,1]
 
 Recordings with an injected defect (injected_defects.json) are left out.
 
 - `mistakes`: every usual mistake, one at a time. Quaternion, Euler, pose unit and tool offset are injected into the same
-  episodes rewritten as tool poses by forward kinematics. `--without-mounts` withholds the wrist cameras' stated mounts;
-  `--imperfect` disturbs the recordings as careful calibration would; `--typical` prints what healthy episodes reach, the
-  origin of the typical values of `CalibrationDoctorConfig` (use it on the training split only).
+  episodes rewritten as tool poses by forward kinematics.
 - `cameras`: one view at a time with an error of growing size, in a direction that the seed chooses, the same in all
   episodes of a seed. For single episodes and for sources of 20: errors found, the kind they were named by, and the
   error that could have gone unseen (median bound). The first rows are false alarms on healthy recordings.
@@ -16,7 +14,6 @@ Recordings with an injected defect (injected_defects.json) are left out.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections import Counter, defaultdict
@@ -39,16 +36,14 @@ from worldline_core.calibration.camera_errors import (
     significant,
 )
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, diagnose_source
-from worldline_core.calibration.doctor_config import CalibrationDoctorConfig
 from worldline_core.calibration.evidence import MIN_IMAGE_PAIRS
 from worldline_core.calibration.observation import Observation, observe, read, small_gray
 from worldline_core.data.episodes.conventions import RecordedConventions, applicable
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.filters.filter_config import FilterDoctorConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, quaternion_xyzw_from_rotation
+from worldline_core.geometry.transforms import quaternion_xyzw_from_rotation
 
 LAGS = (-4, -3, -2, -1, 1, 2, 3, 4)
 OFFSETS_M = (-0.1, -0.06, -0.03, 0.03, 0.06, 0.1, 0.15)
@@ -93,51 +88,13 @@ def as_tool_poses(episode: Episode, kinematics: ArmKinematics) -> Episode:
     )
 
 
-def without_mounts(kinematics: ArmKinematics) -> ArmKinematics:
-    """The robot without the mounts of its wrist cameras."""
-    embodiment = kinematics.embodiment
-    arms = tuple(
-        arm.model_copy(update={"wrist_camera": arm.wrist_camera and arm.wrist_camera.model_copy(update={"link": ""})})
-        for arm in embodiment.arms
-    )
-    stripped = object.__new__(ArmKinematics)
-    stripped.__dict__.update(kinematics.__dict__)
-    stripped.embodiment = embodiment.model_copy(update={"arms": arms})
-    return stripped
-
-
-def imperfect(episode: Episode, seed: int) -> Episode:
-    """The episode calibrated to millimetres, as a careful laboratory would have it.
-
-    Camera mounts off by 5 mm and 1 degree and unsteady by 1 mm and 0.2 degrees, fixed cameras off by 10 mm and 1 degree,
-    focal lengths by 1.5 %, principal points by 1 % of the image, joints noisy by 0.002 rad (standard deviations).
-    """
-    random = np.random.default_rng(seed)
-
-    def disturbed(poses: np.ndarray, metres: float, degrees: float, count: int) -> np.ndarray:
-        angles = random.normal(0, np.radians(degrees) / np.sqrt(3), (count, 3))
-        return poses @ pose_from_euler_fixed_xyz(random.normal(0, metres / np.sqrt(3), (count, 3)), angles)
-
-    cameras = {}
-    for view, camera in episode.cameras.items():
-        poses = disturbed(camera.T_base_camera, *((0.005, 1.0) if camera.moving else (0.01, 1.0)), 1)
-        if camera.moving:
-            poses = disturbed(poses, 0.001, 0.2, len(poses))
-        K = camera.K.copy()
-        K[[0, 1], [0, 1]] *= 1 + random.normal(0, 0.015)
-        K[:2, 2] += random.normal(0, 0.01, 2) * (camera.width, camera.height)
-        cameras[view] = replace(camera, K=K, T_base_camera=poses)
-    state = episode.state + random.normal(0, 0.002, episode.state.shape).astype(np.float32)
-    return replace(episode, cameras=cameras, state=state)
-
-
-def healthy(root: Path, splits: set[str], every: int, disturb: bool) -> Iterator[Healthy]:
+def healthy(root: Path, splits: set[str], every: int) -> Iterator[Healthy]:
     episodes = EpisodeSet.open(root)
     defects = json.loads((root / "injected_defects.json").read_text())
     chosen = [i for i, row in enumerate(episodes.rows) if row.split in splits and row.episode_id not in defects]
     kinematics: dict[str, ArmKinematics] = {}
     for i in chosen[::every]:
-        episode = imperfect(episodes.episode(i), i) if disturb else episodes.episode(i)
+        episode = episodes.episode(i)
         if episode.embodiment not in kinematics:
             kinematics[episode.embodiment] = ArmKinematics(load_embodiment(episode.embodiment))
         robot = kinematics[episode.embodiment]
@@ -182,15 +139,11 @@ def injected(episode: Healthy, choice: int) -> Iterator[tuple[str, Episode, Reco
             yield name, base, conventions
 
 
-def examine(
-    episode: Healthy, base: Episode, conventions: RecordedConventions, config: CalibrationDoctorConfig, mounts: bool
-) -> Diagnosis:
+def examine(episode: Healthy, base: Episode, conventions: RecordedConventions, *, quick: bool = False) -> Diagnosis:
     """Diagnosis of a healthy episode, `base` as joints or tool poses, after these conventions have spoiled it."""
     images = corrupted_image_frames(base.num_frames, conventions)
     gray = {view: values[images] for view, values in episode.gray.items()}
-    return diagnose(
-        corrupt(base, conventions), gray, episode.kinematics if mounts else without_mounts(episode.kinematics), config
-    )
+    return diagnose(corrupt(base, conventions), gray, episode.kinematics, quick=quick)
 
 
 def named(diagnosis: Conclusion) -> str:
@@ -208,23 +161,17 @@ def right(name: str, conventions: RecordedConventions, found: str, value: Record
     return True
 
 
-def measure_mistakes(items: Iterator[Healthy], arguments: argparse.Namespace) -> None:
-    config = CalibrationDoctorConfig()
-    wanted = {name for name in arguments.mistakes.split(",") if name}
+def measure_mistakes(items: Iterator[Healthy]) -> None:
     confusion: dict[str, Counter[str]] = defaultdict(Counter)
     correct: dict[str, list[bool]] = defaultdict(list)
     sets: dict[tuple[str, str], list[Diagnosis]] = defaultdict(list)
     truth: dict[tuple[str, str], RecordedConventions] = {}
-    lag_errors: dict[str, list[float]] = defaultdict(list)
-    healthy_values: dict[str, list[float]] = defaultdict(list)
     spent, count = 0.0, 0
     unobservable: Counter[str] = Counter()
     for number, episode in enumerate(items):
         for name, base, conventions in injected(episode, number):
-            if wanted and name not in wanted:
-                continue
             start = time.process_time()
-            diagnosis = examine(episode, base, conventions, config, not arguments.without_mounts)
+            diagnosis = examine(episode, base, conventions)
             spent, count = spent + time.process_time() - start, count + 1
             found = named(diagnosis)
             if not observable(name, episode, diagnosis):
@@ -232,42 +179,14 @@ def measure_mistakes(items: Iterator[Healthy], arguments: argparse.Namespace) ->
                 continue
             confusion[name][found] += 1
             correct[name].append(right(name, conventions, found, diagnosis.best.conventions))
-            if found == name and name.endswith("lag_frames"):
-                lag_errors[name].append(getattr(diagnosis.best.conventions, name) - getattr(conventions, name))
-            if arguments.typical and name.startswith("none"):
-                collect_typical(name, diagnosis, healthy_values)
             if not (conventions.departures and conventions.departures[0] in NUMBERED):
                 # Numbered mistakes vary over episodes here, while a source has one value.
                 sets[name, episode.joints.embodiment].append(diagnosis)
                 truth[name, episode.joints.embodiment] = conventions
     set_correct: dict[str, list[bool]] = defaultdict(list)
     for (name, embodiment), diagnoses in sets.items():
-        summed = diagnose_source(embodiment, diagnoses, config)
+        summed = diagnose_source(embodiment, diagnoses)
         set_correct[name].append(right(name, truth[name, embodiment], named(summed), summed.best.conventions))
-    report(confusion, correct, set_correct, lag_errors)
-    for case, times in unobservable.items():
-        print(f"not observable in the recording, not counted: {case} ({times})")
-    print(f"{count} diagnoses, {spent / max(count, 1) * 1e3:.0f} ms of CPU each")
-    for name, values in healthy_values.items():
-        low, middle, high = np.percentile(values, [5, 50, 95])
-        print(f"{name}: 5 % {low:.2f}, median {middle:.2f}, 95 % {high:.2f}, max {max(values):.2f} (n = {len(values)})")
-
-
-def collect_typical(name: str, diagnosis: Diagnosis, values: dict[str, list[float]]) -> None:
-    """Margins of the rival readings of a healthy episode, and the flow of each view."""
-    for mistake, score in {e.mistake: e.score for e in reversed(diagnosis.ranked)}.items():
-        values[f"{name}: margin of {mistake}"].append(score - diagnosis.as_recorded.score)
-    for view, measures in diagnosis.measures.items():
-        if "flow" in measures:
-            values[f"{name}: {'wrist' if view.endswith('wrist') else 'fixed'} flow"].append(measures["flow"])
-
-
-def report(
-    confusion: dict[str, Counter[str]],
-    correct: dict[str, list[bool]],
-    set_correct: dict[str, list[bool]],
-    lag_errors: dict[str, list[float]],
-) -> None:
     rows = []
     for name, found in confusion.items():
         sources = f"{100 * np.mean(set_correct[name]):.0f} %" if set_correct.get(name) else ""
@@ -275,16 +194,9 @@ def report(
         others = ", ".join(f"{k} {v}" for k, v in found.most_common() if k not in accepted)
         rows.append((name, found.total(), f"{100 * np.mean(correct[name]):.1f} %", sources, others))
     print_table(("injected", "episodes", "right", "right over sources", "found instead"), rows)
-    mistakes = [value for name, values in correct.items() if not name.startswith("none") for value in values]
-    clean = [value for name, values in correct.items() if name.startswith("none") for value in values]
-    if mistakes:
-        print(f"mistakes named correctly: {100 * np.mean(mistakes):.2f} % of {len(mistakes)}")
-    if clean:
-        print(f"false alarms: {100 * (1 - np.mean(clean)):.2f} % of {len(clean)}")
-    for name, errors in lag_errors.items():
-        print(
-            f"{name}: {100 * np.mean(np.abs(errors) <= 1):.1f} % within one frame, largest error {np.abs(errors).max()}"
-        )
+    for case, times in unobservable.items():
+        print(f"not observable in the recording, not counted: {case} ({times})")
+    print(f"{count} diagnoses, {spent / max(count, 1) * 1e3:.0f} ms of CPU each")
 
 
 # Errors of one camera
@@ -321,25 +233,22 @@ def errors(seed: int, view: str) -> Iterator[tuple[str, float, np.ndarray]]:
             yield name, size, theta
 
 
-def count(
-    tally: Tally, kind: str, episodes: Sequence[tuple[CameraError, ...]], config: CalibrationDoctorConfig, seed: int
-) -> None:
+def count(tally: Tally, kind: str, episodes: Sequence[tuple[CameraError, ...]], seed: int) -> None:
     """Add what is found in single episodes, and in sources drawn from them."""
     for residuals in episodes:
-        tally.alone.append(bool(significant(residuals, config.off_alone)))
+        tally.alone.append(bool(significant(residuals)))
         tally.unseen_alone += [r.bound for r in residuals if r.kind == kind]
     random = np.random.default_rng(seed)
     for _ in range(DRAWS):
         drawn = random.choice(len(episodes), min(TOGETHER, len(episodes)), replace=False)
         residuals = combine([episodes[i] for i in drawn])
-        off = significant(residuals, config.off_together)
+        off = significant(residuals, together=True)
         tally.together.append(bool(off))
         tally.named.update(residual.kind for residual in off)
         tally.unseen_together += [r.bound for r in residuals if r.kind == kind]
 
 
 def measure_cameras(items: Sequence[Healthy], seeds: Sequence[int]) -> None:
-    config = CalibrationDoctorConfig()
     observations = [observe(item.joints, item.gray, item.kinematics) for item in items]
 
     def estimated(observed: Observation) -> tuple[CameraError, ...]:
@@ -356,31 +265,17 @@ def measure_cameras(items: Sequence[Healthy], seeds: Sequence[int]) -> None:
             of_view = [tuple(r for r in clean[i] if r.view == view) for i in shown]
             for kind in ("rotation", "focal length"):
                 tally = Tally()
-                count(tally, kind, of_view, config, 0)
+                count(tally, kind, of_view, 0)
                 yield row(f"{view}: healthy, {kind}", tally)
             tallies: dict[str, Tally] = defaultdict(Tally)
             for seed in seeds:
                 for kind, size, theta in errors(seed, view):
                     found = [estimated(spoiled(observations[i], view, theta)) for i in shown]
-                    count(tallies[f"{view}: {kind} {size:g} {ERROR_KINDS[kind].unit}"], kind, found, config, seed)
+                    count(tallies[f"{view}: {kind} {size:g} {ERROR_KINDS[kind].unit}"], kind, found, seed)
             yield from (row(name, tally) for name, tally in tallies.items())
-        yield exchanged_wrist_videos(items)
 
     columns = ("error", "found in one episode", "unseen up to", "found in 20", "unseen up to", "named")
     print_table(columns, rows())
-
-
-def exchanged_wrist_videos(items: Sequence[Healthy]) -> tuple[str, ...]:
-    """Row of exchanged wrist videos, examined as the filter does."""
-    found = []
-    for item in items:
-        views = [arm.camera_view for arm in item.kinematics.embodiment.arms]
-        if len(views) == 2:
-            gray = item.gray | {one: item.gray[two] for one, two in (views, views[::-1])}
-            found.append(diagnose(item.joints, gray, item.kinematics, FilterDoctorConfig()))
-    alone = np.mean([diagnosis.best.mistake == "wrist_videos" for diagnosis in found])
-    together = diagnose_source("exchanged", found).best.mistake
-    return "wrist videos exchanged", f"{100 * alone:.0f} % of {len(found)}", "", f"all together: {together}", "", ""
 
 
 def row(name: str, tally: Tally) -> tuple[str, ...]:
@@ -401,15 +296,11 @@ def main() -> None:
     parser.add_argument("--recordings", type=Path, default=RECORDINGS)
     parser.add_argument("--splits", default="test,ood_test")
     parser.add_argument("--every", type=int, default=1)
-    parser.add_argument("--imperfect", action="store_true", help="disturb the healthy calibration by millimetres first")
     parser.add_argument("--seeds", default="0,1", help="cameras: directions of the errors")
-    parser.add_argument("--mistakes", default="", help="mistakes: these only, comma-separated")
-    parser.add_argument("--without-mounts", action="store_true", help="mistakes: without stated wrist camera mounts")
-    parser.add_argument("--typical", action="store_true", help="mistakes: print what healthy episodes reach")
     arguments = parser.parse_args()
-    shipped = healthy(arguments.recordings, set(arguments.splits.split(",")), arguments.every, arguments.imperfect)
+    shipped = healthy(arguments.recordings, set(arguments.splits.split(",")), arguments.every)
     if arguments.what == "mistakes":
-        measure_mistakes(shipped, arguments)
+        measure_mistakes(shipped)
         return
     measure_cameras(list(shipped), [int(seed) for seed in arguments.seeds.split(",")])
 

@@ -109,7 +109,6 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     check.add_argument(
         "--output", type=Path, help="where pictures and diagnoses.json go (default: artifacts/calibration/<name>)"
     )
-    check.add_argument("--no-pictures", action="store_false", dest="pictures", help="draw nothing")
     check.add_argument("--json", action="store_true", help="print JSON instead of the table")
     check.set_defaults(run=_calibrate_check)
 
@@ -263,7 +262,6 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
             overrides=arguments.overrides,
             episodes=arguments.episodes,
             output=arguments.output,
-            pictures=arguments.pictures,
         )
     except WorldLineError as error:
         # 1 says that something was found; what cannot be checked at all is another status.

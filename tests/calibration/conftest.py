@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pytest
 
+from benchmarks import calibration as benchmark
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 
 COUNT, HEIGHT, WIDTH, FPS = 24, 60, 80, 10.0
@@ -64,23 +60,9 @@ def images() -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="session")
-def benchmark(project_root: Path) -> ModuleType:
-    """The benchmark's injection, so that tests and benchmark measure the same."""
-    spec = importlib.util.spec_from_file_location(
-        "calibration_benchmark", project_root / "benchmarks" / "calibration.py"
-    )
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="session")
-def healthy(benchmark: ModuleType) -> list:
+def healthy() -> list:
     """One episode of each robot of the test splits."""
     found: dict[str, object] = {}
-    for item in benchmark.healthy(benchmark.RECORDINGS, {"test", "ood_test"}, 4, False):
+    for item in benchmark.healthy(benchmark.RECORDINGS, {"test", "ood_test"}, 4):
         found.setdefault(item.joints.embodiment, item)
     return list(found.values())

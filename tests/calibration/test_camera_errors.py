@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+from benchmarks import calibration as benchmark
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.camera_errors import (
     ERROR_KINDS,
@@ -23,31 +21,25 @@ from worldline_core.calibration.camera_errors import (
     moved_camera,
     significant,
 )
-from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck, conclusion_lines, verdict_text
+from worldline_core.calibration.check_report import (
+    CalibrationCheck,
+    EpisodeCheck,
+    conclusion_lines,
+    diagnosis_picture,
+    verdict_text,
+)
 from worldline_core.calibration.diagnosis import Diagnosis, diagnose_source
-from worldline_core.calibration.doctor_config import CalibrationDoctorConfig
 from worldline_core.calibration.observation import Motion
-from worldline_core.calibration.pictures import diagnosis_picture, headline
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.filters.calibration import detect_mistake
 from worldline_core.filters.filter_config import FilterDoctorConfig
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
-QUICK = FilterDoctorConfig()
-CONFIG = CalibrationDoctorConfig()
-
 
 @pytest.fixture(scope="module")
-def healthy(project_root: Path) -> list:
+def healthy() -> list[benchmark.Healthy]:
     """Twenty-two episodes of the test splits, of all robots."""
-    path = project_root / "benchmarks" / "calibration.py"
-    spec = importlib.util.spec_from_file_location("calibration_for_camera_errors", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module: ModuleType = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return list(module.healthy(module.RECORDINGS, {"test", "ood_test"}, 2, False))
+    return list(benchmark.healthy(benchmark.RECORDINGS, {"test", "ood_test"}, 2))
 
 
 def spoiled(episode: Episode, view: str, kind: str, *sizes: float) -> Episode:
@@ -57,8 +49,8 @@ def spoiled(episode: Episode, view: str, kind: str, *sizes: float) -> Episode:
     return replace(episode, cameras={**episode.cameras, view: moved_camera(episode.cameras[view], theta)})
 
 
-def quickly(item: object, episode: Episode) -> Diagnosis:
-    return diagnose(episode, item.gray, item.kinematics, QUICK)  # type: ignore[attr-defined]
+def quickly(item: benchmark.Healthy, episode: Episode) -> Diagnosis:
+    return diagnose(episode, item.gray, item.kinematics, quick=True)
 
 
 def estimated(diagnosis: Diagnosis, view: str, kind: str) -> CameraError:
@@ -124,7 +116,7 @@ def test_five_degrees_and_a_wrong_focal_length_are_found_in_one_episode(healthy:
     assert [residual.view for residual in turned.off] == ["head"]
     assert estimated(turned, "head", "rotation").estimate[1] == pytest.approx(-5.0, abs=1.5)
     assert verdict_text(turned).startswith("off: head ")
-    assert "±" in headline(turned)
+    assert "±" in verdict_text(turned)
     scaled = quickly(item, spoiled(item.joints, "head", "focal length", 15.0))
     assert scaled.verdict == "off"
     assert estimated(scaled, "head", "focal length").estimate[0] == pytest.approx(-13.0, abs=6.0)
@@ -138,10 +130,12 @@ def test_five_degrees_and_a_wrong_focal_length_are_found_in_one_episode(healthy:
 def test_the_filter_says_which_camera_is_off(healthy: list) -> None:
     item = healthy[4]
     bad = np.zeros(item.joints.num_frames, dtype=bool)
-    found = detect_mistake(spoiled(item.joints, "head", "rotation", 0.0, 5.0, 0.0), item.gray, bad, QUICK)
+    found = detect_mistake(
+        spoiled(item.joints, "head", "rotation", 0.0, 5.0, 0.0), item.gray, bad, FilterDoctorConfig()
+    )
     assert (found.passed, found.reason) == (False, "calibration")
     assert str(found.numbers["off"]).startswith("head ")
-    clean = detect_mistake(item.joints, item.gray, bad, QUICK)
+    clean = detect_mistake(item.joints, item.gray, bad, FilterDoctorConfig())
     assert clean.passed
     unseen = clean.numbers["head rotation unseen up to"]
     assert isinstance(unseen, float)
@@ -154,7 +148,7 @@ def test_two_degrees_are_found_in_twenty_episodes_and_healthy_ones_are_bounded(h
     clean = [quickly(item, item.joints) for item in healthy]
     assert len(clean) >= 20
     assert np.mean([d.verdict == "consistent" for d in clean]) >= 0.95
-    found = diagnose_source("source", clean, QUICK)
+    found = diagnose_source("source", clean)
     assert found.verdict == "consistent"
     bounds = {residual.kind: residual.bound for residual in found.camera_errors if residual.view == "head"}
     assert bounds["rotation"] < 3
@@ -165,7 +159,7 @@ def test_two_degrees_are_found_in_twenty_episodes_and_healthy_ones_are_bounded(h
     assert "head within: rotation " in said
     for sizes in ((2.0, 0.0, 0.0), (0.0, -2.0, 0.0)):
         turned = diagnose_source(
-            "source", [quickly(item, spoiled(item.joints, "head", "rotation", *sizes)) for item in healthy], QUICK
+            "source", [quickly(item, spoiled(item.joints, "head", "rotation", *sizes)) for item in healthy]
         )
         assert turned.verdict == "off"
         assert {residual.view for residual in turned.off} == {"head"}
@@ -186,15 +180,15 @@ def test_many_episodes_say_more_than_one_and_a_broken_one_does_not_speak_for_the
     (alone,) = episode(3.5)
     assert together.half_interval < alone.half_interval / 2
     assert together.bound < alone.bound
-    assert significant([together], CONFIG.off_together) == (together,)
-    assert significant([alone], CONFIG.off_alone) == ()
+    assert significant([together], together=True) == (together,)
+    assert significant([alone]) == ()
     (spoiled_by_one,) = combine([episode(value) for value in (*values, 300.0)])
     assert spoiled_by_one.estimate == pytest.approx(together.estimate, abs=1.0)
 
 
 def test_without_pictures_no_bound_is_claimed(healthy: list) -> None:
     item = healthy[0]
-    diagnosis = diagnose(item.poses, {}, item.kinematics, QUICK)
+    diagnosis = diagnose(item.poses, {}, item.kinematics, quick=True)
     assert diagnosis.camera_errors == ()
     assert verdict_text(diagnosis) == "consistent, but no picture says within what"
 
@@ -204,9 +198,9 @@ def test_exchanged_wrist_videos_are_found(healthy: list) -> None:
     for item in healthy[8:16:2]:
         left, right = (arm.camera_view for arm in item.kinematics.embodiment.arms)
         exchanged = {**item.gray, left: item.gray[right], right: item.gray[left]}
-        found.append(diagnose(item.joints, exchanged, item.kinematics, QUICK))
+        found.append(diagnose(item.joints, exchanged, item.kinematics, quick=True))
     assert sum(d.best.mistake == "wrist_videos" for d in found) >= 3
-    together = diagnose_source("source", found, QUICK)
+    together = diagnose_source("source", found)
     assert (together.verdict, together.best.other) == ("explained", ("wrist_videos", "exchanged"))
     named = next(d for d in found if d.best.mistake == "wrist_videos")
     assert any("exchange the two where the source is written" in note for note in named.notes)

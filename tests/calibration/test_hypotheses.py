@@ -5,19 +5,18 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import yaml
 
+from benchmarks import calibration as benchmark
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.calibration import calibration_doctor
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.check import ListedEpisode, check_command, repairing_lines
 from worldline_core.calibration.check_report import table_text
 from worldline_core.calibration.diagnosis import Diagnosis, diagnose_source
-from worldline_core.calibration.doctor_config import CalibrationDoctorConfig
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import LoadedEpisode
@@ -25,7 +24,6 @@ from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGe
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 
-CONFIG = CalibrationDoctorConfig()
 INVERSE = RecordedConventions(extrinsics="base_to_camera")
 
 
@@ -35,7 +33,7 @@ def of_robot(healthy: list, name: str):
 
 def declared_as(item, name: str) -> Diagnosis:
     kinematics = ArmKinematics(load_embodiment(name))
-    return diagnose(replace(item.joints, embodiment=name), item.gray, kinematics, CONFIG)
+    return diagnose(replace(item.joints, embodiment=name), item.gray, kinematics)
 
 
 def with_exchanged_extrinsics(episode: Episode) -> Episode:
@@ -64,7 +62,7 @@ def test_another_robot_than_declared_is_named(healthy: list, truth: str, declare
     robot = item.joints.embodiment
     assert (diagnosis.verdict, diagnosis.best.other) == ("explained", ("embodiment", robot))
     assert any(f"fits {robot}, not the declared {declared}" in note for note in diagnosis.notes)
-    together = diagnose_source("source", [diagnosis, diagnosis], CONFIG)
+    together = diagnose_source("source", [diagnosis, diagnosis])
     assert (together.verdict, together.best.text) == ("explained", f"embodiment: {robot}")
     listed = ListedEpisode("e", "source", lambda: None, "curate.sources[1].conventions", declares_robot=True)  # type: ignore[arg-type,return-value]
     assert repairing_lines(listed, together.best) == (f"curate.sources[1].embodiment: {robot}",)
@@ -78,41 +76,39 @@ def test_a_reading_that_leaves_the_recording_ill_does_not_win(healthy: list, mon
     assert diagnosis.verdict == "unexplained"
     assert "angle_unit: deg" in diagnosis.nearest[0]
     assert "still wrong hand-eye" in diagnosis.nearest[0]
-    together = diagnose_source("source", [diagnosis] * 3, CONFIG)
+    together = diagnose_source("source", [diagnosis] * 3)
     assert (together.verdict, together.best.mistake) == ("unexplained", "none")
     assert any("angle_unit: deg: healthy in 0 of 3 episodes" in near for near in together.nearest)
 
 
 def test_flange_poses_do_not_turn_the_wrist_cameras(shared_data: Path) -> None:
     loaded = agibot(shared_data, "agibot_gesim", tool_offset_v1_m=0.0)
-    diagnoses = [diagnose(item.episode, pictures(item), None, CONFIG) for item in loaded]
+    diagnoses = [diagnose(item.episode, pictures(item), None) for item in loaded]
     assert {diagnosis.verdict for diagnosis in diagnoses} == {"unexplained"}
     assert all("camera_axes: opengl" in diagnosis.nearest[0] for diagnosis in diagnoses)
-    together = diagnose_source("agibot", diagnoses, CONFIG)
+    together = diagnose_source("agibot", diagnoses)
     assert together.verdict == "unexplained"
     assert "healthy in 0 of 2 episodes" in together.nearest[0]
 
 
 def test_exchanged_wrist_extrinsics_are_not_exchanged_arms(healthy: list) -> None:
     item = of_robot(healthy, "ur5e")
-    diagnosis = diagnose(with_exchanged_extrinsics(item.joints), item.gray, item.kinematics, CONFIG)
+    diagnosis = diagnose(with_exchanged_extrinsics(item.joints), item.gray, item.kinematics)
     assert (diagnosis.verdict, diagnosis.best.other) == ("explained", ("wrist_extrinsics", "exchanged"))
     assert any("exchange the two where the source is written" in note for note in diagnosis.notes)
     arms = corrupt(item.joints, RecordedConventions(arms="exchanged"))
-    assert diagnose(arms, item.gray, item.kinematics, CONFIG).best.mistake == "arms"
+    assert diagnose(arms, item.gray, item.kinematics).best.mistake == "arms"
 
 
 def test_what_nothing_recorded_tells_apart_is_not_claimed(shared_data: Path) -> None:
     """Without pictures and kinematics either the arms or the cameras may be exchanged."""
     loaded = agibot(shared_data, "agibot_gesim")
     exchanged = [with_exchanged_extrinsics(item.episode) for item in loaded]
-    diagnoses = [
-        diagnose(episode, pictures(item), None, CONFIG) for episode, item in zip(exchanged, loaded, strict=True)
-    ]
+    diagnoses = [diagnose(episode, pictures(item), None) for episode, item in zip(exchanged, loaded, strict=True)]
     for diagnosis in diagnoses:
         assert diagnosis.verdict == "unexplained"
         assert any("equally well" in note and "wrist_extrinsics: exchanged" in note for note in diagnosis.notes)
-    together = diagnose_source("agibot", diagnoses, CONFIG)
+    together = diagnose_source("agibot", diagnoses)
     assert together.verdict == "unexplained"
     assert {near.split(": ")[0] for near in together.nearest} >= {"arms", "wrist_extrinsics"}
 
@@ -125,27 +121,27 @@ def test_inverse_and_late(healthy: list, late: str) -> None:
     conventions = INVERSE.model_copy(update={"camera_lag_frames": lags[0], "image_lag_frames": lags[1]})
     images = corrupted_image_frames(item.joints.num_frames, conventions)
     gray = {view: values[images] for view, values in item.gray.items()}
-    diagnosis = diagnose(corrupt(item.joints, conventions), gray, item.kinematics, CONFIG)
+    diagnosis = diagnose(corrupt(item.joints, conventions), gray, item.kinematics)
     assert (diagnosis.verdict, diagnosis.best.conventions) == ("explained", conventions)
-    together = diagnose_source("source", [diagnosis] * 2, CONFIG)
+    together = diagnose_source("source", [diagnosis] * 2)
     assert (together.verdict, together.best.conventions) == ("explained", conventions)
 
 
 @pytest.mark.slow
-def test_one_good_and_one_bad_episode_prescribe_nothing_for_both(benchmark: ModuleType, healthy: list) -> None:
+def test_one_good_and_one_bad_episode_prescribe_nothing_for_both(healthy: list) -> None:
     good, bad = of_robot(healthy, "xarm7"), of_robot(healthy, "ur5e")
-    fine = diagnose(good.joints, good.gray, good.kinematics, CONFIG)
+    fine = diagnose(good.joints, good.gray, good.kinematics)
     mistakes: list[dict[str, object]] = [
         {"image_lag_frames": 3},
         {"extrinsics": "base_to_camera"},
     ]
     for mistake in mistakes:
-        wrong = benchmark.examine(bad, bad.joints, RecordedConventions.model_validate(mistake), CONFIG, True)
+        wrong = benchmark.examine(bad, bad.joints, RecordedConventions.model_validate(mistake))
         assert (fine.verdict, wrong.verdict) == ("consistent", "explained")
-        together = diagnose_source("source", [fine, wrong], CONFIG)
+        together = diagnose_source("source", [fine, wrong])
         assert (together.verdict, together.best.mistake) == ("mixed", "none")
-        assert diagnose_source("source", [fine] * 10 + [wrong], CONFIG).verdict == "consistent"
-        assert diagnose_source("source", [fine] + [wrong] * 10, CONFIG).best.mistake == next(iter(mistake))
+        assert diagnose_source("source", [fine] * 10 + [wrong]).verdict == "consistent"
+        assert diagnose_source("source", [fine] + [wrong] * 10).best.mistake == next(iter(mistake))
 
 
 def test_what_the_cameras_may_follow_is_printed(shared_data: Path, tmp_path: Path) -> None:
@@ -154,7 +150,7 @@ def test_what_the_cameras_may_follow_is_printed(shared_data: Path, tmp_path: Pat
     source = {"kind": "agibot_gesim", "path": str(shared_data / "agibot_gesim_v2"), "fps": 30}
     config.write_text(yaml.safe_dump({"curate": {"sources": [source]}}))
     episode = "agibot_gesim_v2-assets-demo_000"
-    check = check_command(config, None, episodes=[episode], output=tmp_path / "out", pictures=False)
+    check = check_command(config, None, episodes=[episode], output=tmp_path / "out")
     printed = table_text(check)
     assert "curate.sources[0].conventions.camera_lag_frames: -2" in printed
     assert "they may follow the commands: give the kinematics to see" in printed

@@ -1,7 +1,7 @@
-"""The calibration doctor: whether a recording's calibration agrees with itself and with its pictures, and if not, why.
+"""The calibration doctor: does a recording's calibration agree with itself and with its pictures, and if not, why?
 
 Bottom to top: `observation` measures an episode and reads it under given conventions; `evidence` scores a reading;
 `camera_errors` estimates the error of each camera; `diagnosis` decides, for an episode and for the sum over a source;
 `calibration_doctor` searches the usual mistakes; `check` does this for all episodes of a source (`worldline calibrate
-check`), with `check_report` and `pictures`.
+check`), and `check_report` shows it.
 """

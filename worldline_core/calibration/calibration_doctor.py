@@ -15,16 +15,14 @@ import numpy as np
 from worldline_core.calibration.camera_errors import estimate_camera_errors
 from worldline_core.calibration.diagnosis import (
     COMPLEXITY,
-    DEFAULT_CONFIG,
+    MIN_MARGIN,
     SUSPICION,
-    CalibrationDoctorConfig,
+    TERM_LIMITS,
     Diagnosis,
     Explanation,
     bad_terms,
     decide,
     nearest_texts,
-    term_limits,
-    with_camera_errors,
 )
 from worldline_core.calibration.evidence import (
     MIN_IMAGE_PAIRS,
@@ -32,14 +30,11 @@ from worldline_core.calibration.evidence import (
     gripper_terms,
     hand_eye_log_likelihood,
     image_terms,
-    in_view_share,
     inversion_gain,
     observable_views,
     pose_terms,
     rms_hand_eye,
-    still_view_agreement,
     stopped_share,
-    wrist_flow_agreement,
 )
 from worldline_core.calibration.observation import Observation, Reading, arms_of, observe, read
 from worldline_core.data.episodes.conventions import RecordedConventions, applicable
@@ -79,13 +74,15 @@ def diagnose(
     episode: Episode,
     frames: Mapping[str, Iterable[np.ndarray]],
     kinematics: ArmKinematics | None,
-    config: CalibrationDoctorConfig = DEFAULT_CONFIG,
+    *,
+    quick: bool = False,
 ) -> Diagnosis:
     """Whether an episode's calibration is consistent and, if not, the usual mistake that explains it.
 
     Args:
         frames: images by view, uint8 (H, W, 3) RGB or (h, w) grey, gone through once; views without images are judged by poses.
         kinematics: of the embodiment; None where unknown (tool poses must then be recorded).
+        quick: try other readings only if the recorded one looks suspicious.
 
     Raises:
         DataError: images or kinematics do not fit the episode.
@@ -96,21 +93,21 @@ def diagnose(
     if recorded is None or not episode.cameras:
         missing = "tool poses (no kinematics for its joints)" if recorded is None else "camera calibration"
         notes = (f"The recording has no {missing}: nothing can be compared",)
-        return Diagnosis(verdict="too_little_evidence", notes=notes, episode_id=name, measures={})
-    search = _Search(observation, recorded, config)
-    if config.search == "when_suspicious" and (quick := search.unsuspicious()) is not None:
-        quickly = Diagnosis(verdict="consistent", best=quick, ranked=(quick,), episode_id=name, measures={})
-        return with_camera_errors(quickly, estimate_camera_errors(observation, recorded), config.off_alone)
+        return Diagnosis(verdict="too_little_evidence", notes=notes, episode_id=name)
+    search = _Search(observation, recorded)
+    if quick and (unsuspicious := search.unsuspicious()) is not None:
+        diagnosis = Diagnosis(verdict="consistent", best=unsuspicious, ranked=(unsuspicious,), episode_id=name)
+        return diagnosis.with_camera_errors(estimate_camera_errors(observation, recorded))
     as_recorded = search.as_recorded
     notes = notes_on(observation, recorded)
     ranked = sorted([as_recorded, *search.singles()], key=lambda e: -e.score)
-    if bad_terms(as_recorded, config):
+    if bad_terms(as_recorded):
         if search.is_suspicious(ranked[0]):
-            beating = [pair for pair in search.pairs(ranked) if pair.score > ranked[0].score + config.min_margin]
+            beating = [pair for pair in search.pairs(ranked) if pair.score > ranked[0].score + MIN_MARGIN]
             ranked = sorted([*ranked, *beating], key=lambda e: -e.score)
-        if bad_terms(ranked[0], config, as_recorded):
+        if bad_terms(ranked[0], as_recorded):
             ranked = sorted([*ranked, *search.other_robots()], key=lambda e: -e.score)
-    verdict, best, rivals = decide(as_recorded, ranked, config)
+    verdict, best, rivals = decide(as_recorded, ranked)
     if rivals:
         notes = (*notes, f"These explain it equally well, nothing recorded tells which: {'; '.join(rivals)}")
     if best.other is not None:
@@ -121,33 +118,20 @@ def diagnose(
     if verdict == "consistent" and travel < MIN_TRAVEL_M and not observable_views(observation):
         verdict = "too_little_evidence"
         notes = (*notes, "No tool moves and no picture changes: a mistake would leave no trace")
+    nearest = nearest_texts(ranked, as_recorded) if verdict == "unexplained" else ()
     diagnosis = Diagnosis(
-        verdict=verdict,
-        best=best,
-        ranked=tuple(ranked),
-        notes=notes,
-        nearest=nearest_texts(ranked, as_recorded, config) if verdict == "unexplained" else (),
-        episode_id=name,
-        measures={view: measures_of(observation, recorded, view) for view in recorded.cameras},
+        verdict=verdict, best=best, ranked=tuple(ranked), notes=notes, nearest=nearest, episode_id=name
     )
     reading = search.read(best.conventions) if best.other is None else None
-    if reading is None:
-        return diagnosis
-    return with_camera_errors(diagnosis, estimate_camera_errors(observation, reading), config.off_alone)
+    return diagnosis if reading is None else diagnosis.with_camera_errors(estimate_camera_errors(observation, reading))
 
 
 class _Search:
     """One episode, read under the usual mistakes; every reading is scored."""
 
-    def __init__(self, observation: Observation, recorded: Reading, config: CalibrationDoctorConfig) -> None:
-        self.observation, self.recorded, self.config = observation, recorded, config
+    def __init__(self, observation: Observation, recorded: Reading) -> None:
+        self.observation, self.recorded = observation, recorded
         self.recorded_poses = pose_terms(observation, recorded)
-
-    @classmethod
-    def as_written(cls, observation: Observation, config: CalibrationDoctorConfig) -> _Search | None:
-        """The search in a recording as written; None where no tool poses are known."""
-        recorded = read(observation, RecordedConventions())
-        return None if recorded is None else cls(observation, recorded, config)
 
     def terms(self, reading: Reading, poses: Mapping[str, float] | None = None) -> dict[str, float]:
         """All evidence of a reading; `poses` where its pose terms are known, since image lags do not change them."""
@@ -173,7 +157,7 @@ class _Search:
         observation = self.observation
         images = image_terms(observation, self.recorded, wrist_flow=False)
         found = self.explain(self.recorded, {**self.recorded_poses, **images})
-        if min(self.recorded_poses.values(), default=0.0) < SUSPICION or bad_terms(found, self.config):
+        if min(self.recorded_poses.values(), default=0.0) < SUSPICION or bad_terms(found):
             return None
         if inversion_gain(observation, self.recorded) > 0:
             return None
@@ -231,9 +215,12 @@ class _Search:
         if (videos := self.observation.with_exchanged_wrists()) is not None:
             observations["wrist_videos"] = videos
         for name, observation in observations.items():
-            other = _Search.as_written(observation, self.config)
-            if other is not None:
-                yield self.explain(other.recorded, dict(other.as_recorded.evidence), (name, "exchanged"))
+            yield from self.as_written(observation, (name, "exchanged"))
+
+    def as_written(self, observation: Observation, other: tuple[str, str]) -> Iterator[Explanation]:
+        """The reading of another observation as written; none where no tool poses are known."""
+        if (reading := read(observation, RecordedConventions())) is not None:
+            yield self.explain(reading, _Search(observation, reading).terms(reading), other)
 
     def other_robots(self) -> Iterator[Explanation]:
         """The recording as written, with the other robots that have the same arms, if it has joints.
@@ -249,9 +236,8 @@ class _Search:
                 continue
             episode = replace(observation.episode, embodiment=name)
             arms = arms_of(episode, robot)
-            other = _Search.as_written(replace(observation, episode=episode, arms=arms, kinematics=robot), self.config)
-            if other is not None:
-                found = self.explain(other.recorded, dict(other.as_recorded.evidence), ("embodiment", name))
+            other = replace(observation, episode=episode, arms=arms, kinematics=robot)
+            for found in self.as_written(other, ("embodiment", name)):
                 unknown = sum(v for term, v in self.as_recorded.evidence.items() if term not in found.evidence)
                 yield replace(found, score=found.score + unknown)
 
@@ -275,9 +261,8 @@ class _Search:
 
     def is_suspicious(self, explanation: Explanation) -> bool:
         """Whether a reading leaves anything suspicious."""
-        limits = term_limits(self.config)
         return any(
-            value < SUSPICION and limits.get(name.split(" ")[0], 0.0) > -np.inf
+            value < SUSPICION and TERM_LIMITS.get(name.split(" ")[0], 0.0) > -np.inf
             for name, value in explanation.evidence.items()
         )
 
@@ -454,21 +439,6 @@ def tool_offset(observation: Observation, recorded: Reading) -> float | None:
         return None
     offset = float(np.median(offsets))
     return offset if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None
-
-
-def measures_of(observation: Observation, recorded: Reading, view: str) -> dict[str, float]:
-    """The measures of a view, as in `Diagnosis`."""
-    camera, arm = recorded.cameras[view], observation.wrists.get(view)
-    measures = {"in_view": in_view_share(recorded, camera)}
-    seen = view in observable_views(observation)
-    if arm is not None:
-        poses = camera.poses(np.arange(len(recorded.tools)))
-        _, measures["hand_eye_m"], measures["hand_eye_deg"] = rms_hand_eye(recorded.tools[:, arm], poses)
-        if seen:
-            measures["flow"] = wrist_flow_agreement(observation, recorded, view)
-    elif seen:
-        measures["flow"] = still_view_agreement(observation, recorded, view)[0]
-    return measures
 
 
 def notes_on(observation: Observation, recorded: Reading) -> tuple[str, ...]:

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from worldline_core.calibration.doctor_config import ErrorLimits
 from worldline_core.calibration.evidence import MIN_CHANGE, MIN_TEXTURE, observable_views
 from worldline_core.calibration.observation import CELL_PX, Motion, Observation, Reading, cell_centres, cell_means
 from worldline_core.data.episodes.episode import CameraTrack
@@ -46,6 +45,8 @@ COARSE_CELLS, FINE_CELLS = 1.5, 0.7
 """Blur of the coarse and of the fine maps, in cells."""
 SHAPE_UNKNOWN = 12.0
 """Factor on the uncertainty of the robot's shape without joints: the arm behind the hand is unknown."""
+DEVIATIONS_ALONE, DEVIATIONS_TOGETHER = 5.0, 3.0
+"""Standard deviations from zero of a significant error, of one episode and of a source."""
 SIMILAR_GAIN = 0.5
 """Kinds of error with at least this share of the best gain are indistinguishable."""
 OUTLIER_DEVIATIONS = 3.0
@@ -428,6 +429,7 @@ class ErrorKind:
         near: beyond this size the coarse maps are solved first.
         shared_still, shared_wrist: standard deviation of the error common to all episodes of a source, because the robot's
             shape is simplified and flow is measured too short.
+        off_alone, off_together: smallest size to be reported, of one episode and of all episodes of a source.
     """
 
     parameters: slice
@@ -439,6 +441,8 @@ class ErrorKind:
     near: float
     shared_still: float
     shared_wrist: float
+    off_alone: float
+    off_together: float
 
     def solved(self, equations: Equations, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Information (k, k) on these parameters, and the step (k,) to their best values."""
@@ -449,11 +453,11 @@ class ErrorKind:
 
 
 ERROR_KINDS = {
-    "rotation": ErrorKind(slice(0, 3), "deg", 180 / np.pi, 15.0, 3.0, 1.2, 1.5, 0.35, 1.5),
-    "translation": ErrorKind(slice(3, 6), "mm", 1e3, 300.0, 30.0, 25.0, 30.0, 10.0, 50.0),
-    "focal length": ErrorKind(slice(6, 7), "%", 1e2, 30.0, 5.0, 0.7, 4.0, 0.5, 4.0),
-    "principal point": ErrorKind(slice(7, 9), "%", 1e2, 20.0, 2.0, 2.0, 2.5, 0.7, 3.0),
-    "lag": ErrorKind(slice(9, 10), "frames", 1.0, 3.0, 1.0, 0.3, 0.3, 0.08, 0.2),
+    "rotation": ErrorKind(slice(0, 3), "deg", 180 / np.pi, 15.0, 3.0, 1.2, 1.5, 0.35, 1.5, 3.5, 1.25),
+    "translation": ErrorKind(slice(3, 6), "mm", 1e3, 300.0, 30.0, 25.0, 30.0, 10.0, 50.0, 80.0, 25.0),
+    "focal length": ErrorKind(slice(6, 7), "%", 1e2, 30.0, 5.0, 0.7, 4.0, 0.5, 4.0, 9.0, 2.2),
+    "principal point": ErrorKind(slice(7, 9), "%", 1e2, 20.0, 2.0, 2.0, 2.5, 0.7, 3.0, 7.0, 2.0),
+    "lag": ErrorKind(slice(9, 10), "frames", 1.0, 3.0, 1.0, 0.3, 0.3, 0.08, 0.2, 0.6, 0.3),
 }
 
 
@@ -532,13 +536,19 @@ def combine(episodes: Sequence[Sequence[CameraError]]) -> tuple[CameraError, ...
     return tuple(found)
 
 
-def significant(errors: Sequence[CameraError], limits: ErrorLimits) -> tuple[CameraError, ...]:
+def significant(errors: Sequence[CameraError], *, together: bool = False) -> tuple[CameraError, ...]:
     """At most one certain and large error for each view: among the kinds that explain its pictures about equally well, the
-    smallest against its usual size."""
+    smallest against its usual size.
+
+    Args:
+        together: the errors are those of a source, not of one episode.
+    """
     found: dict[str, list[CameraError]] = {}
+    deviations = DEVIATIONS_TOGETHER if together else DEVIATIONS_ALONE
     for error in errors:
-        large = error.size > getattr(limits, error.kind.replace(" ", "_")) and error.gain > 0
-        if large and error.deviations > limits.deviations:
+        kind = ERROR_KINDS[error.kind]
+        large = error.size > (kind.off_together if together else kind.off_alone) and error.gain > 0
+        if large and error.deviations > deviations:
             found.setdefault(error.view, []).append(error)
     off = []
     for kinds in found.values():

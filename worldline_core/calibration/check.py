@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck, as_json, page
+from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck, as_json, diagnosis_picture, page
 from worldline_core.calibration.diagnosis import Explanation, SourceDiagnosis, diagnose_source
-from worldline_core.calibration.pictures import diagnosis_picture
 from worldline_core.config import apply_overrides, read_yaml, validate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.episode_checks import check_camera, check_times, check_values
@@ -39,10 +38,6 @@ from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 logger = logging.getLogger(__name__)
 
-ADDITIVE = ("tool_offset_z_m", "camera_lag_frames", "image_lag_frames")
-"""Conventions that add up when they are declared and found again."""
-SELF_INVERSE = ("extrinsics", "camera_axes", "arms", "gripper")
-"""Conventions that undo themselves when applied twice."""
 OUTPUT_ROOT = Path("artifacts") / "calibration"
 TIME_TOLERANCE_FRAMES = 0.25
 
@@ -64,54 +59,16 @@ class ListedEpisode:
     declares_robot: bool = False
 
 
-def combined_conventions(declared: RecordedConventions, found: RecordedConventions) -> RecordedConventions:
-    """The declaration for a source in which `found` was seen after reading it with `declared`.
-
-    Raises:
-        ConfigError: no single declaration is equivalent, for example because the two are of different views.
-    """
-    if not declared.departures:
-        return found
-    if found.departures and declared.views != found.views:
-        raise ConfigError(
-            "Declared and found conventions are of different views",
-            expected=f"views {declared.views}",
-            got=f"views {found.views}",
-            next_step="remove the declared conventions and check again",
-        )
-    default, values = RecordedConventions(), declared.model_dump()
-    for name in found.departures:
-        was, now, contract = (getattr(item, name) for item in (declared, found, default))
-        if was == contract:
-            values[name] = now
-        elif name in ADDITIVE:
-            values[name] = was + now
-        elif name in SELF_INVERSE and was == now:
-            values[name] = contract
-        else:
-            raise ConfigError(
-                "A found convention cannot be declared on top of a declared one",
-                where=f"conventions.{name}",
-                expected=str(contract),
-                got=f"{was} is declared, and {now} was found",
-                next_step="remove the declared conventions and check again",
-            )
-    return RecordedConventions.model_validate(values)
-
-
 def repairing_lines(item: ListedEpisode, explanation: Explanation) -> tuple[str, ...]:
     """Lines for the source's configuration if the explanation holds; none for the recording as written, or where no line
-    repairs it.
-
-    Raises:
-        ConfigError: as `combined_conventions`.
-    """
+    repairs it."""
     if explanation.other is not None and explanation.other[0] == "embodiment" and item.declares_robot:
         return (f"{item.config_prefix.removesuffix('conventions')}{': '.join(explanation.other)}",)
     if explanation.other is not None or not explanation.departures:
         return ()
-    lines = combined_conventions(item.declared, explanation.conventions).config_lines(item.config_prefix)
-    return lines or (f"remove {item.config_prefix}",)
+    if item.declared.departures:
+        return (f"remove {item.config_prefix} and check again: beside them, {explanation.text} was found",)
+    return explanation.conventions.config_lines(item.config_prefix)
 
 
 def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[ListedEpisode], dict[str, str]]:
@@ -185,11 +142,8 @@ def check_calibration(
     output: Path,
     *,
     descriptions: Mapping[str, str] | None = None,
-    pictures: bool = True,
 ) -> CalibrationCheck:
-    """Diagnoses episodes one after another and writes the result.
-
-    An episode that cannot be read or judged is listed with its reason; the others are not touched by it.
+    """Diagnoses episodes one after another and writes the result; one that cannot be read or judged is listed with its reason.
 
     Raises:
         DataError: there are no episodes to check.
@@ -202,7 +156,7 @@ def check_calibration(
     with Progress("calibrate check", len(listed), "episode") as progress:
         for item in listed:
             try:
-                checked.append(_check_one(item, output, kinematics, pictures))
+                checked.append(_check_one(item, output, kinematics))
             except Exception as error:
                 if ends_the_run(error):
                     raise
@@ -216,7 +170,7 @@ def check_calibration(
     return check
 
 
-def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName, pictures: bool) -> EpisodeCheck:
+def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName) -> EpisodeCheck:
     try:
         loaded = item.load()
         episode = loaded.episode
@@ -232,18 +186,12 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName, 
         return EpisodeCheck(item.episode_id, item.source, None, error.reason, _one_line(error))
     except DataError as error:
         return EpisodeCheck(item.episode_id, item.source, None, "unreadable", _one_line(error))
-    lines: tuple[str, ...] = ()
+    picture: str | None = f"pictures/{safe_stem(diagnosis.episode_id)}.jpg"
     try:
-        lines = repairing_lines(item, diagnosis.best)
-    except ConfigError as error:
-        notes = (*notes, f"{error.what}: {error.next_step}")
-    picture = f"pictures/{safe_stem(diagnosis.episode_id)}.jpg" if pictures else None
-    if picture:
-        try:
-            drawn = diagnosis_picture(diagnosis, episode, frames, arms)
-            write_bytes_atomic(output / picture, jpeg_bytes(drawn))
-        except DataError as error:
-            picture, notes = None, (*notes, f"no picture: {error.what}")
+        write_bytes_atomic(output / picture, jpeg_bytes(diagnosis_picture(diagnosis, episode, frames, arms)))
+    except DataError as error:
+        picture, notes = None, (*notes, f"no picture: {error.what}")
+    lines = repairing_lines(item, diagnosis.best)
     return EpisodeCheck(item.episode_id, item.source, diagnosis, config_lines=lines, picture=picture, notes=notes)
 
 
@@ -287,10 +235,7 @@ def _sum_up(listed: Sequence[ListedEpisode], checked: Sequence[EpisodeCheck]) ->
         if len(diagnoses) < 2:
             continue
         summed = diagnose_source(source, diagnoses)
-        try:
-            yield replace(summed, config_lines=repairing_lines(of_source, summed.best))
-        except ConfigError as error:
-            yield replace(summed, notes=(*summed.notes, f"{error.what}: {error.next_step}"))
+        yield replace(summed, config_lines=repairing_lines(of_source, summed.best))
 
 
 def check_command(
@@ -300,7 +245,6 @@ def check_command(
     overrides: Sequence[str] = (),
     episodes: Sequence[str] = (),
     output: Path | None = None,
-    pictures: bool = True,
 ) -> CalibrationCheck:
     """Check the sources of a configuration file, or an EpisodeSet.
 
@@ -323,4 +267,4 @@ def check_command(
     else:
         raise ConfigError("Give a source's configuration file or an EpisodeSet", got=f"{config}, {artifact}")
     chosen = chosen_episodes(listed, episodes)
-    return check_calibration(chosen, output or OUTPUT_ROOT / name, descriptions=descriptions, pictures=pictures)
+    return check_calibration(chosen, output or OUTPUT_ROOT / name, descriptions=descriptions)

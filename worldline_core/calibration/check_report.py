@@ -1,20 +1,42 @@
-"""Results of a calibration check: a table for the terminal, JSON, and a page with a picture of every episode."""
+"""Results of a calibration check: a table for the terminal, JSON, and a page with a picture of every episode.
+
+A picture shows where the recorded calibration puts the tools, beside where a repaired reading puts them. Unlike action
+tracks, which let wrist cameras follow the kinematics, it uses the camera poses *as recorded*. The arms' outline is drawn
+into the head view (in a wrist view it would fill the picture): beside the arm it is the plainest sign of a wrong calibration.
+"""
 
 from __future__ import annotations
 
 import json
 import textwrap
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from markupsafe import Markup
 from pydantic import ConfigDict, TypeAdapter
 
+from worldline_core.actions.action_tracks import tracks_of_projection
+from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
+from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip, view_name
+from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
+from worldline_core.actions.tool_projection import project_tools
+from worldline_core.calibration.camera_errors import corrected_camera
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, SourceDiagnosis
+from worldline_core.data.episodes.conventions import along_tool_z, apply_conventions, image_frames
+from worldline_core.errors import DataError
 from worldline_core.pages.page import Table, render, words
+from worldline_core.pictures import INK, MUTED, Picture, SheetRow, contact_sheet, draw_tag, evenly_spaced, text_strip
+
+if TYPE_CHECKING:
+    from worldline_core.data.episodes.episode import Episode
+    from worldline_core.data.video.frames import Frames
+    from worldline_core.geometry.kinematics import ArmKinematics
 
 MEANINGS = {
     "unexplained": "the recording disagrees with its calibration, and under no usual mistake it agrees",
@@ -33,7 +55,9 @@ TONES = {
 COLUMNS = ("Episode", "Verdict", "Best explanation", "Score", "As recorded")
 DETAIL_LETTERS = 160
 """Length of an error in its line of the table; the page and diagnoses.json have all of it."""
-_READINGS_SHOWN, _GROUPS_SHOWN = 6, 12
+TILE_HEIGHT, MIN_WIDTH, MOMENTS = 256, 760, 3
+SIGMA_PX_REF = 18.0
+"""Wide enough to be seen at tile size, narrow enough to leave the gripper visible."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +66,7 @@ class EpisodeCheck:
 
     Attributes:
         reason: quarantine reason code of an episode that cannot be read, with `detail`; None for one that can.
-        config_lines: what the source's configuration must say, in place of what it says now.
+        config_lines: replacement lines for the source's configuration.
         picture: path relative to the output folder.
         notes: of the check itself, beside the diagnosis' own.
     """
@@ -80,7 +104,7 @@ class CalibrationCheck:
 
     @property
     def consistent(self) -> bool:
-        """Whether some episode is consistent, and nothing is wrong with any other."""
+        """True if some episode is consistent, and nothing is wrong with any other."""
         verdicts = {episode.verdict for episode in self.episodes}
         sound = not verdicts & {"off", "explained", "unexplained", "unreadable"}
         return sound and "consistent" in verdicts and all(s.verdict not in ("off", "explained") for s in self.sources)
@@ -93,10 +117,13 @@ class CalibrationCheck:
 
 
 def verdict_text(found: Conclusion) -> str:
-    """The verdict, with the camera that is off, or the largest turn of a camera that could have gone unseen."""
+    """The verdict, with the cameras that are off, or the largest turn of a camera that could have gone unseen."""
     if found.verdict == "off":
-        return f"off: {found.off[0]}"
-    return found.consistent_within if found.verdict == "consistent" else words(found.verdict)
+        return f"off: {', '.join(map(str, found.off))}"
+    if found.verdict != "consistent":
+        return words(found.verdict)
+    turns = [error.bound for error in found.camera_errors if error.kind == "rotation"]
+    return f"consistent within {max(turns):.1f} deg" if turns else "consistent, but no picture says within what"
 
 
 def table_text(check: CalibrationCheck) -> str:
@@ -115,13 +142,11 @@ def table_text(check: CalibrationCheck) -> str:
 
 
 def conclusion_lines(check: CalibrationCheck) -> list[str]:
-    """What all episodes say together."""
+    """Conclusions over each source, then over the episodes that these do not cover."""
     parts = [f"{count} {words(name)}" for name, count in check.counted.items()]
     lines = [f"{len(check.episodes)} episodes: {', '.join(parts)}"]
     for found in check.sources:
         lines += ["", source_headline(found), f"  single episodes say: {votes_text(found)}"]
-        lines += [f"  {caution}" for caution in cautions(found)]
-        lines += [f"  {error}" for error in found.off]
         for view in dict.fromkeys(error.view for error in found.camera_errors):
             bounds = [f"{e.kind} {e.bound:.1f} {e.unit}" for e in found.camera_errors if e.view == view]
             lines.append(f"  {view} within: {', '.join(bounds)}")
@@ -138,7 +163,7 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
 def _single_episodes(check: CalibrationCheck) -> list[str]:
     """Episodes that the conclusion over their source does not cover: what repairs them, or what comes nearest."""
     together = {found.source: found for found in check.sources}
-    groups: dict[tuple[str, ...], list[str]] = {}
+    lines = []
     for episode in check.episodes:
         found, diagnosis = together.get(episode.source), episode.diagnosis
         if diagnosis is None or diagnosis.verdict not in ("explained", "unexplained"):
@@ -146,21 +171,16 @@ def _single_episodes(check: CalibrationCheck) -> list[str]:
         if found is not None and (found.verdict, found.config_lines) == (diagnosis.verdict, episode.config_lines):
             continue
         notes = (*diagnosis.notes, *episode.notes) if found is None else ()  # else printed with the source
-        said = [f"note: {note}" for note in notes] + [f"near: {near}" for near in diagnosis.nearest]
-        groups.setdefault((*said, *episode.config_lines), []).append(episode.episode_id)
-    lines = ["", "single episodes (give those that differ a source of their own, by `include`):"] if groups else []
-    for group, names in list(groups.items())[:_GROUPS_SHOWN]:
-        lines.append(f"  {', '.join(names[:4])}{f' and {len(names) - 4} more' if len(names) > 4 else ''}:")
-        lines += [f"    {line}" for line in group]
-    if len(groups) > _GROUPS_SHOWN:
-        lines.append(f"  and more, all in {check.output / 'diagnoses.json'}")
-    return lines
+        lines += [f"  {episode.episode_id}:", *(f"    note: {note}" for note in notes)]
+        lines += [f"    near: {near}" for near in diagnosis.nearest]
+        lines += [f"    {line}" for line in episode.config_lines]
+    header = ["", "single episodes (give those that differ a source of their own, by `include`):"]
+    return [*header, *lines] if lines else []
 
 
 def source_headline(found: SourceDiagnosis) -> str:
     """The conclusion over a source in one line."""
-    score = f"score as recorded {found.as_recorded.score:.1f}"
-    said = verdict_text(found) if found.verdict == "consistent" else words(found.verdict)
+    score, said = f"score as recorded {found.as_recorded.score:.1f}", verdict_text(found)
     if found.verdict == "mixed":
         said += ": its episodes were not written the same way, no line is right for all of them"
     elif found.verdict == "explained":
@@ -170,46 +190,28 @@ def source_headline(found: SourceDiagnosis) -> str:
 
 
 def votes_text(found: SourceDiagnosis) -> str:
-    """What the episodes say one by one, the most frequent first."""
+    """Verdicts and mistakes of the single episodes, the most frequent first."""
     ordered = sorted(found.votes.items(), key=lambda item: (-item[1], item[0]))
     return ", ".join(f"{words(name)} {count}" for name, count in ordered) or "nothing"
-
-
-def cautions(found: SourceDiagnosis) -> list[str]:
-    """A warning where a whole source would be changed for a minority of its episodes."""
-    mistakes = set(found.best.departures)
-    agreeing = sum(count for name, count in found.votes.items() if mistakes <= set(name.split("+")))
-    if found.verdict != "explained" or 2 * agreeing >= found.num_episodes:
-        return []
-    return [
-        f"mind: only {agreeing} of {found.num_episodes} episodes say so by themselves; look at their pictures before"
-        " you change the source, and give those that differ a source of their own"
-    ]
 
 
 def as_json(check: CalibrationCheck) -> dict[str, Any]:
     """Everything in plain values; numbers that are not finite become null."""
     episodes = []
     for each in check.episodes:
-        names = ("episode_id", "source", "verdict", "config_lines", "picture", "notes")
-        content: dict[str, Any] = {name: getattr(each, name) for name in names}
-        if each.diagnosis is None:
-            content |= {"reason": each.reason, "detail": each.detail}
-        else:
-            content |= _conclusion_json(each.diagnosis) | {"measures": each.diagnosis.measures}
-            content["notes"] = (*each.diagnosis.notes, *each.notes)
-        episodes.append(content)
-    names = ("source", "votes", "config_lines")
-    sources = [
-        {name: getattr(found, name) for name in names} | {"episodes": found.num_episodes} | _conclusion_json(found)
-        for found in check.sources
-    ]
+        content = {} if each.diagnosis is None else _conclusion_json(each.diagnosis)
+        content["notes"] = (*content.get("notes", ()), *each.notes)
+        names = ("episode_id", "source", "verdict", "reason", "detail", "config_lines", "picture")
+        episodes.append({name: getattr(each, name) for name in names} | content)
+    names = ("source", "num_episodes", "votes", "config_lines")
+    sources = [{name: getattr(found, name) for name in names} | _conclusion_json(found) for found in check.sources]
     content = {"consistent": check.consistent, "episodes": episodes, "sources": sources}
     numbers = TypeAdapter(Any, config=ConfigDict(ser_json_inf_nan="null"))
     return json.loads(numbers.dump_json(content, fallback=lambda value: np.asarray(value).tolist()))
 
 
 def _conclusion_json(found: Conclusion) -> dict[str, Any]:
+    names = ("view", "kind", "unit", "estimate", "size", "half_interval", "bound")
     return {
         "verdict": found.verdict,
         "mistake": found.best.mistake,
@@ -221,17 +223,7 @@ def _conclusion_json(found: Conclusion) -> dict[str, Any]:
         "notes": found.notes,
         "nearest": found.nearest,
         "camera_errors": [
-            {
-                "view": e.view,
-                "kind": e.kind,
-                "unit": e.unit,
-                "estimate": e.estimate,
-                "size": e.size,
-                "half_interval_95": e.half_interval,
-                "bound_95": e.bound,
-                "off": e in found.off,
-            }
-            for e in found.camera_errors
+            {name: getattr(e, name) for name in names} | {"off": e in found.off} for e in found.camera_errors
         ],
     }
 
@@ -240,6 +232,7 @@ def page(check: CalibrationCheck) -> str:
     """The page: conclusions first, then a table, then a picture of each episode, the worst first."""
     order = list(MEANINGS)
     episodes = sorted(check.episodes, key=lambda episode: (order.index(episode.verdict), episode.episode_id))
+    caption = "Log-likelihood scores: 0 is as a healthy recording, lower is worse."
     return render(
         "calibration/check_page.html",
         title="Calibration check",
@@ -250,15 +243,8 @@ def page(check: CalibrationCheck) -> str:
         tones=TONES,
         headline=source_headline,
         votes=votes_text,
-        cautions=cautions,
-        readings=_readings,
         camera_errors=_camera_errors,
-        table=Table(
-            COLUMNS,
-            [_page_row(episode) for episode in episodes],
-            numeric=(3, 4),
-            caption="Log-likelihood scores: 0 is as a healthy recording, lower is worse.",
-        ),
+        table=Table(COLUMNS, [_page_row(episode) for episode in episodes], numeric=(3, 4), caption=caption),
     )
 
 
@@ -278,11 +264,144 @@ def _camera_errors(found: Conclusion) -> Table:
     return Table(("View", "Error", "Estimate", "Size", "Unseen up to", ""), rows, numeric=range(3, 5))
 
 
-def _readings(diagnosis: Diagnosis) -> Table:
-    """The best readings, with the terms that cost each the most."""
-    rows = []
-    for explanation in diagnosis.ranked[:_READINGS_SHOWN]:
-        worst = sorted(explanation.evidence.items(), key=lambda item: item[1])[:4]
-        costs = ", ".join(f"{name} {value:.1f}" for name, value in worst)
-        rows.append([explanation.text, f"{explanation.score:.1f}", costs])
-    return Table(("Reading", "Score", "What costs it most"), rows, numeric=[1])
+# Pictures
+
+
+def diagnosis_picture(
+    diagnosis: Diagnosis,
+    recorded: Episode,
+    frames: Mapping[str, Frames],
+    kinematics: ArmKinematics | None,
+    *,
+    moments: int = MOMENTS,
+    tile_height: int = TILE_HEIGHT,
+) -> Picture:
+    """One picture per episode: left as recorded, right as repaired, the same frames on both sides.
+
+    Args:
+        recorded: the episode as its source wrote it.
+        frames: by view, uint8 (n, H, W, 3) of the recorded episode.
+
+    Raises:
+        DataError: nothing can be drawn in any view.
+    """
+    conventions = diagnosis.best.conventions
+    repaired, offset, lag = None, 0.0, 0
+    if conventions.departures:
+        if recorded.T_base_ee is None:
+            # Tools come from kinematics: apply_conventions has no recorded poses to move.
+            offset = conventions.tool_offset_z_m
+            conventions = conventions.model_copy(update={"tool_offset_z_m": 0.0})
+        repaired = apply_conventions(recorded, conventions)
+        lag = image_frames(recorded.num_frames, conventions).start
+    elif diagnosis.verdict == "off":
+        cameras = {e.view: corrected_camera(recorded.cameras[e.view], e) for e in diagnosis.off if e.kind != "lag"}
+        repaired = replace(recorded, cameras={**recorded.cameras, **cameras})
+    left: list[SheetRow] = []
+    right: list[SheetRow] = []
+    arms: Sequence[str] = ()
+    for view in frames:
+        if view not in recorded.cameras:
+            continue
+        before = recorded_tracks(recorded, view, kinematics)
+        after = before if repaired is None else recorded_tracks(repaired, view, kinematics, offset)
+        count = min(len(frames[view]), before.num_frames)
+        if repaired is None:
+            chosen = evenly_spaced(count, 2 * moments)
+        else:
+            # Image m belongs to state m as recorded, and to state m - lag of the repaired episode.
+            chosen = differing_moments(before, after, lag, count, moments)
+        if not chosen:
+            continue
+        arms = before.arms
+        shown = {n: image for n, image in enumerate(islice(frames[view], max(chosen) + 1)) if n in chosen}
+        left.append(SheetRow(view_name(view), _drawn(shown, before, view, 0, tile_height)))
+        if repaired is not None:
+            right.append(SheetRow(view_name(view), _drawn(shown, after, view, lag, tile_height)))
+    if not left:
+        raise DataError(
+            "Nothing to draw", where=f"episode {recorded.episode_id}", expected="a calibrated view with images"
+        )
+    sheets = [contact_sheet(left, tile_height=tile_height, title="as recorded", min_width=MIN_WIDTH)]
+    if right:
+        title = f"repaired: {diagnosis.best.text if diagnosis.best.departures else verdict_text(diagnosis)}"
+        sheets.append(contact_sheet(right, tile_height=tile_height, title=title, min_width=MIN_WIDTH))
+    body = np.concatenate(sheets, axis=1)
+    width = body.shape[1]
+    scores = f"score {diagnosis.best.score:.1f}, as recorded {diagnosis.as_recorded.score:.1f} (0 is healthy)"
+    heading = f"{verdict_text(diagnosis)} {diagnosis.best.mistake if diagnosis.best.departures else ''}: {scores}"
+    return np.concatenate([
+        text_strip(f"{recorded.episode_id}  ·  {recorded.embodiment}", width, 34, size_px=21, ink=INK),
+        text_strip(heading, width, 24, size_px=15, ink=MUTED),
+        body,
+        legend_strip(arms, width, outline=HEAD_VIEW in frames),
+    ])  # fmt: skip
+
+
+def recorded_tracks(
+    episode: Episode, view: str, kinematics: ArmKinematics | None, tool_offset_z_m: float = 0.0
+) -> EpisodeTracks:
+    """The state's tools in one view, with K and camera poses as the episode has them: tracks of that one view.
+
+    Args:
+        tool_offset_z_m: from the tools to draw, along their +z.
+
+    Raises:
+        DataError: the episode neither has tool poses nor kinematics for its joints.
+    """
+    camera = episode.cameras[view]
+    if episode.T_base_ee is not None:
+        tools = torch.tensor(episode.T_base_ee, dtype=torch.float64)
+        gripper = torch.zeros(tools.shape[:2]) if episode.gripper is None else torch.tensor(episode.gripper)
+        capsules, radii = tool_capsules(tools)
+    elif kinematics is not None and episode.state_kind == "joints":
+        state = np.array(episode.state, dtype=np.float64)
+        links = kinematics.link_poses(state)
+        tools, gripper = kinematics.tools_of(links), kinematics.gripper(state)
+        capsules, radii = robot_capsules(kinematics, links)
+    else:
+        expected = "recorded tool poses, or joints and kinematics"
+        raise DataError("No tools to draw", where=f"episode {episode.episode_id}", expected=expected)
+    tools = torch.from_numpy(along_tool_z(tools.numpy(), tool_offset_z_m))
+    poses = torch.tensor(camera.poses(np.arange(episode.num_frames)), dtype=torch.float64)[:, None]
+    K = torch.tensor(camera.K, dtype=torch.float64)[None]
+    size, count = (camera.height, camera.width), tools.shape[1]
+    return tracks_of_projection(
+        episode, project_tools(tools, gripper.double(), K, poses, size), tools, poses, K, capsules, radii,
+        views=(view,),
+        arms=("left", "right") if count == 2 else ("right",) if count == 1 else tuple(f"arm{i}" for i in range(count)),
+        image_size=size,
+        controls="state",
+        camera_motion=("recorded",),
+    )  # fmt: skip
+
+
+def differing_moments(first: EpisodeTracks, second: EpisodeTracks, shift: int, count: int, wanted: int) -> list[int]:
+    """Frames of the first reading at which the two differ most in the picture, spread over the clip.
+
+    Args:
+        shift: frame n of the first reading shows the image of frame n - shift of the second.
+        count: frames of the first reading that have images.
+    """
+    common = [n for n in range(count) if 0 <= n - shift < second.num_frames]
+    if len(common) <= wanted:
+        return common
+    index = np.asarray(common)
+    apart = np.linalg.norm(first.uv[index, 0] - second.uv[index - shift, 0], axis=-1)
+    apart[first.valid[index, 0] ^ second.valid[index - shift, 0]] = max(first.image_size)
+    apart[~first.valid[index, 0] & ~second.valid[index - shift, 0]] = 0.0
+    score = apart.max(axis=-1)
+    parts = np.array_split(np.arange(len(common)), wanted)
+    return [common[int(part[np.argmax(score[part])])] for part in parts]
+
+
+def _drawn(
+    images: Mapping[int, np.ndarray], tracks: EpisodeTracks, view: str, lag: int, tile_height: int
+) -> np.ndarray:
+    """Tiles of images by number."""
+    style = OverlayStyle(SIGMA_PX_REF, heat=0.5, outline=view == HEAD_VIEW)
+    tiles = []
+    for n, image in images.items():
+        tile = draw_overlay(image, tracks, n - lag, view, tile_height=tile_height, style=style)
+        tiles.append(draw_tag(tile, f"frame {n}", size_px=11))
+    return np.stack(tiles)

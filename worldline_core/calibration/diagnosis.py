@@ -1,4 +1,4 @@
-"""Diagnoses: what the scores of an episode's readings decide, and the sum over the episodes of a source.
+"""Diagnoses: the verdict from the scores of an episode's readings, and the verdict over the episodes of a source.
 
 The episodes of a source were written the same way, so their scores are added up.
 """
@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 
 from worldline_core.calibration.camera_errors import CameraError, combine, significant
-from worldline_core.calibration.doctor_config import CalibrationDoctorConfig, ErrorLimits
 from worldline_core.calibration.evidence import (
     ARM_FLOW,
     correlation_log_likelihood,
@@ -24,12 +23,19 @@ from worldline_core.data.episodes.conventions import RecordedConventions
 
 VerdictName = Literal["consistent", "off", "explained", "unexplained", "mixed", "too_little_evidence"]
 
+MIN_MARGIN = 2.5
+"""Log-likelihood by which a mistake must beat the recording as written."""
 MIN_TERM = -9.0
 """A term below this is bad: no healthy recording has one."""
 SUSPICION = -4.0
 """A term below this starts the search."""
-MIN_FLOW, MAX_FLOW_TURN_DEG = 0.6, 25.0
-"""Agreement of arm flow below which, and its turn above which, a view is bad."""
+TERM_LIMITS = {
+    "flow": correlation_log_likelihood(0.6, ARM_FLOW),
+    "turn": turn_log_likelihood(25.0),
+    "hand-eye": hand_eye_log_likelihood(0.012, 0.0),
+    **dict.fromkeys(("change", "wrist", "energy", "fingers", "finger"), -np.inf),
+}
+"""By the first word of a term's name, where it is not MIN_TERM; noisy signs cannot veto."""
 COMPLEXITY = 2.0
 """Cost of a reading for each departure from the contract."""
 RIVAL_MARGIN = 1.0
@@ -37,7 +43,7 @@ RIVAL_MARGIN = 1.0
 MAX_GAIN = 20.0
 """Most that one episode can contribute to a reading of its whole source."""
 CONTRADICTING_SHARE = 0.1
-"""Of the episodes that fit by themselves, those that a reading of the whole source may break."""
+"""Largest share of the episodes that fit by themselves which a reading of the whole source may break."""
 FEWEST_TOGETHER = 5
 """From this many episodes on, their scatter measures their common uncertainty."""
 ESTIMATED = {"intrinsics_size", "tool_offset_z_m", "embodiment"}
@@ -45,17 +51,13 @@ ESTIMATED = {"intrinsics_size", "tool_offset_z_m", "embodiment"}
 NEAREST_SHOWN, TERMS_SHOWN = 3, 3
 
 
-DEFAULT_CONFIG = CalibrationDoctorConfig()
-
-
 @dataclass(frozen=True)
 class Explanation:
     """One reading of the recording.
 
     Attributes:
-        conventions: the source's way of writing its numbers; `apply_conventions` repairs the episode with it.
-        score: log-likelihood of all evidence under this reading; 0 is as in a healthy recording, lower is worse.
-            Differences between readings of one episode are meaningful, and add up over episodes.
+        score: log-likelihood of all evidence; 0 is as in a healthy recording, lower is worse. Differences between readings
+            of one episode are meaningful, and add up over episodes.
         evidence: the terms of the score by name ("hand-eye left_wrist", ...); each at most 0.
         other: (name, value) of a mistake without a convention: ("embodiment", the robot that fits),
             ("wrist_extrinsics", "exchanged"), ("wrist_videos", "exchanged").
@@ -81,6 +83,13 @@ class Explanation:
         """The departures with their values: "camera_axes: opengl, views: [head]"."""
         lines = [line.removeprefix(".") for line in self.conventions.config_lines("")]
         return ", ".join(lines + ([": ".join(self.other)] if self.other is not None else [])) or "as recorded"
+
+    @property
+    def key(self) -> frozenset[tuple[str, str]]:
+        """Identity of the reading over episodes, with any tool offset that each of them estimates."""
+        items = {(name, str(getattr(self.conventions, name))) for name in self.conventions.departures}
+        items = {("tool_offset_z_m", "") if name == "tool_offset_z_m" else (name, value) for name, value in items}
+        return frozenset(items if self.other is None else items | {self.other})
 
 
 NOTHING_TRIED = Explanation(RecordedConventions(), 0.0, {})
@@ -112,42 +121,29 @@ class Conclusion:
 
     @property
     def as_recorded(self) -> Explanation:
-        """The recording as written."""
         return next(explanation for explanation in self.ranked if explanation.mistake == "none")
 
-    @property
-    def consistent_within(self) -> str:
-        """The largest rotation of a camera that could have gone unseen, over the views."""
-        turns = [error.bound for error in self.camera_errors if error.kind == "rotation"]
-        return f"consistent within {max(turns):.1f} deg" if turns else "consistent, but no picture says within what"
+    def with_camera_errors[C: Conclusion](self: C, errors: tuple[CameraError, ...], *, together: bool = False) -> C:
+        """With the cameras' errors; consistent becomes `off` where one is significant (`together`: over a source)."""
+        off = significant(errors, together=together)
+        verdict = "off" if off and self.verdict == "consistent" else self.verdict
+        return replace(self, verdict=verdict, camera_errors=errors, off=off)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis(Conclusion):
-    """One episode.
-
-    Attributes:
-        measures: by view, as recorded: hand_eye_m and hand_eye_deg (root mean square deviation of a moving camera from a
-            fixed place in its tool's frame), in_view (share of frames with a tool in the picture), flow (correlation of
-            measured image motion with the predicted one); those that can be measured.
-    """
+    """Conclusion over one episode."""
 
     episode_id: str
-    measures: Mapping[str, Mapping[str, float]]
-
-    @property
-    def margin(self) -> float:
-        """Score of the believed reading above that of the recording as written."""
-        return self.best.score - self.as_recorded.score
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceDiagnosis(Conclusion):
-    """All episodes of one source; scores are summed over them.
+    """Conclusion over all episodes of a source; scores are summed over them.
 
     Attributes:
         votes: verdicts and mistakes of the single episodes, counted.
-        config_lines: what the source's configuration must say, in place of what it says now.
+        config_lines: replacement lines for the source's configuration.
     """
 
     source: str
@@ -156,70 +152,46 @@ class SourceDiagnosis(Conclusion):
     config_lines: tuple[str, ...] = ()
 
 
-def with_camera_errors[C: Conclusion](conclusion: C, errors: tuple[CameraError, ...], limits: ErrorLimits) -> C:
-    """The conclusion with its cameras' errors; a consistent one with a significant error becomes `off`."""
-    off = significant(errors, limits)
-    verdict = "off" if off and conclusion.verdict == "consistent" else conclusion.verdict
-    return replace(conclusion, verdict=verdict, camera_errors=errors, off=off)
-
-
-def term_limits(config: CalibrationDoctorConfig) -> dict[str, float]:
-    """Limits of the terms, by the first word of their names, other than MIN_TERM; noisy signs cannot veto."""
-    return {
-        "flow": correlation_log_likelihood(MIN_FLOW, ARM_FLOW),
-        "turn": turn_log_likelihood(MAX_FLOW_TURN_DEG),
-        "hand-eye": hand_eye_log_likelihood(config.max_hand_eye_m, 0.0),
-        **dict.fromkeys(("change", "wrist", "energy", "fingers", "finger"), -np.inf),
-    }
-
-
-def bad_terms(
-    explanation: Explanation, config: CalibrationDoctorConfig, as_recorded: Explanation | None = None
-) -> dict[str, float]:
+def bad_terms(explanation: Explanation, as_recorded: Explanation | None = None) -> dict[str, float]:
     """The terms that no healthy recording has, by name.
 
     Args:
         as_recorded: the recording as written, for a departing explanation, which must leave nothing suspicious but what is
             tolerated as written and did not get worse.
     """
-    limits, bad = term_limits(config), {}
+    bad = {}
     for name, value in explanation.evidence.items():
         kind = name.split(" ")[0]
+        limit = TERM_LIMITS.get(kind, MIN_TERM)
         if as_recorded is not None:
-            written = as_recorded.evidence.get(name, -np.inf)
-            if value >= written >= limits.get(kind, MIN_TERM):
+            if value >= as_recorded.evidence.get(name, -np.inf) >= limit:
                 continue
-        if value < limits.get(kind, MIN_TERM if as_recorded is None else SUSPICION):
+            limit = TERM_LIMITS.get(kind, SUSPICION)
+        if value < limit:
             bad[name] = value
     return bad
 
 
-def nearest_texts(
-    ranked: Iterable[Explanation], as_recorded: Explanation, config: CalibrationDoctorConfig
-) -> tuple[str, ...]:
+def nearest_texts(ranked: Iterable[Explanation], as_recorded: Explanation) -> tuple[str, ...]:
     """The best readings without a common mistake, each with what is still wrong under it."""
-    best: list[Explanation] = []
+    texts: list[str] = []
+    shown: set[str] = set()
     for explanation in ranked:
-        if explanation.score > as_recorded.score and not any(
-            set(e.departures) & set(explanation.departures) for e in best
-        ):
-            best.append(explanation)
-    texts = []
-    for explanation in best[:NEAREST_SHOWN]:
-        bad = sorted(bad_terms(explanation, config, as_recorded).items(), key=lambda item: item[1])
+        if explanation.score <= as_recorded.score or shown & set(explanation.departures):
+            continue
+        shown |= set(explanation.departures)
+        bad = sorted(bad_terms(explanation, as_recorded).items(), key=lambda item: item[1])
         remains = ", ".join(f"{name} {value:.1f}" for name, value in bad[:TERMS_SHOWN]) or "nothing"
         more = f" and {len(bad) - TERMS_SHOWN} more" if len(bad) > TERMS_SHOWN else ""
         texts.append(f"{explanation.text} (score {explanation.score:.1f}): still wrong {remains}{more}")
-    return tuple(texts)
+    return tuple(texts[:NEAREST_SHOWN])
 
 
-def decide(
-    as_recorded: Explanation, ranked: Sequence[Explanation], config: CalibrationDoctorConfig
-) -> tuple[VerdictName, Explanation, list[str]]:
+def decide(as_recorded: Explanation, ranked: Sequence[Explanation]) -> tuple[VerdictName, Explanation, list[str]]:
     """The verdict, the reading to believe, and the mistakes that explain the recording equally well, if several do."""
-    best, bad = ranked[0], bool(bad_terms(as_recorded, config))
+    best, bad = ranked[0], bool(bad_terms(as_recorded))
     gain = best.score - as_recorded.score
-    if best is not as_recorded and gain >= config.min_margin and not bad_terms(best, config, as_recorded):
+    if best is not as_recorded and gain >= MIN_MARGIN and not bad_terms(best, as_recorded):
         # Of mistakes that occur together, the one that explains most alone is compared with the others.
         alone = next((e for e in ranked if len(e.departures) == 1 and e.departures[0] in best.departures), best)
         rivals = [
@@ -228,7 +200,7 @@ def decide(
             if other.score > alone.score - RIVAL_MARGIN
             and other is not as_recorded
             and not set(other.departures) & set(best.departures)
-            and (len(best.departures) > 1 or not bad_terms(other, config, as_recorded))
+            and (len(best.departures) > 1 or not bad_terms(other, as_recorded))
         ]
         if not rivals:
             return "explained", best, []
@@ -237,18 +209,13 @@ def decide(
     return "unexplained" if bad else "consistent", as_recorded, []
 
 
-def diagnose_source(
-    source: str, diagnoses: Iterable[Diagnosis], config: CalibrationDoctorConfig = DEFAULT_CONFIG
-) -> SourceDiagnosis:
+def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagnosis:
     """The reading of a source: better than the recordings as written, and healthy in most of them.
 
     One episode contributes MAX_GAIN at most for or against a reading: a few broken recordings are no habit of their
     source. A reading that breaks episodes which fit by themselves is not believed: such a source is mixed. Numbers that
     each episode estimates by itself (a tool offset) are replaced by their median. Mistakes that occur together are tried
     where they explain some episode alone.
-
-    Args:
-        diagnoses: made with search "always", so that the readings can be compared.
     """
     listed = [d for d in diagnoses if d.verdict != "too_little_evidence"]
     count = len(listed)
@@ -256,10 +223,10 @@ def diagnose_source(
     if not listed:
         notes = ("No episode can be judged",)
         return SourceDiagnosis(verdict="too_little_evidence", notes=notes, source=source, num_episodes=0, votes={})
-    readings = _source_readings(listed, config)
+    readings = _source_readings(listed)
     as_recorded = _summed([d.as_recorded for d in listed], sum(d.as_recorded.score for d in listed))
     ranked = sorted([as_recorded, *(r.summed(as_recorded.score) for r in readings)], key=lambda e: -e.score)
-    winning = [r for r in readings if r.gain >= config.min_margin + 0.5 * count and r.healthy > count / 2]
+    winning = [r for r in readings if r.gain >= MIN_MARGIN + 0.5 * count and r.healthy > count / 2]
     sound = [r for r in winning if r.contradicting <= CONTRADICTING_SHARE * count]
     sound = sorted(sound, key=lambda r: r.regret(sound))
     rivals = [r for r in sound[1:] if r.fits_like(sound[0], sound)]
@@ -284,8 +251,7 @@ def diagnose_source(
     if best.other is not None:
         return found
     alike = {d.episode_id: d.camera_errors for d in listed if d.best.conventions == best.conventions}
-    limits = config.off_together if len(alike) >= FEWEST_TOGETHER else config.off_alone
-    return with_camera_errors(found, combine(list(alike.values())), limits)
+    return found.with_camera_errors(combine(list(alike.values())), together=len(alike) >= FEWEST_TOGETHER)
 
 
 _Key = frozenset[tuple[str, str]]
@@ -302,23 +268,21 @@ class _SourceReading:
         contradicting: episodes that fit as written, or under another reading, but not under this one.
     """
 
-    def __init__(
-        self, key: _Key, listed: list[Diagnosis], by_key: list[_ByKey], config: CalibrationDoctorConfig
-    ) -> None:
-        self.key = key
+    def __init__(self, key: _Key, listed: list[Diagnosis], by_key: list[_ByKey]) -> None:
+        self.names = {name for name, _ in key}
         self.tried = [found[key] for found in by_key if key in found]
-        tolerated = config.min_margin + COMPLEXITY * len(key)
+        tolerated = MIN_MARGIN + COMPLEXITY * len(key)
         self.scores, self.gain, self.healthy, self.contradicting = [], 0.0, 0, 0
         for diagnosis, found in zip(listed, by_key, strict=True):
             as_recorded = diagnosis.as_recorded
             own = found.get(key) or _instead_of(key, found)
-            bad = bool(bad_terms(own, config, as_recorded))
+            bad = bool(bad_terms(own, as_recorded))
             self.scores.append(own.score)
             self.gain += float(np.clip(own.score - as_recorded.score, -MAX_GAIN, MAX_GAIN))
             self.healthy += not bad
             fits = diagnosis.verdict in ("consistent", "off")
             worse = fits and own.score < as_recorded.score - tolerated
-            unseen = fits and {name for name, _ in key} & ESTIMATED and key not in found
+            unseen = fits and self.names & ESTIMATED and key not in found
             bad_here = bad and (fits or diagnosis.verdict == "explained")
             self.contradicting += bool(worse or unseen or bad_here)
 
@@ -328,9 +292,9 @@ class _SourceReading:
         return float(np.minimum(best - self.scores, MAX_GAIN).sum())
 
     def fits_like(self, best: _SourceReading, others: list[_SourceReading]) -> bool:
-        """Whether this is another mistake that explains the episodes as well as the best one."""
+        """True for another mistake that explains the episodes as well as the best one."""
         near = self.regret(others) - best.regret(others) < RIVAL_MARGIN * len(self.scores)
-        return near and not {name for name, _ in self.key} & {name for name, _ in best.key}
+        return near and not self.names & best.names
 
     def summed(self, score_as_written: float) -> Explanation:
         return _summed(self.tried, score_as_written + self.gain)
@@ -358,25 +322,17 @@ def _nearest(readings: list[_SourceReading], count: int) -> tuple[str, ...]:
     return tuple(list(best.values())[:NEAREST_SHOWN])
 
 
-def _key(explanation: Explanation) -> _Key:
-    """Identity of a reading over episodes, whatever tool offset each of them estimates."""
-    conventions = explanation.conventions
-    items = {(name, str(getattr(conventions, name))) for name in conventions.departures if name != "tool_offset_z_m"}
-    items |= {("tool_offset_z_m", "")} if conventions.tool_offset_z_m else set()
-    return frozenset(items | ({explanation.other} if explanation.other is not None else set()))
-
-
-def _source_readings(listed: list[Diagnosis], config: CalibrationDoctorConfig) -> list[_SourceReading]:
+def _source_readings(listed: list[Diagnosis]) -> list[_SourceReading]:
     """Every single mistake, and those together that explain some episode."""
     by_key: list[_ByKey] = []
     keys: dict[_Key, None] = {}
     for diagnosis in listed:
         found: _ByKey = {}
         for explanation in diagnosis.ranked:  # the best of each key comes first
-            found.setdefault(_key(explanation), explanation)
+            found.setdefault(explanation.key, explanation)
         by_key.append(found)
         keys |= {key: None for key, e in found.items() if len(key) == 1 or e is diagnosis.best}
-    return [_SourceReading(key, listed, by_key, config) for key in keys if key]
+    return [_SourceReading(key, listed, by_key) for key in keys if key]
 
 
 def _summed(members: list[Explanation], score: float) -> Explanation:

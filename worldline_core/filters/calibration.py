@@ -18,7 +18,7 @@ from functools import cache
 import numpy as np
 
 from worldline_core.calibration.calibration_doctor import diagnose, lagged
-from worldline_core.calibration.diagnosis import Diagnosis, bad_terms
+from worldline_core.calibration.diagnosis import MIN_MARGIN, Diagnosis, bad_terms
 from worldline_core.calibration.evidence import (
     fields_of_view_deg,
     mount_offset,
@@ -333,7 +333,7 @@ def detect_mistake(
     if (start, stop, step) != (0, len(bad_frames), 1):
         episode = episode.cut(start, stop, step)
         gray = {view: images[start:stop:step] for view, images in gray.items()}
-    diagnosis = diagnose(episode, gray, kinematics_of(episode), config)
+    diagnosis = diagnose(episode, gray, kinematics_of(episode), quick=True)
     reason = _UNEXPLAINED
     if diagnosis.verdict == "explained":
         lags = all(field.endswith("lag_frames") for field in diagnosis.best.departures)
@@ -343,7 +343,7 @@ def detect_mistake(
     return Verdict(
         reason,
         diagnosis.verdict in ("consistent", "too_little_evidence"),
-        _numbers(diagnosis, config, step) | {"first_frame": start, "every_frame": step},
+        _numbers(diagnosis, step) | {"first_frame": start, "every_frame": step},
     )
 
 
@@ -357,12 +357,12 @@ def _liveliest(episode: Episode, start: int, stop: int, length: int) -> tuple[in
     return first, first + length
 
 
-def _numbers(diagnosis: Diagnosis, config: FilterDoctorConfig, step: int) -> Numbers:
+def _numbers(diagnosis: Diagnosis, step: int) -> Numbers:
     numbers: Numbers = {
         "verdict": diagnosis.verdict,
         "mistake": diagnosis.best.mistake,
         "score_as_recorded": diagnosis.as_recorded.score,
-        "threshold_margin": config.min_margin,
+        "threshold_margin": MIN_MARGIN,
     }
     if diagnosis.verdict == "explained":
         # Lags were found in every step-th frame; the source counts its own.
@@ -377,7 +377,7 @@ def _numbers(diagnosis: Diagnosis, config: FilterDoctorConfig, step: int) -> Num
     if diagnosis.off:
         numbers |= {"off": "; ".join(map(str, diagnosis.off))}
     if diagnosis.verdict == "unexplained":
-        bad = bad_terms(diagnosis.as_recorded, config)
+        bad = bad_terms(diagnosis.as_recorded)
         nearest = "; ".join(diagnosis.nearest)
         numbers |= {"bad": ", ".join(sorted(bad, key=lambda name: bad[name])), "nearest": nearest}
     return numbers

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import ConfigDict, Field, JsonValue, model_validator
 
-from worldline_core.calibration.doctor_config import CalibrationDoctorConfig
 from worldline_core.config import StrictModel, validate
 from worldline_core.errors import ConfigError
 
@@ -188,11 +187,9 @@ class ProjectionConfig(Thresholds):
     cannot be large where much of the image moves"""
 
 
-class FilterDoctorConfig(CalibrationDoctorConfig, Thresholds):
-    """The doctor's thresholds, with a cheaper search: other conventions are tried only where the recorded ones look
-    wrong, and of a long recording only a part is used."""
+class FilterDoctorConfig(Thresholds):
+    """The part of a recording that the calibration doctor looks at."""
 
-    search: Literal["always", "when_suspicious"] = "when_suspicious"
     rate_hz: Positive = 8.0
     """frames per second that are compared: at 30 Hz an arm moves less than a pixel of a small image per frame, and a
     lag of a tenth of a second is more frames than are tried"""
