@@ -67,14 +67,12 @@ def build_parser() -> argparse.ArgumentParser:
     inspect.add_argument("--episode", metavar="ID", help="the episode to show (default: the first one)")
     inspect.add_argument("--video", action="store_true", help="write a video of it: controls drawn over all views")
     inspect.add_argument("--rerun", action="store_true", help="write a Rerun recording of it (open with: rerun FILE)")
-    inspect.add_argument("--json", action="store_true", help="print JSON")
     inspect.set_defaults(run=_inspect)
     verify = commands.add_parser("verify", help="compare the files of finished artifacts with what was written")
     verify.add_argument(
         "artifact", type=Path, nargs="*", help="only these, shipped ones too (default: all of the store)"
     )
     verify.add_argument("--artifacts", type=Path, default=Path("artifacts"), help="the store (default: artifacts)")
-    verify.add_argument("--json", action="store_true", help="print JSON")
     verify.set_defaults(run=_verify)
     add_plan_command(commands)
     add_exchange_commands(commands)
@@ -183,7 +181,7 @@ def _task(arguments: argparse.Namespace) -> None:
     from tasks.execution.command_line import print_artifact, run_task
 
     prepare_prefect(arguments.artifacts)
-    print_artifact(run_task(find_task(arguments.step), arguments), as_json=arguments.json)
+    print_artifact(run_task(find_task(arguments.step), arguments))
 
 
 def _record(arguments: argparse.Namespace) -> None:
@@ -215,13 +213,7 @@ def _inspect(arguments: argparse.Namespace) -> None:
         video=arguments.video,
         rerun=arguments.rerun,
     )
-    if arguments.json:
-        import json
-        from dataclasses import asdict
-
-        print(json.dumps(asdict(found), default=str, indent=1))
-    else:
-        print(found)
+    print(found)
 
 
 def _verify(arguments: argparse.Namespace) -> None:
@@ -233,16 +225,11 @@ def _verify(arguments: argparse.Namespace) -> None:
             raise ArtifactError("Not a finished artifact", where=folder, expected=MANIFEST_NAME, got="no such file")
     checked = check_artifacts(arguments.artifact or finished_artifacts(arguments.artifacts))
     damaged = sum(map(bool, checked.values()))
-    if arguments.json:
-        import json
-
-        print(json.dumps([{"artifact": str(folder), "damage": damage} for folder, damage in checked.items()], indent=1))
-    else:
-        for folder, damage in checked.items():
-            print(f"{'damaged' if damage else 'whole'}  {folder}", *damage, sep="\n  ")
-            if damage:
-                print(f"  next step: {how_to_rebuild(folder)}")
-        print(f"{len(checked)} artifacts, {damaged} damaged")
+    for folder, damage in checked.items():
+        print(f"{'damaged' if damage else 'whole'}  {folder}", *damage, sep="\n  ")
+        if damage:
+            print(f"  next step: {how_to_rebuild(folder)}")
+    print(f"{len(checked)} artifacts, {damaged} damaged")
     raise SystemExit(1 if damaged else 0)
 
 

@@ -52,8 +52,7 @@ def add_rehearse_command(commands: argparse._SubParsersAction[argparse.ArgumentP
         "rehearse",
         help="run a full-size preset at small size, with small random versions of every outside model",
         description="Make small random-weight versions of every outside model and small recordings in a folder, and run"
-        " the preset's own plan on them, from the import of the backbone to the report, a second distillation that reads"
-        " clips the other way, and the five ablations. Sizes alone change; each change is printed. Nothing is learnt: what"
+        " the preset's own plan on them, from the import of the backbone to the report, and the five ablations. Sizes alone change; each change is printed. Nothing is learnt: what"
         " ends with an error here ends with it on many GPUs too.",
     )
     add_preset_arguments(rehearse, "cosmos3-nano")
@@ -75,15 +74,12 @@ def rehearse_command(arguments: argparse.Namespace) -> None:
     path = None if arguments.config is None else arguments.config.resolve()
     preset = arguments.preset or (None if path else "cosmos3-nano")
     with_ablations = not arguments.without_ablations
-    changes, again, besides = prepare(arguments.output, preset, path, arguments.overrides, ablations=with_ablations)
+    changes, besides = prepare(arguments.output, preset, path, arguments.overrides, ablations=with_ablations)
     print(table(changes))
     overrides = (*arguments.overrides, *(change.override for change in changes))
     os.chdir(arguments.output)
     artifacts = Path("artifacts")
     train_in_processes(preset, path, overrides, artifacts, arguments.processes)
-    print("\nbesides, in a second distillation, which reads clips the other way:", table(again), sep="\n")
-    distilled_again = (*overrides, *(change.override for change in again))
-    train_in_processes(preset, path, distilled_again, artifacts, arguments.processes)
     prepare_prefect(artifacts)
     from flows.pipeline import pipeline
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import errno
-import json
 import logging
 import os
 import select
@@ -12,7 +11,6 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, TextIO, cast
@@ -63,7 +61,6 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--name", help="which call of the run, when a step occurs more than once (rollout.shipped_stage2)"
     )
-    parser.add_argument("--json", action="store_true", help="print the artifact and its metrics as JSON")
 
 
 def run_task(task: ArtifactTask, arguments: argparse.Namespace) -> Artifact:
@@ -105,20 +102,14 @@ def run_task_command(task: ArtifactTask) -> None:
     add_task_arguments(parser)
     arguments = parser.parse_args()
     run_supervised(
-        lambda: exit_with_clear_errors(lambda: print_artifact(run_task(task, arguments), as_json=arguments.json)),
+        lambda: exit_with_clear_errors(lambda: print_artifact(run_task(task, arguments))),
         continues=True,
     )
 
 
-def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
-    """One line that says where the artifact is, its digest, and whether it was there already; JSON has its metrics too."""
-    if as_json:
-        from worldline_core.store.artifact_files import MANIFEST_NAME, read_json
-
-        metrics = read_json(artifact.path / MANIFEST_NAME)["metrics"]
-        print(json.dumps({**asdict(artifact), "metrics": metrics}, default=str, indent=1))
-    else:
-        print(f"{artifact.path}  {artifact.digest[:16]}  {'cached' if artifact.cached else 'built'}")
+def print_artifact(artifact: Artifact) -> None:
+    """Print where the artifact is, its digest, and whether it was there already."""
+    print(f"{artifact.path}  {artifact.digest[:16]}  {'cached' if artifact.cached else 'built'}")
 
 
 def exit_with_clear_errors(action: Callable[[], object]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -103,18 +102,6 @@ def test_an_input_is_fed_to_the_call_that_is_named(tmp_path: Path, capsys: pytes
     error = capsys.readouterr().err
     assert "not finished" not in error
     assert str(tmp_path) in error
-
-
-@pytest.mark.slow
-def test_task_and_inspect_answer_scripts_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    main(["task", "curate", "--preset", "smoke", "--artifacts", str(tmp_path), "--json"])
-    artifact = json.loads(capsys.readouterr().out)
-    assert artifact["metrics"]["found"] > 0
-    assert (artifact["step"], artifact["cached"]) == ("curate", False)
-    main(["inspect", artifact["path"], "--json"])
-    found = json.loads(capsys.readouterr().out)
-    assert found["kind"] == "EpisodeSet"
-    assert all(Path(path).is_file() for path in found["written"])
 
 
 def test_a_reader_that_ends_first_is_no_error(project_root: Path) -> None:

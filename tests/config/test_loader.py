@@ -97,11 +97,6 @@ def test_a_section_that_is_taken_away_takes_earlier_changes_of_it_along() -> Non
     assert load_config(PipelineConfig, preset="smoke", overrides=overrides).train_stage1 is None
 
 
-def test_anchors_and_merges_work(tmp_path: Path) -> None:
-    text = "a: &one {steps: 1, rate: 2.0}\nb: {<<: *one, rate: 3.0}\n"
-    assert read_yaml(_write(tmp_path, text)) == {"a": {"steps": 1, "rate": 2.0}, "b": {"steps": 1, "rate": 3.0}}
-
-
 class Apple(StrictModel):
     kind: Literal["apple"]
     colour: str = "red"
@@ -148,13 +143,6 @@ def test_a_file_that_extends_a_preset_states_only_what_differs(tmp_path: Path) -
     assert mine.train_stage1.trainer.batch_size == smoke.train_stage1.trainer.batch_size
     assert set(smoke.rollouts) - set(mine.rollouts) == {"copy_first_frame"}
     assert mine.curate == smoke.curate
-
-
-def test_a_preset_cannot_extend_one_that_does_not_exist(tmp_path: Path) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text("extends: smokey\n")
-    with pytest.raises(ConfigError, match="Unknown preset"):
-        load_config(PipelineConfig, path=path)
 
 
 def test_null_takes_away_what_the_file_has() -> None:

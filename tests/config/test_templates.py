@@ -7,28 +7,20 @@ from typing import Any, get_args
 
 import pytest
 
-from flows.pipeline import chain
 from tasks.execution.artifact_task import find_task
-from tasks.execution.chain import outline
-from worldline_core.config import CONFIG_ROOT, load_config, preset_names, read_yaml, validate
+from worldline_core.config import CONFIG_ROOT, load_config, read_yaml, validate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.sources.open import SourceConfig
 from worldline_core.data.sources.robomind import ROBOMIND_LAYOUTS
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.embodiment import embodiment_names
-from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.recorder.attempts import RecordBanksConfig, RecordPoliciesConfig
 from worldline_core.recorder.record import RecordConfig, plan_jobs
 
 TEMPLATES = sorted([*(CONFIG_ROOT / "sources").glob("*.yaml"), *(CONFIG_ROOT / "filters").glob("*.yaml")])
 RECORDINGS = sorted((CONFIG_ROOT / "recording").glob("*.yaml"))
 KNOWN = {*embodiment_names(), NO_EMBODIMENT}
-
-
-@pytest.mark.parametrize("preset", preset_names())
-def test_a_preset_is_a_chain(preset: str) -> None:
-    assert outline(chain, PipelineConfig.load(preset))
 
 
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)

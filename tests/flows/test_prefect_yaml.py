@@ -47,10 +47,3 @@ def test_keys_entrypoint_and_parameters(deployments: list[dict[str, Any]], index
     assert isinstance(flow, Flow)
     flow.validate_parameters({"config": None, "overrides": (), "artifacts": "artifacts", **deployment["parameters"]})
     assert deployment["parameters"]["preset"] in preset_names()
-
-
-def test_misspelt_parameter_is_refused(deployments: list[dict[str, Any]]) -> None:
-    from flows.pipeline import pipeline
-
-    with pytest.raises(Exception, match="presett"):
-        pipeline.validate_parameters({"presett": "tiny"})

@@ -16,7 +16,7 @@ from worldline_core.recorder.attempts import BankGrid, RecordPoliciesConfig, rec
 from worldline_core.recorder.controllers import ScriptedPolicy, plan_waypoints
 from worldline_core.recorder.record import RecordConfig, Variety, plan_jobs
 from worldline_core.recorder.scene import sample_layout
-from worldline_core.recorder.simulate import EpisodeRecorder, Job
+from worldline_core.recorder.simulate import EpisodeRecorder
 
 POLICIES = {
     "expert": ScriptedPolicy(),
@@ -103,16 +103,6 @@ def test_variety_is_drawn_within_its_limits_and_changes_nothing_else():
     assert 70 < sum(policy is None for policy in drawn) < 130
     with pytest.raises(ValueError, match="earliest <= latest"):
         Variety(share=1, noise_m=0, delay_frames=0, gripper_delay_frames=(3, -3))
-
-
-def test_a_recording_that_starts_late_says_how_it_ended(recorder):
-    # The arm has not arrived when the pictures end.
-    late = ScriptedPolicy(mistakes=0.0, delay_frames=28)
-    job = Job("e", "ur5e_silver", "train", "press", (1, 2), policy=late)
-    layout, motion, scene, _ = recorder.draw(job, 33)
-    on_time = recorder.draw(replace(job, policy=ScriptedPolicy()), 33)
-    assert (layout.target, scene) == (on_time[0].target, on_time[2])
-    assert (on_time[1].outcome, motion.outcome) == ("success", "failure")
 
 
 @pytest.mark.slow

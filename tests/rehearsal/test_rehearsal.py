@@ -23,12 +23,10 @@ from worldline_core.rehearsal.rehearsal import (
     ABLATION_SIZES,
     TWO_VIEWS,
     changes_of,
-    other_input,
     table,
     write_recordings,
 )
 from worldline_core.report.ablation_table import load_variants
-from worldline_core.training.clip_config import FrameInput
 
 PRESET = "cosmos3-nano"
 SIZES = {"image_size", "device", "steps", "workers", "student_layer", "clips", "start_step", "seeds", "timed_blocks",
@@ -75,28 +73,6 @@ def test_what_is_small_already_stays_as_it_is() -> None:
     }
     with pytest.raises(ConfigError, match="unknown key"):
         changes_of(PRESET, None, ["train_stage1.trainer.stepps=2"])
-
-
-@pytest.mark.parametrize("published", ["latents", "frames"])
-def test_both_ways_to_read_clips_are_distilled_from(published: str) -> None:
-    frames = "distill.input={kind: frames, image_size: [480, 640], workers: 4}"
-    given = [frames] if published == "frames" else []
-    given += [change.override for change in changes_of(PRESET, None, given)]
-    again = other_input(PRESET, None, given)
-    first, second = (
-        load_config(PipelineConfig, preset=PRESET, overrides=[*given, *(change.override for change in more)])
-        for more in ([], again)
-    )
-    assert first.distill.input.kind == published
-    assert {first.distill.input.kind, second.distill.input.kind} == {"latents", "frames"}
-    read = next(
-        settings.distill.input for settings in (first, second) if isinstance(settings.distill.input, FrameInput)
-    )
-    assert (read.image_size, read.workers) == ((64, 96), 1)
-    assert second.distill.clips.lengths == (33,)
-    assert [second.distill.teacher_forcing.trainer.steps, second.distill.distribution_matching.trainer.steps] == [2, 6]
-    others = {name: value for name, value in first.model_dump().items() if name != "distill"}
-    assert others == {name: value for name, value in second.model_dump().items() if name != "distill"}
 
 
 @pytest.fixture
@@ -186,9 +162,7 @@ def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project
         assert any(manifest["environment"]["processes"] == 2 for manifest in manifests[step])
     assert all(manifest["environment"]["processes"] == 2 for manifest in manifests["distill"])
     assert any(manifest["metrics"].get("relational_intra", 0) > 0 for manifest in manifests["train_stage2"])
-    assert [manifest["metrics"]["lpips"] for manifest in manifests["distill"]] == ["on", "on"]
-    read = {manifest["config"].get("input", {"kind": "latents"})["kind"] for manifest in manifests["distill"]}
-    assert read == {"latents", "frames"}
+    assert [manifest["metrics"]["lpips"] for manifest in manifests["distill"]] == ["on"]
     (ablations,) = (folder / "artifacts" / "ablation_table").glob("*/table.json")
     rows = {cell["variant"] for cell in json.loads(ablations.read_text())["cells"] if cell["mean"] is not None}
     assert rows == load_variants().keys()

@@ -8,19 +8,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
-from pydantic import ValidationError
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.scale.account import (
     InputRow,
     check_account,
-    portable_message,
     read_account,
     write_account,
     write_shard_account,
 )
-from worldline_core.scale.mapping import RunnerConfig, ends_the_run
+from worldline_core.scale.mapping import ends_the_run
 from worldline_core.store import remote as transient
 from worldline_core.store.remote import UnreachableInputError, is_transient, with_retries
 
@@ -154,22 +152,6 @@ def test_shards_are_merged_and_the_row_with_the_work_counts(tmp_path: Path) -> N
     written = list(tmp_path.rglob("*.parquet"))
     assert len(written) == 3
     assert all(path.relative_to(tmp_path).parts[0] == "run" for path in written)
-
-
-def test_messages_say_nothing_of_this_machine() -> None:
-    text = "cannot open '/home/user/data set/x.mp4' (Decoder object at 0x7f3a9c00ab10): /tmp/a/b.parquet"
-    cleaned = portable_message(text)
-    assert "/home" not in cleaned
-    assert "0x7f3a" not in cleaned
-    assert cleaned.endswith("b.parquet")
-
-
-def test_runner_settings() -> None:
-    assert RunnerConfig().kind == "auto"
-    with pytest.raises(ValidationError, match="an address is that of a Dask or Ray cluster"):
-        RunnerConfig.model_validate({"kind": "processes", "address": "tcp://10.0.0.1:8786"})
-    with pytest.raises(ValidationError, match="Input should be 'auto'"):
-        RunnerConfig.model_validate({"kind": "slurm"})
 
 
 def test_the_runner_is_no_part_of_a_key() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 import stat
@@ -22,7 +21,7 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import find_files, inside, local_file, parse_location
+from worldline_core.data.guards.source_paths import inside, local_file, parse_location
 from worldline_core.scale.account import read_account
 from worldline_core.scale.mapping import RunnerConfig, SerialMapper
 from worldline_core.store import remote
@@ -30,7 +29,6 @@ from worldline_core.store.artifact_files import digest_folder
 from worldline_core.store.remote import RemoteCache, UnreachableInputError, list_files
 from worldline_core.store.store import ArtifactStore
 
-SHARED = Path(__file__).parents[3] / "shared" / "data"
 Make = Callable[..., tuple]
 
 pytestmark = pytest.mark.usefixtures("short_pauses")
@@ -208,39 +206,8 @@ def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, recording
     assert artifacts.input_digest(url) != first
 
 
-def test_files_are_found_as_in_a_folder(tmp_path: Path, recordings: Path, store: ObjectStore) -> None:
-    url = parse_location(store.upload(recordings, "find"))
-    for pattern in ("*.mp4", "*/*.parquet", "meta/*.json"):
-        local = [path.relative_to(recordings).as_posix() for path in find_files(recordings, pattern)]
-        assert [path.relative_to(url).as_posix() for path in find_files(url, pattern)] == local
-        assert local
-
-
 def test_a_set_can_be_opened_where_it_is(recordings: Path, store: ObjectStore) -> None:
     opened, local = EpisodeSet.open(parse_location(store.upload(recordings, "open"))), EpisodeSet.open(recordings)
     assert [row.episode_id for row in opened.rows] == [row.episode_id for row in local.rows]
     assert (opened.frames(2, "head") == local.frames(2, "head")).all()
     assert (opened.episode(1).state == local.episode(1).state).all()
-
-
-REAL = {
-    "agibot_gesim": ("agibot_gesim", {"kind": "agibot_gesim", "fps": 30.0}),
-    "droid": ("droid_ctrl_world", {"kind": "droid_annotation", "include": ["*-0001", "*-0002"]}),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", REAL)
-def test_real_samples_come_through_the_store(tmp_path: Path, store: ObjectStore, name: str) -> None:
-    folder, settings = REAL[name]
-    if not (SHARED / folder).is_dir():
-        pytest.skip("the real samples are not beside this checkout (../shared/data)")
-    url = store.upload(SHARED / folder, f"real-{name}")
-
-    def configured(path: object) -> CurateConfig:
-        source = {**settings, "path": str(path), "name": name}
-        return CurateConfig.model_validate({"sources": [source], "image_size": (48, 64), "min_frames": 1})
-
-    remote, local = (curate(configured(path), {}, tmp_path / str(n)) for n, path in enumerate((url, SHARED / folder)))
-    assert json.dumps(remote) == json.dumps(local)
-    assert digest_folder(tmp_path / "0") == digest_folder(tmp_path / "1")

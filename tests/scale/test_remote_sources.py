@@ -41,28 +41,6 @@ def robotwin(root: Path, sample: Any) -> dict[str, Any]:
     return {"kind": "robotwin", "fps": 10.0}
 
 
-def agibot_world(root: Path, sample: Any) -> dict[str, Any]:
-    pytest.importorskip("h5py")
-    writers("test_source_agibot_world").write_episode(root)
-    return {"kind": "agibot_world", "split": "train"}
-
-
-def enerverse_ac(root: Path, sample: Any) -> dict[str, Any]:
-    pytest.importorskip("h5py")
-    module = writers("test_source_enerverse_ac")
-    module.write_clip(root, "task_1/clip")
-    module.write_arrays(root, "task_2/clip", 40)
-    return {"kind": "enerverse_ac", "fps": 30}
-
-
-def unitree_h5(root: Path, sample: Any) -> dict[str, Any]:
-    pytest.importorskip("h5py")
-    module = writers("test_source_unitree_h5")
-    module.write_transitions(root)
-    module.write_hdf5(root, 1, 40)
-    return module.settings(root)
-
-
 def lerobot_v21(root: Path, sample: Any) -> dict[str, Any]:
     writers("test_lerobot").v21_dataset(root, {0: 6, 1: 6, 2: 5})
     return {
@@ -92,7 +70,7 @@ def video_folder(root: Path, sample: Any) -> dict[str, Any]:
 
 
 @pytest.mark.usefixtures("reading_in_this_process")  # which alone has a file system in memory
-@pytest.mark.parametrize("write", [robotwin, agibot_world, enerverse_ac, unitree_h5, lerobot_v21, mcap, video_folder])
+@pytest.mark.parametrize("write", [robotwin, lerobot_v21, mcap, video_folder])
 def test_the_same_bytes_from_a_folder_and_from_elsewhere(
     tmp_path: Path, sample: Callable[..., tuple], write: Callable[[Path, Any], dict[str, Any]]
 ) -> None:

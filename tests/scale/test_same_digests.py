@@ -90,36 +90,6 @@ def test_other_sizes_of_shards(recordings: Path, undisturbed: tuple[str, str], t
     assert both_digests(recordings, tmp_path, SerialMapper(RunnerConfig(episodes_per_shard=size))) == undisturbed
 
 
-CURATION = """
-import json, sys
-from pathlib import Path
-from tasks.execution.shard_mapper import shard_mapper
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.scale.mapping import RunnerConfig
-
-if __name__ == "__main__":
-    runner = RunnerConfig(kind="processes", workers=2, episodes_per_shard=3)
-    curate(CurateConfig.model_validate(json.loads(sys.argv[1])), {}, Path(sys.argv[2]), shard_mapper(runner))
-"""
-
-
-@pytest.mark.slow
-def test_processes_share_the_temporary_server(recordings: Path, tmp_path: Path, project_root: Path) -> None:
-    (tmp_path / "curation.py").write_text(CURATION)
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
-    environment |= {"PREFECT_HOME": str(tmp_path), "PYTHONPATH": str(project_root)}
-    ended = subprocess.run(
-        [sys.executable, "curation.py", config(recordings).model_dump_json(), "set"],
-        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
-    assert ended.returncode == 0, ended.stderr
-    assert len(read_account(tmp_path / "set")) == COUNT + 1
-    assert ended.stderr.count("Stopping temporary server") == 1
-    assert "Warning" not in ended.stderr
-    assert "failed to process" not in ended.stderr
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
 @pytest.mark.parametrize(("kind", "workers"), [("processes", 2), ("dask", 2), ("ray", 2)])
@@ -221,16 +191,3 @@ def test_an_unforeseen_error_is_a_quarantined_episode(
     assert any(line.startswith("worldline_core/data/curation/curate.py:") for line in evidence["trace"])
     assert str(tmp_path) not in row.evidence + row.detail
     assert "deadbeef" not in row.evidence + row.detail
-
-
-@pytest.mark.usefixtures("reading_in_this_process")
-def test_a_full_disk_ends_the_run(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import errno
-
-    def full(*_arguments: object, **_named: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(EpisodeSetWriter, "add", full)
-    with pytest.raises(OSError, match="No space left"):
-        curate(config(recordings), {}, tmp_path / "set")
-    assert EpisodeSetWriter(tmp_path / "set").rejected() == []

@@ -13,7 +13,7 @@ import pytest
 from number_work import NumberFileWork, NumberWork, attempts, do_numbers
 
 from tasks.execution.shard_mapper import shard_mapper
-from worldline_core.errors import DataError, UnavailableError
+from worldline_core.errors import DataError
 from worldline_core.scale.mapping import (
     Outcome,
     RunnerConfig,
@@ -112,44 +112,6 @@ def test_an_unreachable_input_is_said_after_all_else_is_done(tmp_path: Path) -> 
 def test_few_episodes_stay_in_this_process(tmp_path: Path) -> None:
     run(tmp_path, range(8, 12), 2, "auto", serial_below=5)
     assert processes(tmp_path) == {str(os.getpid())}
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("prefect_server")
-def test_a_bounded_number_of_shards_is_handed_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten shards wait as plain values; no more than `in_flight` are with the runner when one is answered."""
-    from prefect.task_runners import ThreadPoolTaskRunner
-
-    monkeypatch.setattr("tasks.execution.shard_mapper.process_runner", ThreadPoolTaskRunner)  # a thread starts at once
-    begun_before_taken: list[int] = []
-    config = RunnerConfig.model_validate({"kind": "processes", "workers": 1, "in_flight": 3})
-
-    class Watched:
-        """Notes how many numbers were begun, but not taken, whenever a shard is taken."""
-
-        def __init__(self) -> None:
-            self.inner = shard_mapper(config)
-            self.episodes_per_shard = self.inner.episodes_per_shard
-            self.done = 0
-
-        def run(self, shards: Sequence[Shard[Any]], *, one_at_a_time: bool = False) -> Iterator[Outcome]:
-            for shard, error in self.inner.run(shards, one_at_a_time=one_at_a_time):
-                begun_before_taken.append(len((tmp_path / "log.txt").read_text().splitlines()) - self.done)
-                self.done += len(shard)
-                yield shard, error
-
-    watched = Watched()
-    do_numbers(watched, tmp_path, range(20, 40), 2)
-    assert len(results(tmp_path)) == watched.done == 20
-    assert max(begun_before_taken) <= 3 * 2
-
-
-def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    monkeypatch.setitem(sys.modules, "prefect_ray", None)
-    with pytest.raises(UnavailableError, match="the extra `ray`"):
-        run(tmp_path, range(8, 10), 1, "ray")
 
 
 def test_workers_get_what_a_step_states_and_not_what_it_opened(tmp_path: Path) -> None:

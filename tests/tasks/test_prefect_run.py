@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import subprocess
 import sys
-import textwrap
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -24,7 +22,7 @@ from prefect.settings import PREFECT_API_URL, PREFECT_LOCAL_STORAGE_PATH, tempor
 from flows.pipeline import prepare, prepare_banks
 from tasks.execution.artifact_task import variant
 from tasks.execution.chain import outline
-from tasks.execution.prefect_artifacts import is_worth_saying, show_in_prefect
+from tasks.execution.prefect_artifacts import show_in_prefect
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
@@ -83,14 +81,6 @@ def test_equal_calls_are_one(declare: Any) -> None:
     assert list(outline(chain)) == ["write_first", "write_first.other"]
     with pytest.raises(ConfigError, match="write_first"):
         outline(lambda: [task.submit(config(text=text)) for text in "ab"])
-
-
-@pytest.mark.slow
-def test_prefect_shows_what_depends_on_what(storage: Path, two_calls: Callable[..., None]) -> None:
-    run(storage, two_calls)
-    runs = {run.name: run for run in task_runs(storage.parent.name, 2)}
-    waited_for = runs["write_next.second"].task_inputs["wait_for"]
-    assert [source.model_dump()["id"] for source in waited_for] == [runs["write_first"].id]
 
 
 @pytest.mark.slow
@@ -253,45 +243,3 @@ def test_a_step_that_breaks_ends_the_run_with_its_own_error(
     assert process.returncode != 0
     assert process.stdout.strip().splitlines()[-1] == "ValueError: this task breaks"
     assert "count.last: counting" not in process.stdout
-
-
-@pytest.mark.parametrize(("error", "shown"), [(DataError("x"), False), (KeyError("x"), True)])
-def test_an_error_that_says_what_to_do_is_logged_without_a_traceback(error: Exception, *, shown: bool) -> None:
-    record = logging.LogRecord(
-        "prefect.flow_runs", logging.ERROR, "", 0, "failed: %r", (error,), (type(error), error, None)
-    )
-    assert is_worth_saying(record)
-    assert (record.exc_info is not None) == shown
-    record.msg, record.args = "Crash detected! Execution was aborted by a termination signal.", None
-    assert not is_worth_saying(record)
-
-
-@pytest.mark.slow
-def test_a_process_of_the_pool_ends_with_the_one_that_started_it(project_root: Path) -> None:
-    code = """
-        import multiprocessing, os, time
-        from worldline_core.scale.process import end_with_pool
-
-        def work(pid):
-            end_with_pool()
-            pid.value = os.getpid()
-            time.sleep(60)
-
-        if __name__ == "__main__":
-            context = multiprocessing.get_context("fork")
-            pid = context.Value("i", 0)
-            context.Process(target=work, args=(pid,)).start()
-            while not pid.value:
-                time.sleep(0.05)
-            print(pid.value, flush=True)
-            os._exit(0)
-    """
-    result = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], cwd=project_root, capture_output=True, text=True, check=True,
-        env={**os.environ, "PYTHONPATH": str(project_root)}, timeout=120,
-    )  # fmt: skip
-    worker = int(result.stdout)
-    deadline = time.monotonic() + 20
-    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
-        time.sleep(0.2)
-    assert not Path(f"/proc/{worker}").exists()

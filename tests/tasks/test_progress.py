@@ -127,17 +127,3 @@ def test_a_terminal_has_a_bar_and_messages_stand_on_lines_of_their_own(project_r
     assert len(bars) > 2
     assert "20/20" in bars[-1]
     assert not re.search(r"\d of 20 steps", text)
-
-
-def test_everything_shows_its_progress_the_same_way(project_root: Path) -> None:
-    own = [path for path in project_root.glob("worldline_core/**/*.py") if "tqdm" in path.read_text(encoding="utf-8")]
-    assert [path.name for path in own] == ["progress.py"]
-    using = [path for path in project_root.glob("worldline_core/**/*.py") if "core.progress import" in path.read_text()]
-    assert {path.stem for path in using} >= {
-        "trainer",
-        "rollout",
-        "record",
-        "attempts",
-        "teacher_trajectories",
-        "mapping",
-    }

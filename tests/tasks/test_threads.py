@@ -12,8 +12,6 @@ import torch
 
 from tasks.execution.artifact_task import ArtifactTask
 from worldline_core.config import StrictModel
-from worldline_core.errors import ArtifactError
-from worldline_core.scale.process import same_threads
 from worldline_core.store.store import ArtifactStore
 
 seen: list[int] = []
@@ -57,13 +55,3 @@ def test_a_step_is_continued_on_the_threads_that_it_began_with(
     assert torch.get_num_threads() == 1
     manifest = json.loads((artifact.path / "manifest.json").read_text())
     assert manifest["environment"]["threads"] == 3
-
-
-@pytest.mark.parametrize("begun", ["8", 0, -1, 2.5, True, 10**6, 10**30])
-def test_a_number_of_threads_that_is_none_is_refused(tmp_path: Path, threads: int, begun: object) -> None:
-    """Left aside, the bytes would depend on where the work was stopped; believed, a million threads would be started."""
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "threads.json").write_text(json.dumps({"threads": begun}))
-    with pytest.raises(ArtifactError, match="Not a number of threads"), same_threads(tmp_path):
-        pass
-    assert torch.get_num_threads() == threads

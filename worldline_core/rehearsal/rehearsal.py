@@ -24,7 +24,6 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rehearsal.outside_models import write_outside_models
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.atomic import write_bytes_atomic
-from worldline_core.training.clip_config import ClipInput, FrameInput, LatentInput
 
 CHANGES_FILE = "changes.md"
 RECORDINGS, TWO_VIEW_RECORDINGS = "recordings", "recordings_two_views"
@@ -108,22 +107,6 @@ def changes_of(
     return [change for change in small if after[change.key] != change.published]
 
 
-def other_input(preset: str | None, path: Path | None, overrides: Sequence[str]) -> list[Change]:
-    """Changes of a second, shorter distillation that reads its clips the other way, cached latents or frames: laboratories
-    choose by the size of their disks.
-
-    Args:
-        overrides: those of the rehearsal.
-    """
-    config = load_config(PipelineConfig, preset=preset, path=path, overrides=overrides)
-    mine, stage2 = config.distill.input, config.train_stage2.input
-    other: ClipInput = LatentInput()
-    if not isinstance(mine, FrameInput):
-        other = stage2 if isinstance(stage2, FrameInput) else FrameInput(image_size=config.encode_latents.image_size)
-    read = Change("distill.input", mine.model_dump(), other.model_dump(), "the other way to read clips")
-    return [read, *changes_of(preset, path, overrides, (("distill.clips.lengths", [33], "two blocks"),))]
-
-
 def _larger(value: Any, small: Any) -> bool:
     if isinstance(value, int) and isinstance(small, int):
         return value > small
@@ -156,18 +139,17 @@ def _shown(value: Any) -> str:
 
 def prepare(
     folder: Path, preset: str | None, path: Path | None, overrides: Sequence[str], *, ablations: bool = True
-) -> tuple[list[Change], list[Change], list[Change]]:
+) -> tuple[list[Change], list[Change]]:
     """Write outside models, recordings and the list of changes into ``folder``; what is there already is kept.
 
-    Returns the changes, those of the second distillation besides, and those of the ablations.
+    Returns the changes, and those of the ablations.
 
     Raises:
         ConfigError: the configuration is not valid, or not with its changes, or has nothing to ablate.
     """
     changes = changes_of(preset, path, overrides)
     changed = [*overrides, *(change.override for change in changes)]
-    again = other_input(preset, path, changed)
-    lists = {"What the rehearsal changes; all else is as the file says": changes, "In the second distillation": again}
+    lists = {"What the rehearsal changes; all else is as the file says": changes}
     ablated: list[Change] = []
     if ablations:  # mistakes in their configuration are reported now, not at the end
         ablated = lists["In the ablations"] = changes_of(preset, path, changed, ABLATION_SIZES)
@@ -184,7 +166,7 @@ def prepare(
     for name, episodes, split in ((RECORDINGS, THREE_VIEWS, None), (TWO_VIEW_RECORDINGS, TWO_VIEWS, "test")):
         if not (folder / name / "index.parquet").is_file():
             write_recordings(folder / name, episodes, split=split)
-    return changes, again, ablated
+    return changes, ablated
 
 
 FPS, FRAMES = 30.0, 129

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from worldline_core.errors import ArtifactError
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_json_atomic
 
@@ -22,7 +21,6 @@ logger = logging.getLogger(__name__)
 
 _TRIM_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -4, -8  # malloc.h
 _NEVER = 2**31 - 1
-_MOST_THREADS = 1024
 
 
 def end_with_parent(end: Callable[[], object]) -> None:
@@ -59,8 +57,6 @@ def same_threads(output: Path) -> Iterator[None]:
         return
     path, now = output / "run" / "threads.json", torch.get_num_threads()
     begun = read_json(path).get("threads")
-    if not (begun is None or (type(begun) is int and 0 < begun <= _MOST_THREADS)):
-        raise ArtifactError("Not a number of threads", where=path, got=begun, next_step="delete the unfinished folder")
     if begun not in (None, now):
         logger.info("continuing on %d threads, as it began, instead of %d", begun, now)
         torch.set_num_threads(begun)

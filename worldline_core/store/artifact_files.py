@@ -193,23 +193,11 @@ def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
 
 
 def content_files(folder: Path, *, everything: bool = False) -> dict[str, JsonObject]:
-    """`size` [bytes] and `sha256` of every file of a folder's content by relative name, as a manifest lists them.
-
-    Raises:
-        ArtifactError: a listed file is gone when it is read, because something still writes to the folder.
-    """
-    try:
-        return {
-            path.relative_to(folder).as_posix(): {"size": path.stat().st_size, "sha256": digest_file(path)}
-            for path in folder_files(folder, everything=everything)
-        }
-    except FileNotFoundError as error:
-        raise ArtifactError(
-            "A file was gone when its folder was read",
-            where=error.filename or folder,
-            expected="a folder that nothing writes to, without links to nothing",
-            next_step="wait until what writes it is done (a recording, a copy), then run the command again",
-        ) from error
+    """`size` [bytes] and `sha256` of every file of a folder's content by relative name, as a manifest lists them."""
+    return {
+        path.relative_to(folder).as_posix(): {"size": path.stat().st_size, "sha256": digest_file(path)}
+        for path in folder_files(folder, everything=everything)
+    }
 
 
 def digest_listed(files: Mapping[str, JsonObject]) -> str:
