@@ -27,7 +27,7 @@ from worldline_core.evaluation.video.metrics_on_request import (
 )
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.report.context import ReportConfig, ReportContext
-from worldline_core.report.quality import quality_section
+from worldline_core.report.results import quality_section
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 
 ALWAYS = VideoEvaluationConfig(segmenters=("colour",), resamples=100)

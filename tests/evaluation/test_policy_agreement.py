@@ -9,7 +9,7 @@ from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
 from worldline_core.evaluation.policy.agreement import mmrv, pearson, policy_agreement, spearman
 from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
-from worldline_core.report.decisions import policy_ranking
+from worldline_core.report.results import policy_ranking
 
 OPTIONS = {"resamples": 400, "seed": 1}
 COMPARED = PolicyEvaluationConfig(

@@ -22,7 +22,7 @@ from worldline_core.evaluation.policy.trust import (
     trust_verdicts,
 )
 from worldline_core.pages.page import render
-from worldline_core.report.decisions import policy_evaluation
+from worldline_core.report.results import policy_evaluation
 
 OPTIONS = {"resamples": 200, "seed": 3}
 

@@ -147,10 +147,6 @@ class VideoScores:
         order = [*SPLIT_LABELS]
         return sorted(found, key=lambda g: (order.index(g) if g in order else 99, g))
 
-    def subgroups(self, split: str) -> list[str]:
-        """Groups within a split: embodiments and outcomes."""
-        return sorted({g for s in self.summaries for g in s.get("metrics", {}) if g.startswith(f"{split}/")})
-
     def methods(self, group: str) -> list[Method]:
         return in_order({m for s in self.summaries for m in s.get("metrics", {}).get(group, {})})
 

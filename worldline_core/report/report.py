@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from worldline_core.evaluation.scores import TRUE_METHOD
-from worldline_core.pages.page import NARROW_SPACE, Table, number, percent, render
+from worldline_core.pages.page import NARROW_SPACE, number, percent, render
 from worldline_core.progress import with_progress
 from worldline_core.report.context import (
     SPLIT_LABELS,
@@ -28,8 +28,7 @@ from worldline_core.report.context import (
     predicting,
 )
 from worldline_core.report.data import data_section
-from worldline_core.report.decisions import decisions_section, most_candidates
-from worldline_core.report.quality import constant_cost, quality_section
+from worldline_core.report.results import decisions_section, most_candidates, quality_section
 from worldline_core.report.training import provenance_section, training_section
 from worldline_core.report.videos import overview_video, videos_section
 from worldline_core.store.artifact_files import JsonObject, read_rows
@@ -165,8 +164,6 @@ def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
         figures=[figure for figure in figures if figure is not None],
         video=overview_video(context),
         entries=[(section, f"Missing: {section.missing}" if section.missing else what) for section, what in entries],
-        further=Table(("Number", "What it is", "How it was measured"), further_numbers(context, view)),
-        constant_cost=context.slot("constant_cost", constant_cost(context)),
     )
 
 
@@ -248,27 +245,3 @@ def episode_counts(context: ReportContext) -> tuple[int, int] | None:
     rows, refused = read_rows(curated / "index.parquet"), read_rows(curated / "quarantine.parquet")
     kept = len(rows) if filtered is None else len({row["episode_id"] for row in read_rows(filtered / "index.parquet")})
     return len(rows) + len(refused), kept
-
-
-def further_numbers(context: ReportContext, view: HeadView | None) -> list[list[object]]:
-    """Gains over shuffled controls and over a copy, the share that the causal model keeps, and the episodes kept."""
-    rows: list[list[object]] = []
-    if view is not None:
-        for kind, what in (
-            (f"{view.primary.kind}_shuffled", "robot IoU over the same weights with shuffled actions"),
-            ("copy", "robot IoU over copying the first frame"),
-        ):
-            found = view.difference(view.method(kind, view.primary.group, "baseline"))
-            if found is not None:
-                low, high = (number(float(found[key]), signed=True) for key in ("low", "high"))
-                how = f"{view.primary.long_label}, paired; 95{NARROW_SPACE}% interval {low} to {high}"
-                rows.append([number(float(found["mean"]), signed=True), what, how])
-        causal, main = view.value(view.method("causal", view.primary.group)), view.value(view.primary)
-        if causal and main and main["mean"]:
-            how = f"IoU {causal['mean']:.3f} against {view.primary.label}'s {main['mean']:.3f}"
-            rows.append([percent(causal["mean"] / main["mean"]), "of its robot IoU kept by the causal model", how])
-    counts = episode_counts(context)
-    if counts is not None:
-        how = "the rest is in quarantine, each with its reason"
-        rows.append([number(counts[1]), f"of {number(counts[0])} episodes kept", how])
-    return rows
