@@ -128,10 +128,7 @@ def test_joints_that_no_message_has(tmp_path: Path, toy: Any) -> None:
     joints = declared["arms"][0]["state"]["joints"]
     joints["names"] = ["a", "elbow"]
     error = rejection(declared)
-    assert (error.reason, error.expected) == ("missing_column", "position of a, elbow")
-    assert "joints a, b, finger" in str(error.got)
-    joints |= {"names": ["a", "b"], "field": "velocity"}
-    assert "0 velocity values" in str(rejection(declared).got)
+    assert (error.reason, error.expected, error.got) == ("missing_column", "a, elbow", "a, b, finger")
 
 
 def test_drivers_that_share_a_topic(tmp_path: Path, toy: Any) -> None:

@@ -105,7 +105,7 @@ def write(
     for number in range(200):
         time = number / 100
         joints = [{"name": name, "position": value} for name, value in zip("ab", toy.joints(time), strict=True)]
-        joints.append({"name": "finger", "position": float(toy.finger(time))})
+        joints += [{"name": "finger", "position": float(toy.finger(time))}, {"name": "silent"}]
         sent.append((time, "/joints", stamped("JointStates", time, joints=joints)))
     for number in range(100):
         time = number / 50
@@ -164,9 +164,9 @@ def test_protobuf_messages_come_back(tmp_path: Path, toy: Any, foxglove: dict[st
     assert episode.cameras["head"].moving
     assert episode.T_base_ee is not None
     assert np.abs(episode.T_base_ee[:, 0] - episode.cameras["head"].T_base_camera).max() < 1e-9
-    velocity = declared(tmp_path)
-    velocity["arms"][0]["state"]["joints"]["field"] = "velocity"  # not set in any message
-    assert np.isnan(load(velocity).episode.state[:, :2]).all()
+    silent = declared(tmp_path)
+    silent["arms"][0]["state"]["joints"]["names"] = ["a", "silent"]  # not set in any message, and not 0
+    assert np.isnan(load(silent).episode.state).tolist() == [[False, True, False]] * episode.num_frames
 
 
 def test_json_messages_are_read_like_protobuf(tmp_path: Path, toy: Any, foxglove: dict[str, Any]) -> None:

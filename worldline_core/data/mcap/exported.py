@@ -23,7 +23,6 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
-from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 from mcap_ros2.writer import Writer as Ros2Writer
@@ -33,8 +32,7 @@ from worldline_core.data.episodes.recorded_poses import RecordedCameras, rejecte
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.plain_files import expect_layout, parse_json
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
-from worldline_core.data.mcap.file import McapFile, Stream
-from worldline_core.data.mcap.images import ImageTrack
+from worldline_core.data.mcap.file import ImageTrack, McapFile, Stream
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, Transform
 from worldline_core.data.mcap.resampling import add_camera
 from worldline_core.data.video.frames import Frames, MadeFrames, in_step
@@ -120,21 +118,49 @@ def write_rollout_mcap(
 def _new_file(path: Path, name: str, metadata: Mapping[str, str], encoding: Encoding) -> Iterator[_Messages]:
     """A file with a metadata record, which appears when its messages are complete."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        messages = _Ros2Messages(stream) if encoding == "ros2" else _FoxgloveMessages(stream)
+        messages = _Messages(stream, encoding)
         messages.writer.add_metadata(name, dict(metadata))
         yield messages
         messages.writer.finish()
 
 
 class _Messages:
-    """Writes messages of the time `time_ns`, given in the fields of Foxglove's schemas."""
+    """Writes messages of the time `time_ns`, given in the fields of Foxglove's schemas.
 
-    writer: Writer | Ros2Writer
-    static_transforms: str
-    time_ns = 0
+    `protobuf`: with the descriptors that Foxglove publishes; `ros2`: in CDR, as the equivalents of sensor_msgs and tf2_msgs.
+    """
+
+    def __init__(self, stream: BinaryIO, encoding: Encoding) -> None:
+        self.time_ns = 0
+        self.writer: Writer | Ros2Writer
+        self._schemas: dict[str, Any] = {}
+        self._channels: dict[str, int] = {}
+        if encoding == "ros2":
+            self.writer, self._static_transforms = (
+                Ros2Writer(stream, compression=CompressionType.ZSTD),
+                STATIC_TRANSFORMS,
+            )
+        else:
+            self.writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
+            self.writer.start(profile="", library="worldline")
+            self._static_transforms = "/tf"
 
     def add(self, topic: str, schema: _Schema, message: Message) -> None:
-        raise NotImplementedError
+        seconds, nanoseconds = divmod(self.time_ns, 10**9)
+        if isinstance(self.writer, Ros2Writer):
+            name, converted = _ROS2[schema]
+            if schema not in self._schemas:
+                self._schemas[schema] = self.writer.register_msgdef(name.replace("/", "/msg/"), _definition(name))
+            content = converted(message, {"sec": seconds, "nanosec": nanoseconds})
+            self.writer.write_message(topic, self._schemas[schema], content, self.time_ns)
+            return
+        kind = _PROTOBUF[schema]
+        if schema not in self._schemas:
+            self._schemas[schema] = register_schema(self.writer, kind)
+        if topic not in self._channels:
+            self._channels[topic] = self.writer.register_channel(topic, "protobuf", self._schemas[schema])
+        data = kind(timestamp={"seconds": seconds, "nanos": nanoseconds}, **message).SerializeToString()
+        self.writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns)
 
     def add_poses(self, index: int, cameras: Mapping[str, CameraTrack], T_base_ee: np.ndarray | None) -> None:
         """Calibrations and fixed cameras with the first frame; moving cameras and tools with every frame."""
@@ -143,7 +169,7 @@ class _Messages:
                 self.add(f"/{view}/calibration", "CameraCalibration", _calibration(camera))
             if index == 0 or camera.moving:
                 pose = camera.T_base_camera[index if camera.moving else 0]
-                topic = "/tf" if camera.moving else self.static_transforms
+                topic = "/tf" if camera.moving else self._static_transforms
                 self.add(topic, "FrameTransform", _transform(f"{view}_camera", pose))
         for arm, pose in enumerate(T_base_ee[index] if T_base_ee is not None else ()):
             self.add("/tf", "FrameTransform", _transform(f"tool_{arm}", pose))
@@ -152,46 +178,6 @@ class _Messages:
         """By kind (image, robot_mask) and view."""
         for (kind, view), image in images.items():
             self.add(f"/{view}/{kind}", "CompressedImage", _image(image, f"{view}_camera", image_format))
-
-
-class _FoxgloveMessages(_Messages):
-    """Messages in protobuf, with the descriptors that Foxglove publishes."""
-
-    static_transforms = "/tf"
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self.writer = self._writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
-        self._writer.start(profile="", library="worldline")
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-
-    def add(self, topic: str, schema: _Schema, message: Message) -> None:
-        kind = _PROTOBUF[schema]
-        if schema not in self._schemas:
-            self._schemas[schema] = register_schema(self._writer, kind)
-        if topic not in self._channels:
-            self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[schema])
-        seconds, nanoseconds = divmod(self.time_ns, 10**9)
-        data = kind(timestamp={"seconds": seconds, "nanos": nanoseconds}, **message).SerializeToString()
-        self._writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns)
-
-
-class _Ros2Messages(_Messages):
-    """Messages in CDR, as the equivalents of sensor_msgs and tf2_msgs."""
-
-    static_transforms = STATIC_TRANSFORMS
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self.writer = self._writer = Ros2Writer(stream, compression=CompressionType.ZSTD)
-        self._schemas: dict[str, Schema] = {}
-
-    def add(self, topic: str, schema: _Schema, message: Message) -> None:
-        name, converted = _ROS2[schema]
-        if name not in self._schemas:
-            self._schemas[name] = self._writer.register_msgdef(name.replace("/", "/msg/"), _definition(name))
-        seconds, nanoseconds = divmod(self.time_ns, 10**9)
-        content = converted(message, {"sec": seconds, "nanosec": nanoseconds})
-        self._writer.write_message(topic, self._schemas[name], content, self.time_ns)
 
 
 _PROTOBUF: dict[_Schema, Any] = {
@@ -212,7 +198,6 @@ def _metadata(episode: Episode, views: list[str]) -> dict[str, str]:
         "video_frames": episode.video_frames,
         "num_arms": 0 if episode.T_base_ee is None else int(episode.T_base_ee.shape[1]),
         "gripper": None if episode.gripper is None else np.asarray(episode.gripper, np.float64).tolist(),
-        "image_format": "png",
     }
     return {key: json.dumps(value, sort_keys=True) for key, value in values.items()}
 
@@ -250,8 +235,8 @@ def _transform(child: str, pose: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _compressed_image(message: Message, stamp: Message) -> Message:
-    return {**_headed(message, stamp), "format": message["format"], "data": message["data"]}
+def _headed(message: Message, stamp: Message) -> dict[str, Any]:
+    return {"header": {"stamp": stamp, "frame_id": message["frame_id"]}}
 
 
 def _camera_info(message: Message, stamp: Message) -> Message:
@@ -272,12 +257,8 @@ def _joint_state(message: Message, stamp: Message) -> Message:
     return {"header": header, "name": names, "position": positions, "velocity": [], "effort": []}
 
 
-def _headed(message: Message, stamp: Message) -> dict[str, Any]:
-    return {"header": {"stamp": stamp, "frame_id": message["frame_id"]}}
-
-
 _ROS2: dict[_Schema, tuple[str, Callable[[Message, Message], Message]]] = {
-    "CompressedImage": ("sensor_msgs/CompressedImage", _compressed_image),
+    "CompressedImage": ("sensor_msgs/CompressedImage", lambda message, stamp: {**_headed(message, stamp), **message}),
     "CameraCalibration": ("sensor_msgs/CameraInfo", _camera_info),
     "FrameTransform": ("tf2_msgs/TFMessage", _tf_message),
     "JointStates": ("sensor_msgs/JointState", _joint_state),
@@ -310,18 +291,13 @@ _ROS2_FIELDS: dict[str, tuple[str, ...]] = {
 
 def _definition(name: str) -> str:
     """Text of a message type: its own fields, then those of every type in them."""
-    parts: dict[str, str] = {}
-
-    def collect(found: str) -> None:
-        parts.setdefault(found, "\n".join(_ROS2_FIELDS[found]))
-        for field in _ROS2_FIELDS[found]:
-            kind = field.split()[0].split("[")[0]
-            if kind in _ROS2_FIELDS and kind not in parts:
-                collect(kind)
-
-    collect(name)
-    own, *others = parts.items()
-    return "".join([own[1], *(f"\n{'=' * 80}\nMSG: {kind}\n{fields}" for kind, fields in others)])
+    types = [name]
+    for kind in types:  # grows
+        inner = [field.split()[0].split("[")[0] for field in _ROS2_FIELDS[kind]]
+        types += [found for found in dict.fromkeys(inner) if found in _ROS2_FIELDS and found not in types]
+    fields = ["\n".join(_ROS2_FIELDS[kind]) for kind in types]
+    others = zip(types[1:], fields[1:], strict=True)
+    return fields[0] + "".join(f"\n{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in others)
 
 
 def exported_episode_id(file: McapFile) -> str:
@@ -356,13 +332,8 @@ def _read_metadata(file: McapFile) -> dict[str, Any]:
     where = f"{file.path}, {EPISODE_METADATA}"
     about = {key: parse_json(value, where) for key, value in file.metadata[EPISODE_METADATA].items()}
     if about.get("format_version") != FORMAT_VERSION:
-        raise RejectedInputError(
-            "unreadable",
-            "MCAP episode has another version",
-            where=file.path,
-            expected=FORMAT_VERSION,
-            got=about.get("format_version"),
-        )
+        what, found = "MCAP episode has another version", about.get("format_version")
+        raise RejectedInputError("unreadable", what, where=file.path, expected=FORMAT_VERSION, got=found)
     return about
 
 
@@ -434,12 +405,9 @@ def _track(file: McapFile, stream: Stream, camera: CameraTrack | None = None) ->
 def _poses(found: Mapping[str, list[Transform]], child: str, count: int, file: McapFile) -> np.ndarray:
     transforms = found.get(child, [])
     if len(transforms) != count:
+        where = f"{file.path}, frame {child}"
         raise RejectedInputError(
-            "missing_calibration",
-            "Transforms are missing",
-            where=f"{file.path}, frame {child}",
-            expected=count,
-            got=len(transforms),
+            "missing_calibration", "Transforms are missing", where=where, expected=count, got=len(transforms)
         )
     values = np.array([transform.values for transform in transforms], dtype=np.float64)
     with rejected_as("invalid_extrinsics", f"{file.path}, frame {child}", {"frame": child}):

@@ -1,4 +1,4 @@
-"""One MCAP file: checked before it is unpacked, its topics, and the messages of chosen topics in the order of the file.
+"""One MCAP file: checked before it is unpacked, its topics, the messages of chosen topics, and their images.
 
 The library trusts a chunk's header: it allocates what a zstd frame claims, and unpacks an lz4 frame to its end, up to 255
 bytes per byte. The size of every chunk is therefore checked first. Records (https://mcap.dev/spec): an opcode, a length
@@ -15,10 +15,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
+import av
+import av.error
+import cv2
 import lz4.frame
+import numpy as np
 import zstandard
+from av.video.codeccontext import VideoCodecContext
 from mcap.exceptions import McapError
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader
 from mcap.records import Channel, Footer, Schema
@@ -26,9 +31,11 @@ from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 
-from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, too_large
+from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.data.guards.plain_files import decode_image
+from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
-from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, MessageDecoder
+from worldline_core.data.mcap.messages import IMAGE_KINDS, EncodedImage, Kind, MessageDecoder, RawImage
 
 # What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
 _DAMAGE = (
@@ -41,6 +48,15 @@ _FOOTER_BYTES = 9 + 20
 _LZ4_RATIO = 255
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
 _SMALLEST_BYTES = 2 * len(_MAGIC) + _FOOTER_BYTES
+_CODECS = {"h264": "h264", "h265": "hevc"}
+# ROS and Foxglove name -> bytes per pixel, and OpenCV's conversion to RGB.
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+}
 
 
 @dataclass
@@ -65,19 +81,13 @@ class Stream:
 
     @property
     def has_header(self) -> bool:
-        """Whether the schema has a header time."""
         return bool(self.stamps_ns) and self.stamps_ns[0] is not None
-
-    @property
-    def has_header_times(self) -> bool:
-        """Whether the times are set: a simulated clock is 0 once, a driver that sets none writes 0 always."""
-        return None not in self.stamps_ns and self.stamps_ns.count(0) <= 1
 
 
 class McapFile:
     """Read access to one file, which is open only while it is read.
 
-    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (damaged, not finished).
+    Every method raises RejectedInputError: missing_file, special_file, too_large, unreadable (damaged, not finished).
     """
 
     def __init__(self, path: AnyPath) -> None:
@@ -97,10 +107,7 @@ class McapFile:
             return summary
 
     def check_sums(self) -> None:
-        """Compares the whole file with the checksums of its data and its summary (0: none).
-
-        Raises: RejectedInputError (unreadable) where a byte differs.
-        """
+        """Compares the whole file with the checksums of its data and its summary (0: none)."""
         path = regular_file(self.path, "MCAP file")
         with _damage_as_rejection(self.path), path.open("rb") as stream:
             reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
@@ -161,10 +168,7 @@ class McapFile:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, Kind, int, int | None, Any]]:
-        """(topic, kind, log time, header time or None, content) of these topics' messages with start <= log time < stop.
-
-        Raises: RejectedInputError: unknown_schema, unreadable.
-        """
+        """(topic, kind, log time, header time or None, content) of these topics' messages with start <= log time < stop."""
         for schema, channel, record in self._records(topics, start_ns, stop_ns):
             kind, stamp_ns, value = self._decoder.decode(channel, schema, record.data)
             yield channel.topic, kind, record.log_time, stamp_ns, value
@@ -174,7 +178,7 @@ class McapFile:
     ) -> dict[str, Stream]:
         """Messages with start <= log time < stop by topic, for the topics of `roles` (topic -> accepted kinds).
 
-        Raises: RejectedInputError: unknown_schema for a topic with messages of another kind, or of several; unreadable.
+        Raises: RejectedInputError (unknown_schema) for a topic with messages of another kind, or of several.
         """
         streams: dict[str, Stream] = {}
         for topic, kind, log_ns, stamp_ns, value in self.messages(roles, start_ns, stop_ns):
@@ -269,10 +273,7 @@ def check_chunks(path: Path, where: object) -> list[int]:
 
 
 def _unpacked_bytes(stream: BinaryIO, length: int) -> int:
-    """Size that the chunk record at the stream's position unpacks to: the larger of its header's and its frame's claim.
-
-    Raises: ValueError, or what the decompressors raise, for a damaged chunk.
-    """
+    """Size that the chunk record at the stream's position unpacks to: the larger of its header's and its frame's claim."""
     *_, declared, _, name_length = struct.unpack("<QQQII", stream.read(32))
     if name_length > 32:
         raise ValueError(f"a name of a compression of {name_length} bytes")
@@ -287,3 +288,159 @@ def _unpacked_bytes(stream: BinaryIO, length: int) -> int:
         frame = lz4.frame.LZ4FrameDecompressor().decompress(stream.read(packed_length), max_length=MAX_CHUNK_BYTES + 1)
         return max(declared, len(frame))
     return declared
+
+
+# Images: read in order of time, each decoded only when an instant needs it.
+
+
+@dataclass(frozen=True)
+class ImageTrack:
+    """Frames of a view as images of a topic.
+
+    Attributes:
+        around_ns: log times between which the topic's messages were counted; None: the file's beginning or end.
+        order: (n,) index in the file of the i-th message in time.
+        chosen: (t,) index in time of each frame's image; ascending, an image may repeat.
+        key_frames: of a video, (n,) in order of time, whether decoding can begin there.
+        camera: the images must have its calibrated size; None: any size.
+    """
+
+    file: McapFile
+    topic: str
+    kind: Kind
+    around_ns: tuple[int | None, int | None]
+    order: np.ndarray
+    chosen: np.ndarray
+    key_frames: np.ndarray | None = None
+    camera: CameraTrack | None = None
+
+    def frames(self) -> Iterator[np.ndarray]:
+        """uint8 (H, W, 3) RGB of each frame, in order.
+
+        Raises: RejectedInputError: unreadable, truncated_video, too_large; missing_calibration when the images are not of
+            the size that is calibrated.
+        """
+        where = f"{self.file.path}, topic {self.topic}"
+        decoded = self._video(where) if self.kind == "video" else self._images(where)
+        number, image = next(decoded)
+        shape = image.shape
+        if self.camera is not None and shape[:2] != (self.camera.height, self.camera.width):
+            raise RejectedInputError(
+                "missing_calibration",
+                "Calibration belongs to another image size",
+                where=f"{where}, view {self.camera.view}",
+                expected=f"{shape[1]}x{shape[0]}",
+                got=f"{self.camera.width}x{self.camera.height}",
+            )
+        for wanted in self.chosen:
+            while number < wanted:
+                number, image = next(decoded)
+            if image.shape != shape:
+                what = "Images of a topic differ in size"
+                raise RejectedInputError("unreadable", what, where=where, expected=shape[:2], got=image.shape[:2])
+            yield image
+
+    def _images(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
+        for number, value in self._in_time(np.unique(self.chosen)):
+            place = f"{where}, image {number}"
+            yield number, _raw_pixels(value, place) if isinstance(value, RawImage) else decode_image(value.data, place)
+
+    def _video(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
+        """Frames from the last key frame before the first chosen one on."""
+        keys = np.flatnonzero([] if self.key_frames is None else self.key_frames[: self.chosen[0] + 1])
+        if not len(keys):
+            what = "No key frame comes before the first frame of the episode"
+            raise RejectedInputError("truncated_video", what, where=where, next_step="begin the episode later")
+        numbers = np.arange(keys[-1], self.chosen[-1] + 1)
+        expected = iter(numbers)
+        for number, image in _decoded(self._in_time(numbers), where):
+            if number != next(expected, None):
+                raise _lost_frame(f"{where}, frame {number}")
+            yield number, image
+        if next(expected, None) is not None:
+            raise _lost_frame(where)
+
+    def _in_time(self, numbers: np.ndarray) -> Iterator[tuple[int, Any]]:
+        """(index in time, content) of the messages with these indices, ascending."""
+        place = {int(message): number for number, message in enumerate(self.order)}
+        waiting: dict[int, Any] = {}
+        wanted = [int(number) for number in numbers]
+        needed, done = set(wanted), 0
+        for message, (*_, value) in enumerate(self.file.messages([self.topic], *self.around_ns)):
+            number = place.get(message, -1)
+            if number in needed:
+                waiting[number] = value
+            while done < len(wanted) and wanted[done] in waiting:
+                yield wanted[done], waiting.pop(wanted[done])
+                done += 1
+            if done == len(wanted):
+                return
+        what = "File holds fewer images than when it was first read"
+        where = f"{self.file.path}, topic {self.topic}"
+        raise RejectedInputError("changed_while_reading", what, where=where, expected=len(wanted), got=done)
+
+
+def frames_after_loss(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray) -> np.ndarray:
+    """(n,) bool: video frames between a gap of more than 1.5 steps and the next key frame.
+
+    After a lost message a decoder returns wrong pictures, without an error, until the next key frame; so the loss is detected
+    by the times of the messages.
+    """
+    lost = np.concatenate([[False], np.diff(times_ns) > 1.5 * step_ns])
+    last_loss = np.maximum.accumulate(np.where(lost, np.arange(len(lost)), -1))
+    last_key = np.maximum.accumulate(np.where(key_frames, np.arange(len(lost)), -1))
+    return last_loss > last_key
+
+
+def _decoded(messages: Iterator[tuple[int, EncodedImage]], where: str) -> Iterator[tuple[int, np.ndarray]]:
+    """(index in time, RGB) of video messages, each one frame in Annex B."""
+    decoder: VideoCodecContext | None = None
+    try:
+        for number, image in messages:
+            if decoder is None:
+                if image.format not in _CODECS:
+                    what, expected = "Video codec is not supported", " or ".join(_CODECS)
+                    raise RejectedInputError("unknown_schema", what, where=where, expected=expected, got=image.format)
+                decoder = cast("VideoCodecContext", VideoCodecContext.create(_CODECS[image.format], "r"))
+                decoder.thread_type = "NONE"
+            packet = av.Packet(image.data)
+            packet.pts = packet.dts = number
+            for frame in decoder.decode(packet):
+                yield _picture(frame, where)
+        for frame in decoder.decode(None) if decoder is not None else ():
+            yield _picture(frame, where)
+    except av.error.FFmpegError as error:
+        raise RejectedInputError("truncated_video", "Video cannot be decoded", where=where, got=str(error)) from error
+
+
+def _picture(frame: av.VideoFrame, where: str) -> tuple[int, np.ndarray]:
+    check_image_size(frame.width, frame.height, where)
+    if frame.is_corrupt or frame.pts is None:
+        raise _lost_frame(f"{where}, frame {frame.pts}")
+    return int(frame.pts), frame.to_ndarray(format="rgb24")
+
+
+def _lost_frame(where: str) -> RejectedInputError:
+    expected = "one frame per message, each decodable from those before it"
+    return RejectedInputError(
+        "truncated_video",
+        "Video frames are missing or damaged",
+        where=where,
+        expected=expected,
+        next_step="cut the recording at the damage",
+    )
+
+
+def _raw_pixels(image: RawImage, where: str) -> np.ndarray:
+    if image.encoding not in _ENCODINGS:
+        what, expected = "Pixel encoding is not supported", ", ".join(_ENCODINGS)
+        raise RejectedInputError("unreadable", what, where=where, expected=expected, got=image.encoding)
+    channels, conversion = _ENCODINGS[image.encoding]
+    check_image_size(image.width, image.height, where)
+    if image.step < image.width * channels or len(image.data) != image.step * image.height:
+        what = "Image has another number of bytes than its size"
+        expected = f"{image.height} rows of {image.step} bytes, at least {image.width * channels} each"
+        raise RejectedInputError("unreadable", what, where=where, expected=expected, got=f"{len(image.data)} bytes")
+    rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
+    pixels = rows[:, : image.width * channels].reshape(image.height, image.width, channels)
+    return np.ascontiguousarray(pixels) if conversion is None else cv2.cvtColor(pixels, conversion)

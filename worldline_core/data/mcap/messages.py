@@ -10,6 +10,7 @@ import base64
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -109,12 +110,10 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Joints:
-    """Readings by joint; a field may be empty."""
+    """Positions by joint; NaN where a message leaves one out, empty where it has none."""
 
     names: tuple[str, ...]
     position: tuple[float, ...]
-    velocity: tuple[float, ...]
-    effort: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,15 +154,6 @@ def _numbers(values: Any) -> tuple[float, ...]:
     return tuple(float(value) for value in ([values] if isinstance(values, int | float) else values))
 
 
-def _encoded(raw: Any) -> EncodedImage:
-    return EncodedImage(_frame(raw), _bytes(raw.data), str(raw.format))
-
-
-def _raw_image(raw: Any) -> RawImage:
-    size = int(raw.width), int(raw.height), int(raw.step)
-    return RawImage(_frame(raw), _bytes(raw.data), str(raw.encoding), *size)
-
-
 def _calibration(raw: Any) -> Calibration:
     binning, roi = (0, 0), (0, 0, 0, 0)
     if hasattr(raw, "binning_x"):
@@ -175,26 +165,17 @@ def _calibration(raw: Any) -> Calibration:
 
 def _joints(raw: Any) -> Joints:
     if not hasattr(raw, "joints"):
-        velocity, effort = (_numbers(getattr(raw, field, ())) for field in ("velocity", "effort"))
-        return Joints(tuple(str(name) for name in raw.name), _numbers(raw.position), velocity, effort)
-    joints = list(raw.joints)  # foxglove.JointStates: a record for each joint, with optional readings
-    position, velocity, effort = (
-        tuple(float(getattr(joint, field)) if _is_set(joint, field) else float("nan") for joint in joints)
-        for field in ("position", "velocity", "effort")
-    )
-    return Joints(tuple(str(joint.name) for joint in joints), position, velocity, effort)
-
-
-def _is_set(raw: Any, name: str) -> bool:
-    """Whether an optional field has a value; protobuf returns 0 for an unset number."""
-    return bool(raw.HasField(name)) if hasattr(raw, "HasField") else hasattr(raw, name)
+        return Joints(tuple(map(str, raw.name)), _numbers(raw.position))
+    # foxglove.JointStates: a record for each joint with optional readings; protobuf returns 0 for an unset number.
+    joints = list(raw.joints)
+    unset = [not (j.HasField if hasattr(j, "HasField") else partial(hasattr, j))("position") for j in joints]
+    values = (float("nan") if empty else float(j.position) for j, empty in zip(joints, unset, strict=True))
+    return Joints(tuple(str(joint.name) for joint in joints), tuple(values))
 
 
 def _pose_values(position: Any, orientation: Any) -> tuple[float, ...]:
-    return (
-        *(float(getattr(position, axis)) for axis in "xyz"),
-        *(float(getattr(orientation, axis)) for axis in "xyzw"),
-    )
+    both = [*(getattr(position, axis) for axis in "xyz"), *(getattr(orientation, axis) for axis in "xyzw")]
+    return tuple(map(float, both))
 
 
 def _transform(raw: Any) -> Transform:
@@ -211,20 +192,17 @@ def _pose(raw: Any) -> Transform:
     return Transform(_frame(raw).lstrip("/"), "", _header_time(raw) or 0, values)
 
 
-def _marker(raw: Any) -> str:
-    return str(raw.data).lower() if isinstance(raw.data, bool) else str(raw.data)
-
-
 _READERS: dict[Kind, Callable[[Any], Any]] = {
-    "image": _encoded,
-    "video": _encoded,
-    "raw_image": _raw_image,
+    **dict.fromkeys(("image", "video"), lambda raw: EncodedImage(_frame(raw), _bytes(raw.data), str(raw.format))),
+    "raw_image": lambda raw: RawImage(
+        _frame(raw), _bytes(raw.data), str(raw.encoding), int(raw.width), int(raw.height), int(raw.step)
+    ),
     "calibration": _calibration,
     "joints": _joints,
     "numbers": lambda raw: _numbers(raw.data),
     "transforms": lambda raw: tuple(map(_transform, raw.transforms if hasattr(raw, "transforms") else [raw])),
     "pose": _pose,
-    "marker": _marker,
+    "marker": lambda raw: str(raw.data).lower() if isinstance(raw.data, bool) else str(raw.data),
 }
 
 

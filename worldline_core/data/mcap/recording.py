@@ -11,11 +11,9 @@ from worldline_core.data.episodes.episode import REPEATS_STATE, CameraTrack, Epi
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap.file import McapFile, Stream
-from worldline_core.data.mcap.images import ImageTrack, frames_after_loss
+from worldline_core.data.mcap.file import ImageTrack, McapFile, Stream, frames_after_loss
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Calibration, Joints, Kind
 from worldline_core.data.mcap.resampling import (
-    Arrivals,
     Clocks,
     TransformTree,
     add_camera,
@@ -23,7 +21,6 @@ from worldline_core.data.mcap.resampling import (
     checked_poses,
     in_order,
     instants,
-    largest_distance_ms,
     nearest,
     resampled,
     resampled_poses,
@@ -76,22 +73,15 @@ class Segment:
 
 @dataclass(frozen=True)
 class _Signal:
-    """Measurements of a topic in order of time, (n, d)."""
+    """Measurements of a topic in order of time, (n, d) at (n,)."""
 
     topic: str
-    arrivals: Arrivals
+    times_ns: np.ndarray
     values: np.ndarray
-
-    @property
-    def times_ns(self) -> np.ndarray:
-        return self.arrivals.times_ns
 
 
 class _Recording:
-    """Topics of one episode, before resampling.
-
-    Raises: RejectedInputError with the reason.
-    """
+    """Topics of one episode, before resampling; every fault is a RejectedInputError."""
 
     def __init__(self, config: McapTopicsSourceConfig, file: McapFile, segment: Segment) -> None:
         self.config, self.file = config, file
@@ -102,7 +92,7 @@ class _Recording:
             None if stop is None else stop + _READING_MARGIN_NS,
         )
         self.streams = self._read_streams()
-        self.clocks = clocks = Clocks.from_streams(config, self.streams, file.path)
+        self.clocks = clocks = Clocks(config, self.streams, file.path)
         self.start_ns, self.stop_ns = (None if t is None else t - clocks.header_to_log_ns for t in (start, stop))
         self.signals = {readings: self._signal(readings) for readings in config.readings}
         self.tools: dict[str, _Signal] = {}
@@ -130,10 +120,7 @@ class _Recording:
         return f"{self.file.path}, topic {topic}"
 
     def _read_streams(self) -> dict[str, Stream]:
-        """Every topic that the episode needs; a missing transform is reported where a pose needs it.
-
-        Raises: RejectedInputError (missing_topic) for one that is not in the file, or silent during the episode.
-        """
+        """Every topic that the episode needs; a missing transform is reported where a pose needs it."""
         topics = self.config.topics
         roles: dict[str, tuple[Kind, ...]] = {
             topic: kinds for role, kinds in _KINDS.items() if role != "transforms" for topic in sorted(topics[role])
@@ -144,21 +131,12 @@ class _Recording:
         streams = self.file.streams(roles, *self.around_ns)
         silent = sorted(needed - set(streams))
         if silent:
-            counts = ", ".join(f"{topic}: {len(stream.log_ns)}" for topic, stream in sorted(streams.items()))
-            raise RejectedInputError(
-                "missing_topic",
-                "A topic has no messages during the episode",
-                where=self.file.path,
-                expected=", ".join(silent),
-                got=counts or "no messages",
-            )
+            what = "A topic has no messages during the episode"
+            raise RejectedInputError("missing_topic", what, where=self.file.path, expected=", ".join(silent))
         return streams
 
     def _signal(self, readings: TopicReadings) -> _Signal:
-        """The declared numbers of a topic; messages with other joints (several drivers may share it) are left out.
-
-        Raises: RejectedInputError: missing_column where no message has the joints or columns; clock_jump.
-        """
+        """The declared numbers of a topic; messages with other joints (several drivers may share it) are left out."""
         stream = self.streams[readings.topic]
         taken: list[int] = []
         rows: list[list[float]] = []
@@ -166,55 +144,36 @@ class _Recording:
             if not isinstance(value, Joints):
                 columns, numbers = readings.columns, value
             elif readings.names is not None and set(readings.names) <= set(value.names):
-                columns, numbers = [value.names.index(name) for name in readings.names], getattr(value, readings.field)
+                columns, numbers = [value.names.index(name) for name in readings.names], value.position
             else:
                 columns, numbers = None, ()
             if columns is not None and max(columns) < len(numbers):
                 taken.append(number)
                 rows.append([numbers[column] for column in columns])
         if not rows:
-            raise self._missing(stream, readings)
+            raise RejectedInputError(
+                "missing_column",
+                "No message of a topic has the declared joints or columns",
+                where=self.at(stream.topic),
+                expected=", ".join(readings.names or map(str, readings.columns or ())),
+                got=", ".join(sorted({name for v in stream.values for name in getattr(v, "names", ())})) or "an array",
+            )
         arrivals = in_order(self.clocks.times_ns(stream)[taken], self.at(stream.topic))
-        return _Signal(stream.topic, arrivals, np.array(rows, np.float64)[arrivals.order])
-
-    def _missing(self, stream: Stream, readings: TopicReadings) -> RejectedInputError:
-        first = stream.values[0]
-        if isinstance(first, Joints):
-            known = sorted({name for value in stream.values for name in value.names})
-            got = f"joints {', '.join(known)}; {len(getattr(first, readings.field))} {readings.field} values"
-        else:
-            got = f"{len(first)} columns"
-        wanted = readings.names if readings.names is not None else tuple(map(str, readings.columns or ()))
-        return RejectedInputError(
-            "missing_column",
-            "No message of a topic has the declared joints or columns",
-            where=self.at(stream.topic),
-            expected=f"{readings.field} of {', '.join(wanted)}",
-            got=got,
-        )
+        return _Signal(stream.topic, arrivals.times_ns, np.array(rows, np.float64)[arrivals.order])
 
     def _tool(self, topic: str) -> tuple[_Signal, str]:
-        """Poses (n, 7) of a topic, and the frame that they are given in.
-
-        Raises: RejectedInputError: invalid_tool_pose, clock_jump.
-        """
+        """Poses (n, 7) of a topic, and the frame that they are given in."""
         stream = self.streams[topic]
         values = checked_poses([pose.values for pose in stream.values], "invalid_tool_pose", self.at(topic))
         frames = sorted({pose.parent for pose in stream.values})
         if len(frames) != 1:
-            got = ", ".join(frames)
-            raise RejectedInputError(
-                "invalid_tool_pose", "Tool poses change their frame", where=self.at(topic), expected="one", got=got
-            )
+            what = "Tool poses change their frame"
+            raise RejectedInputError("invalid_tool_pose", what, where=self.at(topic), got=", ".join(frames))
         arrivals = in_order(self.clocks.times_ns(stream), self.at(topic))
-        return _Signal(topic, arrivals, values[arrivals.order]), frames[0]
+        return _Signal(topic, arrivals.times_ns, values[arrivals.order]), frames[0]
 
     def _calibration(self, topic: str) -> Calibration:
-        """The calibration around the episode, or in the whole file where it was sent only once.
-
-        Raises: RejectedInputError: missing_calibration; changing_calibration when messages differ: a zoom, or two cameras
-            on one topic.
-        """
+        """The calibration around the episode, or in the whole file where it was sent only once."""
         if topic in self.streams:
             values = self.streams[topic].values
         else:
@@ -224,13 +183,8 @@ class _Recording:
         first = values[0]
         different = next((value for value in values if value != first), None)
         if different is not None:
-            raise RejectedInputError(
-                "changing_calibration",
-                "Calibration changes during the recording",
-                where=self.at(topic),
-                expected=f"K {list(first.K)}, D {list(first.D)} of {first.width}x{first.height}",
-                got=f"K {list(different.K)}, D {list(different.D)} of {different.width}x{different.height}",
-            )
+            what = "Calibration changes during the recording: a zoom, or two cameras on one topic"
+            raise RejectedInputError("changing_calibration", what, where=self.at(topic), expected=first, got=different)
         return first
 
     def _transforms(self, wanted: Iterable[str]) -> TransformTree:
@@ -239,8 +193,6 @@ class _Recording:
         Static transforms come from the whole file, moving ones from around the episode. Where these do not lead to a
         wanted frame, the moving ones before the episode are read too: a fixed camera may be published once, when the
         recording starts.
-
-        Raises: RejectedInputError (invalid_extrinsics) for a frame with two parents.
         """
         config = self.config
 
@@ -273,10 +225,7 @@ class _Recording:
         return [*self.signals.values(), *self.tools.values()]
 
     def grid(self) -> np.ndarray:
-        """(t,) instants [ns]: from the first image of the primary view after all topics have begun, until the first ends.
-
-        Raises: RejectedInputError: time_gap for a topic that is silent for too long, too_short.
-        """
+        """(t,) instants [ns]: from the first image of the primary view after all topics have begun, until the first ends."""
         config = self.config
         # Gaps between images are judged in `chosen_images`, by the distance of instants from the nearest image.
         topics = [(config.views[view].image, each.times_ns, float("inf")) for view, each in self.images.items()]
@@ -303,10 +252,7 @@ class _Recording:
         return grid
 
     def chosen_images(self, view: str, grid: np.ndarray) -> np.ndarray:
-        """(t,) the nearest image of each instant.
-
-        Raises: RejectedInputError: wrong_fps for a camera slower than the wanted rate, time_gap where images are missing.
-        """
+        """(t,) the nearest image of each instant."""
         config, arrivals = self.config, self.images[view]
         where = self.at(config.views[view].image)
         if arrivals.median_step_ns * config.fps > 1.25e9:
@@ -341,7 +287,7 @@ class _Recording:
         return chosen
 
     def track(self, view: str, chosen: np.ndarray, camera: CameraTrack | None) -> ImageTrack:
-        """Raises: RejectedInputError (truncated_video) for video frames that depend on a lost message."""
+        """The chosen images, none of which is a video frame that depends on a lost message."""
         stream, arrivals = self.streams[self.config.views[view].image], self.images[view]
         keys = np.array(stream.key_frames, bool)[arrivals.order] if stream.key_frames else None
         if keys is not None:
@@ -389,10 +335,7 @@ class _Recording:
 def read_topics_episode(
     config: McapTopicsSourceConfig, file: McapFile, segment: Segment, episode_id: str, scene: str
 ) -> LoadedEpisode:
-    """The episode; its images stay in the file until they are asked for.
-
-    Raises: RejectedInputError with the reason.
-    """
+    """The episode; its images stay in the file until they are asked for. Raises: RejectedInputError."""
     recording = _Recording(config, file, segment)
     grid = recording.grid()
     chosen = {view: recording.chosen_images(view, grid) for view in config.views}
@@ -411,12 +354,8 @@ def read_topics_episode(
         outside += beyond
     state_names = _state_names(config)
     tools = recording.tool_poses(grid)
-    signals = recording.all_signals()
-    images = recording.images
-    times = [each.times_ns for each in (*images.values(), *signals)] + recording.moving_times()
-    # Signals of the same messages count once.
-    arrivals = {(signal.topic, len(signal.times_ns)): signal.arrivals for signal in signals}
-    without_header = ", ".join(recording.clocks.without_header)
+    times = [each.times_ns for each in (*recording.images.values(), *recording.all_signals())]
+    times += recording.moving_times()
     episode = Episode(
         episode_id=episode_id,
         source=config.label,
@@ -438,13 +377,9 @@ def read_topics_episode(
         conventions={
             "layout": LAYOUT,
             "time": config.time,
-            "clock_skew_ms": round(recording.clocks.skew_ms, 6),
-            "resampling_max_ms": round(max(largest_distance_ms(each, grid) for each in times), 6),
-            "messages_lost": sum(each.lost for each in (*images.values(), *arrivals.values())),
-            "repeated_images": sum(int(len(numbers) - len(np.unique(numbers))) for numbers in chosen.values()),
+            "resampling_max_ms": round(max(np.abs(t[nearest(t, grid)] - grid).max() / 1e6 for t in times), 6),
             "gripper_overshoot": outside,
             "action": "commanded" if commands else f"{REPEATS_STATE}: no commands are recorded",
-            **({"timed_by_log": without_header} if without_header else {}),
             **cameras.notes(),
         },
     )

@@ -28,49 +28,39 @@ MAX_DISORDER_S = 1.0
 """A message that comes later than this behind a younger one was stamped by a clock that was set back."""
 
 
-@dataclass(frozen=True)
 class Clocks:
-    """Clocks of one episode's topics.
+    """Clocks of one episode's topics, compared by their least delays (log time minus header time).
+
+    Raises: RejectedInputError (clock_skew) where header times count, and disagree by more than allowed or are not set.
 
     Attributes:
-        header_to_log_ns: subtracted from a log time to get a time on the clock of the headers.
-        skew_ms: largest difference between the least delays of two topics.
-        without_header: topics timed by their log time.
+        header_to_log_ns: subtracted from a log time to get a time on the clock of the headers: the least delay of the
+            joints' topic, which commands must fit; where the joints have no header, the least of all topics.
     """
 
-    config: McapTopicsSourceConfig
-    header_to_log_ns: int
-    skew_ms: float
-    without_header: tuple[str, ...]
-
-    @classmethod
-    def from_streams(cls, config: McapTopicsSourceConfig, streams: Mapping[str, Stream], where: object) -> Clocks:
-        """Compares the clocks of all topics by their least delays (log time minus header time).
-
-        The least delay of the joints' topic, which commands must fit, leads from log to header time for messages without
-        a header; where the joints have none, the least of all topics does.
-
-        Raises: RejectedInputError (clock_skew) where header times count, and disagree by more than allowed or are not set.
-        """
-        by_header = config.time == "header"
-        headed = [stream for stream in streams.values() if stream.has_header and stream.kind != "calibration"]
-        unset = next((stream for stream in headed if not stream.has_header_times), None) if by_header else None
-        if unset is not None:
-            raise RejectedInputError(
-                "clock_skew",
-                "Messages have no header time",
-                where=f"{where}, topic {unset.topic}",
-                expected="a header time in every message",
-                got=f"0 in {sum(not stamp for stamp in unset.stamps_ns)} of {len(unset.stamps_ns)}",
-                next_step="set time: log",
-            )
+    def __init__(self, config: McapTopicsSourceConfig, streams: Mapping[str, Stream], where: object) -> None:
+        self.config, self.header_to_log_ns = config, 0
+        if config.time == "log":
+            return
         least_ms: dict[str, float] = {}
-        for stream in headed:
-            if stream.has_header_times:
-                delay = np.array(stream.log_ns, np.int64) - np.array(stream.stamps_ns, np.int64)
-                least_ms[stream.topic] = float(delay.min() - config.offset_ns(stream.topic)) / 1e6
-        skew_ms = max(least_ms.values()) - min(least_ms.values()) if least_ms else 0.0
-        if by_header and skew_ms > config.max_clock_skew_ms:
+        for stream in streams.values():
+            if not stream.has_header or stream.kind == "calibration":
+                continue
+            unset = sum(not stamp for stamp in stream.stamps_ns)
+            if unset > 1:  # a simulated clock is 0 once, a driver that sets none writes 0 always
+                raise RejectedInputError(
+                    "clock_skew",
+                    "Messages have no header time",
+                    where=f"{where}, topic {stream.topic}",
+                    got=f"0 in {unset} of {len(stream.stamps_ns)}",
+                    next_step="set time: log",
+                )
+            delay = np.array(stream.log_ns, np.int64) - np.array(stream.stamps_ns, np.int64)
+            least_ms[stream.topic] = float(delay.min() - config.offset_ns(stream.topic)) / 1e6
+        if not least_ms:
+            return
+        skew_ms = max(least_ms.values()) - min(least_ms.values())
+        if skew_ms > config.max_clock_skew_ms:
             raise RejectedInputError(
                 "clock_skew",
                 "Clocks of topics disagree",
@@ -80,20 +70,14 @@ class Clocks:
                 next_step="declare time_offsets_ms, or set time: log",
                 evidence={"skew_ms": skew_ms, "least_delay_ms": least_ms},
             )
-        if not by_header:
-            return cls(config, 0, skew_ms, ())
-        reference = config.arms[0].state.joints.topic
-        shift = round(least_ms.get(reference, min(least_ms.values())) * 1e6) if least_ms else 0
-        without = (s.topic for s in streams.values() if not s.has_header and s.kind != "transforms")
-        return cls(config, shift, skew_ms, tuple(sorted(without)))
+        joints = config.arms[0].state.joints.topic
+        self.header_to_log_ns = round(least_ms.get(joints, min(least_ms.values())) * 1e6)
 
     def times_ns(self, stream: Stream) -> np.ndarray:
         """(n,) times of a topic's messages [ns] on the configured clock."""
-        if self.config.time == "log":
-            return np.array(stream.log_ns, np.int64)
-        if not stream.has_header:
-            return np.array(stream.log_ns, np.int64) - self.header_to_log_ns
-        return np.array(stream.stamps_ns, np.int64) + self.config.offset_ns(stream.topic)
+        if self.config.time == "header" and stream.has_header:
+            return np.array(stream.stamps_ns, np.int64) + self.config.offset_ns(stream.topic)
+        return np.array(stream.log_ns, np.int64) - self.header_to_log_ns
 
 
 @dataclass(frozen=True)
@@ -103,14 +87,11 @@ class Arrivals:
     Attributes:
         times_ns: (n,) strictly ascending; of messages with the same time the first is kept.
         order: (n,) index of each message in the order of the file.
-        lost: messages missing by the rate: the smaller of two estimates, from intervals longer than 1.5 times the median
-            and from the whole duration, since jitter makes long intervals too.
         median_step_ns: 0 for a single message.
     """
 
     times_ns: np.ndarray
     order: np.ndarray
-    lost: int
     median_step_ns: float
 
 
@@ -133,13 +114,7 @@ def in_order(times_ns: np.ndarray, where: str) -> Arrivals:
         )
     times, order = np.unique(times_ns, return_index=True)
     steps = np.diff(times)
-    median = float(np.median(steps)) if len(steps) else 0.0
-    lost = 0
-    if median:
-        left_out = float(np.sum(np.round(steps[steps > 1.5 * median] / median) - 1))
-        expected = (times[-1] - times[0]) / median + 1
-        lost = round(max(min(left_out, expected - len(times)), 0))
-    return Arrivals(times, order, lost, median)
+    return Arrivals(times, order, float(np.median(steps)) if len(steps) else 0.0)
 
 
 def check_gaps(
@@ -189,11 +164,6 @@ def nearest(times_ns: np.ndarray, grid_ns: np.ndarray) -> np.ndarray:
     return np.where(earlier, right - 1, right)
 
 
-def largest_distance_ms(times_ns: np.ndarray, grid_ns: np.ndarray) -> float:
-    """Largest distance of an instant from its nearest measurement [ms]."""
-    return float(np.abs(times_ns[nearest(times_ns, grid_ns)] - grid_ns).max() / 1e6)
-
-
 def resampled(times_ns: np.ndarray, values: np.ndarray, grid_ns: np.ndarray, *, hold: bool = False) -> np.ndarray:
     """(t, d) of values (n, d) at strictly ascending times; linear or, with `hold`, the last one up to each instant.
 
@@ -217,10 +187,7 @@ def resampled_poses(times_ns: np.ndarray, values: np.ndarray, grid_ns: np.ndarra
 
 
 def checked_poses(poses: Sequence[tuple[float, ...]], reason: Reason, where: str) -> np.ndarray:
-    """Poses x y z qx qy qz qw as (n, 7).
-
-    Raises: RejectedInputError of this reason for one that is not finite, or has a quaternion without length.
-    """
+    """Poses x y z qx qy qz qw as (n, 7), none of which is not finite or has a quaternion without length."""
     values = np.array(poses, np.float64)
     if not (np.isfinite(values).all() and (np.linalg.norm(values[:, 3:], axis=1) > 1e-6).all()):
         raise RejectedInputError(reason, "Pose is not finite or has a quaternion without direction", where=where)
@@ -248,10 +215,7 @@ class _Edge:
 
     @cached_property
     def ordered(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times (n,) and poses (n, 7) in order of time.
-
-        Raises: RejectedInputError: invalid_extrinsics, clock_jump.
-        """
+        """Times (n,) and poses (n, 7) in order of time."""
         values = checked_poses(self.values, "invalid_extrinsics", self.where)
         if not self.moving:
             return np.array(self.times_ns[-1:], np.int64), values[-1:]
@@ -260,7 +224,7 @@ class _Edge:
 
 
 class TransformTree:
-    """Frames below their parents."""
+    """Frames below their parents; one that has two, or is above itself, is rejected (invalid_extrinsics)."""
 
     def __init__(self, where: object, max_gap_s: float) -> None:
         self._where = where
@@ -268,10 +232,7 @@ class TransformTree:
         self._edges: dict[str, _Edge] = {}
 
     def add(self, transforms: Sequence[Transform], times_ns: Iterable[int], *, static: bool) -> None:
-        """Adds the transforms of one message.
-
-        Raises: RejectedInputError (invalid_extrinsics) for a frame with two parents.
-        """
+        """Adds the transforms of one message."""
         for transform, time_ns in zip(transforms, times_ns, strict=True):
             parent, child = transform.parent, transform.child
             edge = self._edges.setdefault(child, _Edge(parent, f"{self._where}, transform {parent} -> {child}"))
@@ -288,10 +249,7 @@ class TransformTree:
         self._edges = {**earlier._edges, **self._edges}
 
     def _chain(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on up to the root.
-
-        Raises: RejectedInputError (invalid_extrinsics) for frames that are above themselves.
-        """
+        """The frame, its parent, and so on up to the root."""
         found = [frame]
         while found[-1] in self._edges:
             above = self._edges[found[-1]].parent
@@ -303,7 +261,6 @@ class TransformTree:
         return found
 
     def connected(self, base: str, frame: str) -> bool:
-        """Whether transforms lead from one frame to the other."""
         return bool(set(self._chain(base)) & set(self._chain(frame)))
 
     def moving_times(self, base: str, frame: str) -> list[np.ndarray]:
@@ -328,10 +285,7 @@ class TransformTree:
         return up[: up.index(common)], down[: down.index(common)]
 
     def poses(self, base: str, frame: str, grid_ns: np.ndarray) -> np.ndarray:
-        """(t, 4, 4) T_base_frame at the instants; every transform between the two is resampled by itself.
-
-        Raises: RejectedInputError: missing_calibration for unconnected frames, invalid_extrinsics, clock_jump, time_gap.
-        """
+        """(t, 4, 4) T_base_frame at the instants; every transform between the two is resampled by itself."""
         up, down = self._between(base, frame)
         return rigid_inverse(self._product(up, grid_ns)) @ self._product(down, grid_ns)
 
@@ -359,9 +313,7 @@ def add_camera(
 ) -> None:
     """Adds a view from its calibration message and its poses (n or 1, 4, 4) in the base.
 
-    Args:
-        where: file and calibration topic.
-        rectified: the images are rectified: P holds their K, and no lens is left.
+    `rectified`: P holds the K of the images, and no lens is left.
 
     Raises: RejectedInputError: singular_intrinsics, invalid_extrinsics, invalid_distortion.
     """
@@ -376,8 +328,6 @@ def _intrinsics(calibration: Calibration, *, rectified: bool, where: object) -> 
     """K (3, 3) of the published image, and its size (height, width), after region of interest and binning.
 
     K and P belong to the whole sensor (ROS REP 104); a region is cut out first, then binned.
-
-    Raises: RejectedInputError (singular_intrinsics) for numbers that do not fit together.
     """
 
     def refused(what: str, expected: object, got: object) -> RejectedInputError:

@@ -21,7 +21,6 @@ class TopicReadings(StrictModel):
     columns: tuple[int, ...] | None = Field(
         default=None, description="positions, for messages that are a list of numbers"
     )
-    field: Literal["position", "velocity", "effort"] = Field(default="position", description="of JointState messages")
     resample: Resampling = Field(default="linear", description="hold: the last value counts until the next one")
 
     @model_validator(mode="after")

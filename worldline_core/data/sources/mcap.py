@@ -1,9 +1,6 @@
 """MCAP files: those written by this project, one episode per file, and recordings of other tools (ROS 2, Foxglove).
 
-Of the latter, topics are declared (`McapTopicsSourceConfig`), nothing is guessed, and the recording is brought to a fixed
-rate: every instant gets the nearest image of each view, joints and poses between their neighbours, transforms by slerp.
-How far off in time that is, and what was lost or timed by another clock, is written into the episode's conventions. See
-docs/mcap.md.
+Topics of the latter are declared (`McapTopicsSourceConfig`), nothing is guessed. See docs/mcap.md.
 """
 
 from __future__ import annotations
@@ -31,12 +28,11 @@ class McapSourceConfig(SourceConfigBase):
 
 
 def _files(root: AnyPath) -> dict[str, AnyPath]:
-    """Path below the source's folder -> file; a source that is one file has that alone."""
     return {root.name: root} if is_file(root) else {str(relative_name(p, root)): p for p in find_files(root, "*.mcap")}
 
 
 def _checked(path: AnyPath, name: str, root: AnyPath) -> AnyPath:
-    """The file, or the refusal of a name that leads out of the source's folder."""
+    """The file; a name that leads out of the source's folder is refused."""
     return path if path == root else inside(root, name)
 
 
@@ -103,25 +99,14 @@ class McapTopicsSource:
 
 
 def _segments(rule: WholeFiles | TimeRanges | Markers, file: McapFile | None, relative_path: str) -> Iterator[Segment]:
-    """Episodes of one file.
-
-    Args:
-        file: opened where there are markers: only they look into it.
-
-    Raises: RejectedInputError: missing_topic, unknown_schema, unreadable while looking for markers.
-    """
+    """Episodes of one file; only markers look into it."""
     if isinstance(rule, WholeFiles):
         yield Segment()
     elif isinstance(rule, TimeRanges):
         for part in rule.ranges:
             if fnmatchcase(relative_path, part.file):
-                yield Segment(
-                    part.name,
-                    round(part.start_s * 1e9),
-                    round(part.stop_s * 1e9),
-                    relative=True,
-                    instruction=part.instruction,
-                )
+                start, stop = round(part.start_s * 1e9), round(part.stop_s * 1e9)
+                yield Segment(part.name, start, stop, relative=True, instruction=part.instruction)
     elif file is not None:
         yield from _between_markers(rule, file)
 
