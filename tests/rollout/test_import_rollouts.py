@@ -1,4 +1,4 @@
-"""Folders of videos as sets of rollouts: names, indexes and tiles; every file accounted for; counts, rates and sizes."""
+"""Folders of videos as sets of rollouts: names and tiles; every file accounted for; counts, rates and sizes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.data.video.encoder import encode_video
-from worldline_core.errors import ConfigError, DataError
+from worldline_core.errors import DataError
 from worldline_core.rollout.import_rollouts import import_rollouts
 from worldline_core.rollout.rollout_config import ImportRolloutsConfig
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -81,7 +81,6 @@ def test_named_files_become_a_set_of_the_same_bytes(videos: Path, episodes: Path
     assert copied.read_bytes() == (videos / "robot_a-1_head.mp4").read_bytes()
     assert counts["files"] == {"matched": 6}
     assert counts["frames"] == 6 * N
-    assert counts["lowest_first_frame_psnr"] > 30
     assert {(file["status"], file["view"]) for file in files} == {("matched", view) for view in VIEWS}
 
 
@@ -122,12 +121,12 @@ def test_counts_rates_and_sizes_are_compared_before_anything_is_written(videos: 
     ):
         assert line in str(refused.value)
     assert not (videos.parent / "out").exists()
-    found, _, _ = run(videos, episodes, fps=8, resize=True, num_frames=5)
-    assert {row.num_frames for row in found.rows} == {5}
-    assert close(found.frames("robot_a-2", "head"), frames[:5])
+    encode(videos / "robot_a-1_left_wrist.mp4", frames)
+    found, _, _ = run(videos, episodes, fps=8, resize=True)
+    assert close(found.frames("robot_a-2", "head"), frames)
     (videos / "robot_a-1_head.mp4").write_bytes((videos / "robot_a-2_left_wrist.mp4").read_bytes()[:400])
     with pytest.raises(DataError, match="cannot be decoded"):
-        run(videos, episodes, fps=8, resize=True, num_frames=5)
+        run(videos, episodes, fps=8, resize=True)
 
 
 def test_templates_with_folders_seeds_and_other_names_of_views(videos: Path, episodes: Path) -> None:
@@ -141,37 +140,6 @@ def test_templates_with_folders_seeds_and_other_names_of_views(videos: Path, epi
     found, counts, _ = run(folder, episodes, **config)
     assert counts["views"] == ["head"]
     assert found.seeds("robot_a-1") == [1, 2]
-
-
-def test_an_index_lists_files_of_any_name(videos: Path, episodes: Path) -> None:
-    rows = []
-    for number, path in enumerate(sorted(videos.glob("*.mp4"))):
-        episode, _, view = path.stem.partition("_")[2].partition("_")
-        rows.append({"path": f"{number}.mp4", "episode": f"robot_{episode}", "view": view})
-        path.rename(videos / f"{number}.mp4")
-
-    def write(rows: list[dict[str, str]]) -> None:
-        lines = [",".join(rows[0]), *(",".join(row.values()) for row in rows)]
-        (videos / "index.csv").write_text("\n".join(lines))
-
-    write(rows)
-    found, counts, _ = run(videos, episodes, index="index.csv")
-    assert counts["files"] == {"matched": 6}
-    assert close(found.frames("robot_a-2", "right_wrist"), recorded("robot_a-2", "right_wrist"))
-    write([*rows[1:], rows[1]])
-    with pytest.raises(DataError, match="lists a file twice"):
-        run(videos, episodes, index="index.csv")
-    write([*rows[1:], rows[0] | {"path": "9.mp4"}])
-    with pytest.raises(
-        DataError, match=r"(?s)unknown: 0\.mp4 \(not listed\).*missing: 9\.mp4 \(listed, but not there\)"
-    ):
-        run(videos, episodes, index="index.csv")
-    write([{**row, "camera": "x"} for row in rows])
-    with pytest.raises(ConfigError, match="camera: unknown key"):
-        run(videos, episodes, index="index.csv")
-    write([*rows[1:], rows[0] | {"path": "../secret.mp4"}])
-    with pytest.raises(DataError, match=r"\.\./secret"):
-        run(videos, episodes, index="index.csv")
 
 
 def test_ctrl_world_s_pictures_of_two_rows_are_taken_apart(videos: Path, episodes: Path) -> None:
@@ -189,7 +157,6 @@ def test_ctrl_world_s_pictures_of_two_rows_are_taken_apart(videos: Path, episode
     found, counts, _ = run(videos.parent / "synthetic_traj", episodes, **config)
     assert counts["frames"] == 2 * 3 * N
     assert close(found.frames("robot_a-1", "right_wrist"), 255 - recorded("robot_a-1", "right_wrist"))
-    assert counts["lowest_first_frame_psnr"] < 20  # the first frame is not the observed one: worth a look
     with pytest.raises(DataError, match="do not divide into 5 x 3 tiles"):
         run(videos.parent / "synthetic_traj", episodes, **config | {"tiles": [["head", None, None], *[[None] * 3] * 4]})
 

@@ -225,9 +225,6 @@ def test_misuse_is_refused_and_changes_nothing(causal: WorldLine, starts: list[S
             simulation.select(clips, seeds)
     with pytest.raises(DataError, match="No such clips"):
         simulation.fork(0)
-    paths = {**start.cameras, "left_wrist": Camera(start.cameras["left_wrist"].K, np.tile(np.eye(4), (17, 1, 1)))}
-    with pytest.raises(DataError, match=r"(?s)only the pose at the start is known.*left_wrist"):
-        replace(start, cameras=paths).begin(causal)
     with pytest.raises(DataError, match=r"(?s)do not fit together.*'seeds': 2"):
         start.begin(causal, seed=[1, 2])
     with pytest.raises(DataError, match="wrong length for this embodiment"):

@@ -135,29 +135,6 @@ def test_decoding_one_block_while_the_next_is_sampled_changes_nothing(observed: 
         assert all(np.array_equal(one[view], other[view]) for view in causal.views)
 
 
-def test_tool_poses_drive_it_as_well(observed: Observation, causal: WorldLine) -> None:
-    """Tools and wrist cameras of the same motion, given instead of the joints: the same maps, so the same video."""
-    tracks, _ = compute_tracks(observed.episode, ArmKinematics(load_embodiment("ur5e_silver")))
-    cameras = {
-        view: Camera(camera.K, tracks.T_base_camera[:FRAMES, v])
-        for v, (view, camera) in enumerate(observed.episode.cameras.items())
-        if view != "head"
-    }
-    poses = tracks.T_base_tool[:FRAMES].astype(np.float64)
-    # Stored in float32: made rigid again.
-    poses[..., :3, :3] = np.linalg.svd(poses[..., :3, :3])[0] @ np.linalg.svd(poses[..., :3, :3])[2]
-    by_tools = causal.predict(
-        observed.images,
-        None,
-        {"head": observed.cameras["head"], **cameras},
-        tool_poses=poses,
-        gripper=tracks.gripper[:FRAMES, 0],
-    )
-    by_joints = causal.predict(observed.images, observed.controls, observed.cameras, embodiment="ur5e_silver")
-    for view in causal.views:
-        assert np.abs(by_tools[view].astype(int) - by_joints[view].astype(int)).mean() < 0.5, view
-
-
 def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, models: Path, tmp_path: Path) -> None:
     def refused(match: str, error: type[Exception] = DataError, **changes: object) -> None:
         given: dict[str, object] = {
@@ -169,7 +146,6 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
         with pytest.raises(error, match=match):
             causal.predict(**(given | changes))  # type: ignore[arg-type]
 
-    refused("driven by controls of an embodiment, or by tool poses", embodiment=None)
     refused(r"(?s)1 \+ k \* 16 rows.*got: 16", controls=observed.controls[:16])
     refused("images are not those of the model's views", images={"left_wrist": observed.images["left_wrist"]})
     refused("cameras are not those of the images", cameras={})

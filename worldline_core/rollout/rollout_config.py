@@ -185,38 +185,32 @@ class ImportRolloutsConfig(StrictModel):
     Attributes:
         method: name that the predictions carry in scores and reports.
         name: template of a file's path below the folder, with ``{episode}``, ``{view}``, ``{seed}``, and ``*`` for anything.
-        index: file in the folder that lists them instead: CSV with the columns path, episode, and perhaps view and
-            seed.
         views: our view for each of the names that files or tiles use; default: our own names.
         tiles: rows and columns of the views that one video shows side by side; null for a part that is none.
         episode_prefix: what our episode ids have before theirs.
         splits: every episode of these splits is expected.
         fps: rate that the videos show, where their container says another.
         resize: bring pictures to the recordings' size instead of refusing another one.
-        num_frames: frames that are kept of longer videos.
         missing, unknown: refuse, or report in ``files.parquet``, expected videos that are not there and files that are none
             of the expected.
     """
 
     method: str = Field(min_length=1)
     name: str = "{episode}_{view}.mp4"
-    index: str | None = None
     views: dict[str, str] | None = None
     tiles: tuple[tuple[str | None, ...], ...] | None = Field(default=None, min_length=1)
     episode_prefix: str = ""
     splits: tuple[str, ...] = ("test",)
     fps: float | None = Field(default=None, gt=0)
     resize: bool = False
-    num_frames: int | None = Field(default=None, ge=1)
     missing: Literal["refuse", "report"] = "refuse"
     unknown: Literal["refuse", "report"] = "refuse"
-    crf: int = Field(default=0, ge=0, le=51, description="of videos that are written anew: cut, resized or in tiles")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         fields = {field for field, _ in NAME_FIELD.findall(self.name) if field}
         needed = {"episode"} if self.tiles is not None else {"episode", "view"}
-        if self.index is None and not needed <= fields <= needed | {"seed"}:
+        if not needed <= fields <= needed | {"seed"}:
             raise ValueError(f"name: {self.name} has the fields {sorted(fields)}; needed are {sorted(needed)}")
         if self.tiles is not None and (len({len(row) for row in self.tiles}) != 1 or not self.shown):
             raise ValueError("tiles: rows of equal length, with at least one view among them")

@@ -232,15 +232,6 @@ class Starts:
                 got={"sizes": sorted(sizes), "views": [sorted(start) for start in self.images]},
             )
         self.image_size = sizes.pop()
-        for start in self.cameras:
-            moving = [v for v, c in start.items() if c.T_base_camera is not None and c.T_base_camera.ndim == 3]
-            if moving:
-                raise DataError(
-                    "Of a camera only the pose at the start is known",
-                    where=", ".join(moving),
-                    expected="T_base_camera (4, 4), or None for a mount that the embodiment's file knows",
-                    got="a pose per frame",
-                )
 
     def pictures(self, views: Sequence[str], size: tuple[int, int]) -> Float[Tensor, "b v 3 h w"]:
         """First images at the model's size."""

@@ -14,14 +14,15 @@ from torch import Tensor
 
 from worldline_core.actions.action_maps import render_action_maps, stack_controls
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, native_vectors
-from worldline_core.errors import CheckpointError
+from worldline_core.errors import CheckpointError, DataError
+from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
 from worldline_core.model.pretrained import pretrained_folder
 from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video, load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.observation import Camera, given_tracks, ordered_views
+from worldline_core.rollout.observation import Camera, image_size, ordered_views, project_controls
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts, Stepping
 
@@ -142,12 +143,10 @@ class WorldLine:
     def predict(
         self,
         images: Mapping[str, np.ndarray],
-        controls: np.ndarray | None,
+        controls: np.ndarray,
         cameras: Mapping[str, Camera],
         *,
-        embodiment: str | Path | None = None,
-        tool_poses: np.ndarray | None = None,
-        gripper: np.ndarray | None = None,
+        embodiment: str | Path,
         seed: int = 42,
     ) -> dict[str, np.ndarray]:
         """Videos of every given view under these controls; the same arguments give the same bytes on a CPU.
@@ -156,12 +155,9 @@ class WorldLine:
             images: what each view sees now, ``uint8 (H, W, 3)`` RGB, all of one size: of all of ``views``, or of some with
                 the first one among them.
             controls: ``(frames, state size)`` in the embodiment's layout (for each arm joints [rad], then the gripper's
-                opening, 0 closed .. 1 open), at ``contract.fps`` frames per second. Row 0 belongs to the images. Or
-                None, with tool poses instead.
+                opening, 0 closed .. 1 open), at ``contract.fps`` frames per second. Row 0 belongs to the images.
             cameras: of the same views.
-            embodiment: name or YAML file of the robot; needed with ``controls``.
-            tool_poses: ``(frames, arms, 4, 4)``, tools (between the fingertips, +z out of the gripper) to base, arms in
-                the order left, right; with ``gripper``, the openings ``(frames, arms)``.
+            embodiment: name or YAML file of the robot.
 
         Returns:
             ``uint8 (frames, H, W, 3)`` per view, the observed frame first, at ``image_size``.
@@ -173,8 +169,16 @@ class WorldLine:
             ConfigError: there is no such embodiment.
         """
         views = self.chosen_views(images)
-        fps, unit = self.contract.fps, self.frames_per_unit
-        tracks = given_tracks(images, controls, cameras, embodiment, tool_poses, gripper, fps=fps, unit=unit)
+        rows, unit = np.asarray(controls, np.float64), self.frames_per_unit
+        if len(rows) <= unit or (len(rows) - 1) % unit:
+            raise DataError(
+                "The model predicts one observed frame and whole units", expected=f"1 + k * {unit} rows of controls",
+                got=len(rows), next_step=f"give {1 + max(1, (len(rows) - 1) // unit) * unit} rows",
+            )  # fmt: skip
+        kinematics = ArmKinematics(load_embodiment(embodiment))
+        tracks = project_controls(
+            cameras, image_size(images, cameras), kinematics, controls=rows, fps=self.contract.fps
+        )
         first = torch.stack([frames_to_video(images[view][None], self.image_size)[:, 0] for view in views])
         pieces = [clips[0] for clips in self.stream(first[None], [tracks], tracks.num_frames, [seed], views=views)]
         return {view: np.concatenate([piece[view] for piece in pieces]) for view in views}
