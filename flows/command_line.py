@@ -13,6 +13,7 @@ from flows.exchange_commands import add_exchange_commands
 from flows.full_size_commands import add_plan_command, add_rehearse_command
 from flows.serve_commands import add_serve_commands
 from tasks.execution.artifact_task import find_task, task_names
+from tasks.execution.command_line import add_config_arguments, add_task_arguments
 from tasks.execution.temporary_server import prepare_prefect
 
 
@@ -35,17 +36,11 @@ def build_parser() -> argparse.ArgumentParser:
     ablations.add_argument("--variant", action="append", metavar="NAME", help="only this one and the full model")
     ablations.set_defaults(run=_ablations)
     for parser_with_config in (pipeline, nightly, ablations):
-        _add_config_arguments(parser_with_config)
+        add_config_arguments(parser_with_config)
     task = commands.add_parser("task", help="run one step alone", formatter_class=argparse.RawDescriptionHelpFormatter)
     task.add_argument("step", choices=task_names(), metavar="STEP", help="one of: " + ", ".join(task_names()))
-    _add_task_arguments(task)
+    add_task_arguments(task)
     task.set_defaults(run=_task)
-    rollout = commands.add_parser("rollout", help="predict videos (short for: task rollout)")
-    _add_task_arguments(rollout)
-    rollout.set_defaults(run=_task, step="rollout")
-    report = commands.add_parser("report", help="write the report of what is finished (short for: task report)")
-    _add_task_arguments(report)
-    report.set_defaults(run=_task, step="report")
     record = commands.add_parser("record", help="record episodes and candidate banks in simulation (extra: sim)")
     record.add_argument(
         "--config", type=Path, default=Path("configs/recording/sample.yaml"), help="recording configuration"
@@ -111,18 +106,6 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     check.set_defaults(run=_calibrate_check)
 
 
-def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
-    from tasks.execution.command_line import add_config_arguments
-
-    add_config_arguments(parser)
-
-
-def _add_task_arguments(parser: argparse.ArgumentParser) -> None:
-    from tasks.execution.command_line import add_task_arguments
-
-    add_task_arguments(parser)
-
-
 def _checked_preset(arguments: argparse.Namespace, *, weights: bool = False) -> str | None:
     """The preset of a run whose configuration is sound, and whose recordings and ``weights`` are there: mistakes are
     reported before Prefect and its server start."""
@@ -144,10 +127,9 @@ def _pipeline(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments, weights=True)
     prepare_prefect(arguments.artifacts)
     from flows.pipeline import pipeline
-    from tasks.execution.prefect_artifacts import run_flow
 
     print(f"how far it is, and then the report: {arguments.artifacts / 'report' / 'latest' / 'index.html'}")
-    report = run_flow(pipeline, preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
+    report = pipeline(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
     print(f"report: {report.path / 'index.html'}")
 
 
@@ -161,10 +143,9 @@ def _nightly(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments)
     prepare_prefect(arguments.artifacts)
     from flows.nightly_evaluation import nightly_evaluation
-    from tasks.execution.prefect_artifacts import run_flow
 
     values = preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, arguments.night
-    print(f"nightly: {run_flow(nightly_evaluation, *values) / 'index.html'}")
+    print(f"nightly: {nightly_evaluation(*values) / 'index.html'}")
 
 
 def _ablations(arguments: argparse.Namespace) -> None:

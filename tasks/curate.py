@@ -13,6 +13,4 @@ curate = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(curate)
+    curate.main()

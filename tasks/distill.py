@@ -14,6 +14,4 @@ distill = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(distill)
+    distill.main()

@@ -13,6 +13,4 @@ encode_latents = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(encode_latents)
+    encode_latents.main()

@@ -13,6 +13,4 @@ filter_episodes = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(filter_episodes)
+    filter_episodes.main()

@@ -12,6 +12,4 @@ import_rollouts = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(import_rollouts)
+    import_rollouts.main()

@@ -13,6 +13,4 @@ render_actions = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(render_actions)
+    render_actions.main()

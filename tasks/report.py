@@ -12,6 +12,4 @@ report = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(report)
+    report.main()

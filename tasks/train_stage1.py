@@ -14,6 +14,4 @@ train_stage1 = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(train_stage1)
+    train_stage1.main()

@@ -12,6 +12,4 @@ train_teacher = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(train_teacher)
+    train_teacher.main()

@@ -97,6 +97,10 @@ class ArtifactTask:
 
         return store.run(self.name, self.version, work, config, inputs, distributed=self.distributed)
 
+    def main(self) -> None:
+        """Entry point of ``python -m tasks.<name>``."""
+        load_object("tasks.execution.command_line:run_task_command")(self)
+
     def key(self, store: ArtifactStore, config: StrictModel, digests: Mapping[str, str]) -> str:
         """Content key of the artifact, given the digests of its inputs."""
         return store.key(self.name, self.version, config, dict(sorted(digests.items())))

@@ -97,7 +97,7 @@ def _parse_input(text: str) -> tuple[str, Path]:
 
 
 def run_task_command(task: ArtifactTask) -> None:
-    """Entry point of ``python -m tasks.<name>``."""
+    """Run a task with the arguments of this process, which can be stopped."""
     parser = argparse.ArgumentParser(prog=f"python -m tasks.{task.name}", description=task.summary)
     add_task_arguments(parser)
     arguments = parser.parse_args()

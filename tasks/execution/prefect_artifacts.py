@@ -1,62 +1,16 @@
-"""What Prefect is told of a finished run: that it is, a link to its report, and a table of what was measured.
-
-None of it is the work itself: a server that ended before fails no run whose work is done.
-"""
+"""What Prefect shows of a finished run: a link to its report, a table of what was measured, and pictures."""
 
 from __future__ import annotations
 
 import base64
-import functools
-import logging
 import mimetypes
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import httpx
-from prefect import Flow
 from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
 from tasks.execution.prefect_run import ArtifactReference
-from worldline_core.errors import UnavailableError, WorldLineError
 from worldline_core.evaluation.paired import collect_metrics
-
-logger = logging.getLogger(__name__)
-
-
-def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
-    """What a flow returns, although Prefect's server may have ended before it could be told.
-
-    Raises: UnavailableError when the server ended before the flow did; what the flow raises.
-    """
-    done: list[R] = []
-
-    @functools.wraps(flow.fn)
-    def body(*values: Any, **named: Any) -> R:
-        done.append(flow.fn(*values, **named))
-        return done[0]
-
-    for name in ("prefect.flow_runs", "prefect.task_runs"):
-        logging.getLogger(name).addFilter(is_worth_saying)
-    observed = flow.with_options()
-    observed.fn = body
-    try:
-        return observed(*arguments)
-    except httpx.TransportError as error:
-        if not done:
-            raise UnavailableError(
-                "Prefect's server ended before the run", got=str(error), next_step="the same command continues"
-            ) from error
-        logger.warning("The run is finished; Prefect's server ended before it could be told: %s", error)
-        return done[0]
-
-
-def is_worth_saying(record: logging.LogRecord) -> bool:
-    """Whether a record of Prefect's says more than the command itself: not that a run was stopped. Of an error whose message
-    says what is wrong and what to do, where in the code it arose is taken out."""
-    if record.exc_info and isinstance(record.exc_info[1], WorldLineError):
-        record.exc_info = None
-    return "aborted by a termination signal" not in record.getMessage()
 
 
 def _report_pictures(report: Path) -> list[Path]:
@@ -84,15 +38,10 @@ def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures:
         {"metric": name, "mean": value.mean, "95 % from": value.low, "to": value.high, "trajectories": value.count}
         for name, value in sorted(collect_metrics(scores).items())
     ]
-    try:
-        create_link_artifact((page / "index.html").as_uri(), "Open the report", key="report", description=str(page))
-        if rows:
-            create_table_artifact(
-                rows, key="metrics", description="Means with 95 % intervals: what/where/method/metric"
-            )
-        for number, picture in enumerate(pictures):
-            key = "picture" if number == 0 else f"picture-{number}"
-            data = f"data:{mimetypes.guess_type(picture)[0]};base64,{base64.b64encode(picture.read_bytes()).decode()}"
-            create_image_artifact(data, key=key, description=f"{picture.stem}: {page / 'index.html'}")
-    except httpx.TransportError as error:
-        logger.warning("Prefect's pages show nothing of this run: its server does not answer (%s)", error)
+    create_link_artifact((page / "index.html").as_uri(), "Open the report", key="report", description=str(page))
+    if rows:
+        create_table_artifact(rows, key="metrics", description="Means with 95 % intervals: what/where/method/metric")
+    for number, picture in enumerate(pictures):
+        key = "picture" if number == 0 else f"picture-{number}"
+        data = f"data:{mimetypes.guess_type(picture)[0]};base64,{base64.b64encode(picture.read_bytes()).decode()}"
+        create_image_artifact(data, key=key, description=f"{picture.stem}: {page / 'index.html'}")

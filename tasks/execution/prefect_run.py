@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import json
+import logging
 import multiprocessing
 import os
 from collections.abc import Mapping
@@ -38,7 +39,7 @@ from tasks.execution.run_page import LATEST_REPORT, RunPage
 from tasks.execution.shard_mapper import limited_threads, process_runner, shard_mapper, shared_server
 from worldline_core.config import StrictModel
 from worldline_core.data.guards.source_paths import SourceFolder, parse_location
-from worldline_core.errors import ArtifactError
+from worldline_core.errors import ArtifactError, WorldLineError
 from worldline_core.progress import running_node
 from worldline_core.scale.mapping import RunnerConfig, WorkerDiedError
 from worldline_core.scale.process import end_with_pool, keep_freed_memory
@@ -92,6 +93,8 @@ class PrefectRun(Outline):
 
     def __enter__(self) -> Self:
         keep_freed_memory()
+        for name in ("prefect.flow_runs", "prefect.task_runs"):
+            logging.getLogger(name).addFilter(_without_traceback)
         if self._page is not None:
             self._stack.enter_context(self._page)
         self._stack.enter_context(activated(self))
@@ -232,6 +235,13 @@ class PrefectRun(Outline):
         self._stack.enter_context(limited_threads(max(1, cores // self._runner.steps_at_once)))
         self._stack.enter_context(shared_server())
         return self._stack.enter_context(process_runner(self._runner.steps_at_once))
+
+
+def _without_traceback(record: logging.LogRecord) -> bool:
+    """Take the traceback out of Prefect's record of an error that says what is wrong and what to do."""
+    if record.exc_info and isinstance(record.exc_info[1], WorldLineError):
+        record.exc_info = None
+    return True
 
 
 def _prefect_task(call: TaskCall, *, refresh: bool) -> Task[..., dict[str, Any]]:

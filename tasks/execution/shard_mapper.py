@@ -25,7 +25,6 @@ from worldline_core.scale.mapping import (
     try_shard,
 )
 from worldline_core.scale.process import end_with_pool
-from worldline_core.store.remote import process_cache
 from worldline_core.store.store import helper_lock
 
 _DEATHS = frozenset(
@@ -55,7 +54,7 @@ class PrefectMapper:
         if few and not one_at_a_time:
             yield from SerialMapper(config).run(shards)
             return
-        limit = 1 if one_at_a_time else config.in_flight or 2 * workers
+        limit = 1 if one_at_a_time else 2 * workers
         waiting = deque(shards)
         while waiting:  # a pool of processes ends with the worker that it loses: the next round has a new one
             set_up_temporary_server()
@@ -80,8 +79,7 @@ class PrefectMapper:
         from prefect import Task
 
         task = Task(fn=_work, name="shard", task_run_name=shard.label, persist_result=False, log_prints=False)
-        room = int(self.config.remote_cache_gb * 2**30)
-        parameters = {"payload": pickle.dumps(shard), "pauses": self.config.pauses, "remote_cache_bytes": room}
+        parameters = {"payload": pickle.dumps(shard), "pauses": self.config.pauses}
         if self.config.kind != "ray":
             return runner.submit(task, parameters)
         from prefect_ray.context import remote_options
@@ -100,12 +98,11 @@ class PrefectMapper:
                 return process_runner(workers)
 
 
-def _work(payload: bytes, pauses: list[float], remote_cache_bytes: int) -> None:
+def _work(payload: bytes, pauses: list[float]) -> None:
     """The body of every shard's task, in a worker: one thread per worker, since there is one worker per core."""
     import cv2
 
     cv2.setNumThreads(1)
-    process_cache().max_bytes = remote_cache_bytes
     shard: Shard[Any] = pickle.loads(payload)  # noqa: S301 - made by `PrefectMapper` in this same run
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)

@@ -140,7 +140,7 @@ def test_killed_in_the_middle_and_resumed_elsewhere(
     from prefect.settings import PREFECT_API_URL
 
     (tmp_path / "config.json").write_text(config(recordings).model_dump_json())
-    settings = runner("processes", workers=2, episodes_per_shard=2, in_flight=2)
+    settings = runner("processes", workers=2, episodes_per_shard=2)
     (tmp_path / "runner.json").write_text(settings.model_dump_json())
     output = tmp_path / "set"
     command = [sys.executable, str(Path(__file__).with_name("curate_command.py"))]

@@ -273,11 +273,9 @@ class RunnerConfig(StrictModel):
         default=None, description="scheduler of a Dask or Ray cluster; null: a cluster of its own on this machine"
     )
     episodes_per_shard: int = Field(default=16, ge=1)
-    in_flight: int | None = Field(default=None, ge=1, description="shards handed out at a time; null: two per worker")
     serial_below: int = Field(default=256, ge=0, description="auto: fewer episodes than this are done in this process")
     retries: int = Field(default=2, ge=0, description="further attempts at a shard that could not reach its input")
     retry_seconds: float = Field(default=5.0, ge=0, description="pause before the first of them; doubles")
-    remote_cache_gb: float = Field(default=8.0, gt=0, description="room for copies of remote files, per worker")
     verify: VerifyMode = Field(
         default="full",
         description="how a step's inputs are compared with what was written. full: the digest of every file, once a process;"

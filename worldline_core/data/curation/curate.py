@@ -29,7 +29,7 @@ from worldline_core.data.sources.open import nothing_found, open_source
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.scale.account import InputRow, check_account, crash_evidence, portable_message, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, ends_the_run, map_episodes
-from worldline_core.store.remote import UnreachableInputError, first_line, is_transient, process_cache
+from worldline_core.store.remote import UnreachableInputError, first_line, is_transient
 from worldline_core.store.store import helper_lock
 
 logger = logging.getLogger(__name__)
@@ -190,7 +190,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
 
     def do(self, episode: ListedEpisode) -> InputRow:
         try:
-            return read_limited(self.config.reader, _process, self, episode, process_cache().max_bytes)
+            return read_limited(self.config.reader, _process, self, episode)
         except RejectedInputError as error:
             return self._quarantine(episode, error.reason, str(error), error.evidence)
 
@@ -280,7 +280,6 @@ def _nothing_found(work: CurateWork, source: int) -> DataError:
     return nothing_found(work.config.sources[source], work.source(source), parse_location(work.roots[source]))
 
 
-def _process(work: CurateWork, episode: ListedEpisode, remote_cache_bytes: int) -> InputRow:
-    process_cache().max_bytes = remote_cache_bytes
+def _process(work: CurateWork, episode: ListedEpisode) -> InputRow:
     with helper_lock(work.output):
         return _kept_open(work).process(episode)
