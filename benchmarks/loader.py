@@ -4,7 +4,7 @@ Run: `python benchmarks/loader.py [--processes 2] [--only 480x640]`. It makes it
 curation does) in a temporary folder, then times, in turns so that a busy machine disturbs all alike:
 
 - *raw*: processes that do nothing but decode the clips and drop the frames;
-- *loader*: the same number of loader processes that read the same clips in the same order into shared memory, and the
+- *loader*: the same number of loader processes that read the same clips in the same order, and the
   training process that takes every batch from them.
 
 The ratio of a table is loader to raw in frames per second of processor time, all processes added up (the training process
@@ -154,15 +154,17 @@ class RepeatedClips:
 def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int, rounds: int) -> dict[str, Any]:
     """Frames a second of the loader and of the baseline."""
     config = FrameInput.model_validate({"image_size": case["size"]})
-    source = FrameSource(episodes, RECORDINGS.with_name("models") / "tokenizer", config, views=VIEWS)
+    source = FrameSource(episodes, RECORDINGS.with_name("models") / "tokenizer", config)
     sampling = ClipSampling.model_validate({"lengths": case["lengths"]})
-    sampler = ClipSampler(source.rows, sampling, splits=["train"], start_step=1, batch_size=case["batch"], seed=0)
+    sampler = ClipSampler(
+        source.rows, sampling, views=VIEWS, splits=["train"], start_step=1, batch_size=case["batch"], seed=0
+    )
     steps = case["steps"]
     batches = [sampler.clips(index).clips for index in range(steps)]
     frames = len(VIEWS) * sum(clip.num_frames for batch in batches for clip in batch)
     raw = Baseline(source, batches, processes)
     repeated: Any = RepeatedClips(sampler, steps)
-    loader = read_ahead(ClipDataset(source, repeated, VIEWS, ReadingConfig(workers=processes)), 0, None)
+    loader = read_ahead(ClipDataset(source, repeated, ReadingConfig(workers=processes)), 0, None)
 
     loading: list[int] = []
 

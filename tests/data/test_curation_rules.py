@@ -246,7 +246,7 @@ def test_the_clip_sampler_follows_these_weights(tmp_path: Path) -> None:
     rows = [row("large", 100 + k) for k in range(30)] + [row("small", 60 + k) for k in range(3)]
     stored = [ClipRow(r.episode_id, r.num_frames, ("head",), r.source, "e", r.split, "", "head") for r in rows]
     config = ClipSampling(lengths=(33,), source_weights=weights(tmp_path, rows, 0.0))
-    sampler = ClipSampler(stored, config, splits=["train"], start_step=1, batch_size=50, seed=0)
+    sampler = ClipSampler(stored, config, views=("head",), splits=["train"], start_step=1, batch_size=50, seed=0)
     drawn = [clip.episode_id for index in range(80) for clip in sampler.clips(index).clips]
     share = sum(name.startswith("small") for name in drawn) / len(drawn)
     assert share == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / len(drawn)))

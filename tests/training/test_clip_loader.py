@@ -13,14 +13,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError, TrainingError
+from worldline_core.store.artifact_files import read_json_lines
+from worldline_core.training import clip_loader
 from worldline_core.training.clip_config import ClipSampling, FrameInput, ReadingConfig
-from worldline_core.training.clip_loader import Batch, ClipLoader, SkippedClips
+from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipSampler
 from worldline_core.training.clip_source import ClipSource, FrameSource, LatentStore
 
@@ -32,7 +33,7 @@ class Scripted(LatentStore):
 
     behaviour: dict[str, str]
 
-    def read(self, clip: Clip, views: tuple[str, ...], out: np.ndarray) -> None:
+    def read(self, clip: Clip, views: tuple[str, ...]) -> torch.Tensor:
         what = self.behaviour.get(clip.episode_id)
         if what == "slow":
             time.sleep(0.15)
@@ -40,7 +41,7 @@ class Scripted(LatentStore):
             raise DataError("A clip cannot be read: truncated", where=str(clip))
         elif what == "die":
             os.kill(os.getpid(), signal.SIGKILL)
-        super().read(clip, views, out)
+        return super().read(clip, views)
 
 
 def scripted(world: Any, behaviour: dict[str, str] | None = None) -> Scripted:
@@ -53,7 +54,9 @@ def scripted(world: Any, behaviour: dict[str, str] | None = None) -> Scripted:
 def sampler_of(source: ClipSource, **changes: Any) -> ClipSampler:
     values = {"lengths": (5, 9, 17), "view_weights": {"joint": 1.0, "primary": 1.0}, "single_view_factor": 2}
     config = ClipSampling.model_validate(changes or values)
-    return ClipSampler(source.rows, config, splits=["train"], start_step=source.start_step, batch_size=2, seed=9)
+    return ClipSampler(
+        source.rows, config, views=VIEWS, splits=["train"], start_step=source.start_step, batch_size=2, seed=9
+    )
 
 
 def same(one: Batch, other: Batch) -> bool:
@@ -78,8 +81,8 @@ def test_batches_do_not_depend_on_who_reads_them_and_when(world: Any) -> None:
     # Two episodes are slow: processes overtake each other.
     slow = ClipLoader(scripted(world, {"episode-003": "slow", "episode-006": "slow"}), views=VIEWS)
     state = torch.get_rng_state()
-    for workers, prefetch in ((0, 2), (1, 2), (2, 1)):
-        load = slow.batches(sampler, ReadingConfig(workers=workers, prefetch=prefetch), stop=24)
+    for workers in (0, 1, 2):
+        load = slow.batches(sampler, ReadingConfig(workers=workers), stop=24)
         # In order, back as after a kill, and beyond where reading ahead stops.
         for index in (*range(20), 5, 6, 7, 20, 21):
             assert same(load(index), expected[index])
@@ -97,7 +100,7 @@ def test_errors_name_their_clips_and_leave_no_process(world: Any) -> None:
         ("die", TrainingError, r"loader process has ended[\s\S]*episode-004[\s\S]*exited unexpectedly"),
     ):
         loader = ClipLoader(scripted(world, {"episode-004": what}), views=VIEWS)
-        load = loader.batches(sampler, ReadingConfig(workers=1, prefetch=1))
+        load = loader.batches(sampler, ReadingConfig(workers=1))
         for index in range(first):
             load(index)
         with pytest.raises(kind, match=message):
@@ -149,7 +152,9 @@ def test_batches_reach_a_gpu(world: Any) -> None:
         assert torch.equal(load(index).latents.cpu(), plain.load(sampler_of(source).clips(index)).latents)
 
 
-def test_a_damaged_clip_is_named_or_skipped_and_counted(world: Any, tokenizer: Path, tmp_path: Path) -> None:
+def test_a_damaged_clip_is_named_or_skipped_and_counted(
+    world: Any, tokenizer: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shutil.copytree(world.episodes, tmp_path / "set")
     (video,) = (tmp_path / "set").rglob("*left_wrist*/**/*.mp4")
     content = video.read_bytes()
@@ -157,12 +162,11 @@ def test_a_damaged_clip_is_named_or_skipped_and_counted(world: Any, tokenizer: P
     video.write_bytes(content[:half] + bytes(len(content) - half))
     episodes = EpisodeSet.open(tmp_path / "set")
     config = FrameInput.model_validate({"image_size": [32, 32], "on_unreadable": "skip"})
-    source = FrameSource(episodes, tokenizer, config, views=VIEWS)
+    source = FrameSource(episodes, tokenizer, config)
     faults: dict[str, str] = {}
     for row in episodes.rows:
-        out = np.empty((3, *source.shape(17)), np.uint8)
         try:
-            source.read(Clip(row.episode_id, 0, 17, 1), VIEWS, out)
+            source.read(Clip(row.episode_id, 0, 17, 1), VIEWS)
         except DataError as error:
             faults[row.episode_id] = str(error)
     assert all(f"{name}, frames 0..16, view left_wrist, in" in fault for name, fault in faults.items())
@@ -180,21 +184,20 @@ def test_a_damaged_clip_is_named_or_skipped_and_counted(world: Any, tokenizer: P
         wanted = sampler.clips(index).clips
         assert all(drawn == clip for drawn, clip in zip(batch.clips, wanted, strict=True) if clip.episode_id in good)
         assert batch.frames is not None
-        out = np.empty((3, *source.shape(17)), np.uint8)
-        source.read(batch.clips[0], VIEWS, out)
-        assert np.array_equal(batch.frames[0], out)
-    skipped = SkippedClips.count(run)
-    assert skipped > 0
+        assert torch.equal(batch.frames[0], source.read(batch.clips[0], VIEWS))
+    path = run / "skipped_clips-0.jsonl"
+    skipped = read_json_lines(path)
+    assert len(skipped) > 0
     # Steps that are done again after a kill, and a line that the kill cut short, change no count.
+    with path.open("a") as file:
+        file.write('{"index": 3, "cl')
     again = loader.batches(sampler, config, run)
     assert all(same(again(index), batch) for index, batch in enumerate(batches))
-    with (run / "skipped_clips-0.jsonl").open("a") as file:
-        file.write('{"index": 3, "cl')
-    assert SkippedClips.count(run) == skipped
-    assert SkippedClips.count(tmp_path / "elsewhere") == 0
-    few = loader.batches(sampler, config.model_copy(update={"max_skipped": skipped - 1}), run)
-    with pytest.raises(DataError, match=rf"at most {skipped - 1} [\s\S]*got: {skipped}"):
-        few(0)
+    assert read_json_lines(path) == skipped
+    monkeypatch.setattr(clip_loader, "MOST_SKIPPED", len(skipped) - 1)
+    few = loader.batches(sampler, config, run)
+    with pytest.raises(DataError, match=rf"at most {len(skipped) - 1}[\s\S]*got: {len(skipped)}"):
+        [few(index) for index in range(10)]
 
 
 def test_where_nothing_can_be_read_skipping_ends(world: Any) -> None:

@@ -13,6 +13,8 @@ from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.processes import BatchPlan
 
+VIEWS = ("head", "left_wrist", "right_wrist")
+
 
 @pytest.fixture
 def store(world: Any) -> LatentStore:
@@ -20,7 +22,13 @@ def store(world: Any) -> LatentStore:
 
 
 def make(store: LatentStore, config: ClipSampling | None = None, **changes: Any) -> ClipSampler:
-    values: dict[str, Any] = {"splits": ["train"], "start_step": store.start_step, "batch_size": 4, "seed": 3}
+    values: dict[str, Any] = {
+        "views": VIEWS,
+        "splits": ["train"],
+        "start_step": store.start_step,
+        "batch_size": 4,
+        "seed": 3,
+    }
     rows = changes.pop("rows", store.rows)
     return ClipSampler(rows, config or ClipSampling(lengths=(5, 9, 17)), **(values | changes))
 
@@ -87,9 +95,9 @@ def test_sources_and_views_follow_their_weights(store: LatentStore) -> None:
     sources = {row.episode_id: row.source for row in rows}
     batches = [sampler.clips(index) for index in range(400)]
     assert {sources[clip.episode_id] for batch in batches for clip in batch.clips} == {"common"}
-    views = Counter(batch.view for batch in batches)
-    assert 240 < views["primary"] < 360
-    assert views["primary"] + views["left_wrist"] == 400
+    views = Counter((batch.views, batch.primary) for batch in batches)
+    assert 240 < views[("head",), True] < 360
+    assert views[("head",), True] + views[("left_wrist",), False] == 400
 
 
 def test_single_view_steps_take_larger_batches(store: LatentStore) -> None:
@@ -99,9 +107,9 @@ def test_single_view_steps_take_larger_batches(store: LatentStore) -> None:
     sizes = Counter()
     for index in range(60):
         batch = whole.clips(index)
-        sizes[batch.view, len(batch.clips)] += 1
+        sizes[batch.views, len(batch.clips)] += 1
         assert batch.clips == parts[0].clips(index).clips + parts[1].clips(index).clips
-    assert set(sizes) == {(None, 4), ("head", 12)}
+    assert set(sizes) == {(VIEWS, 4), (("head",), 12)}
 
 
 def test_impossible_requests_are_named(store: LatentStore) -> None:
@@ -133,7 +141,7 @@ def test_the_draws_of_a_seed_stay_what_they_are(store: LatentStore) -> None:
     """Checkpoints name a seed; the clips that it draws are fixed here."""
     config = ClipSampling(lengths=(5, 9), view_weights={"joint": 1.0, "head": 1.0}, single_view_factor=2)
     batches = [make(store, config, batch_size=2).clips(index) for index in range(3)]
-    assert [batch.view for batch in batches] == ["head", None, None]
+    assert [batch.views for batch in batches] == [("head",), VIEWS, VIEWS]
     drawn = [(int(clip.episode_id[-1]), clip.start) for batch in batches for clip in batch.clips]
     assert drawn == [(4, 8), (6, 4), (2, 4), (3, 4), (6, 0), (4, 0), (4, 4), (4, 8)]
     assert {clip.num_frames for batch in batches for clip in batch.clips} == {9}

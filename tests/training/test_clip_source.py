@@ -51,9 +51,7 @@ class Remembering(Memoryless):
 
 
 def read(source: ClipSource, clip: Clip, views: tuple[str, ...] = VIEWS) -> np.ndarray:
-    out = np.empty((len(views), *source.shape(clip.num_frames)), source.dtype)
-    source.read(clip, views, out)
-    return out
+    return source.read(clip, views).numpy()
 
 
 @pytest.mark.parametrize("stride", [1, 2])
@@ -90,7 +88,7 @@ def test_resident_batches_are_those_of_the_store(world: Any) -> None:
     store, tracks = LatentStore.open(world.latents), ActionTracks.open(world.tracks)
     resident = ResidentLatents(store, "cpu")
     config = ClipSampling(lengths=(5, 9, 17), view_weights={"joint": 1.0, "left_wrist": 1.0})
-    sampler = ClipSampler(store.rows, config, splits=["train"], start_step=4, batch_size=3, seed=0)
+    sampler = ClipSampler(store.rows, config, views=VIEWS, splits=["train"], start_step=4, batch_size=3, seed=0)
     for projection, action_frames in (("current_camera", 1), ("current_camera", 4), ("clip_start_camera", 1)):
         options: Any = {"views": VIEWS, "wrist_projection": projection, "action_frames": action_frames}
         loaders = [ClipLoader(source, tracks=tracks, **options) for source in (store, resident)]
@@ -140,9 +138,8 @@ def test_a_damaged_and_a_missing_shard_are_named(world: Any, tmp_path: Path) -> 
 
 def open_frames(episodes: EpisodeSet | Path, tokenizer: Path, **changes: Any) -> FrameSource:
     values = {"image_size": [32, 32], **changes}
-    options = {"primary_alone": values.pop("primary_alone", False), "views": values.pop("views", VIEWS)}
     episodes = EpisodeSet.open(episodes) if isinstance(episodes, Path) else episodes
-    return FrameSource(episodes, tokenizer, FrameInput.model_validate(values), **options)
+    return FrameSource(episodes, tokenizer, FrameInput.model_validate(values))
 
 
 def test_frames_are_those_of_the_episode_set(world: Any, tokenizer: Path) -> None:
@@ -165,7 +162,7 @@ def test_segments_and_frames_without_images_are_respected(world: Any, tokenizer:
     assert np.array_equal(read(cut, clip), read(plain, dataclasses.replace(clip, start=7)))
     splits = ["train", "validation"]
     config = ClipSampling(lengths=(9, 13))
-    sampler = ClipSampler(cut.rows, config, splits=splits, start_step=1, batch_size=4, seed=0)
+    sampler = ClipSampler(cut.rows, config, views=VIEWS, splits=splits, start_step=1, batch_size=4, seed=0)
     drawn = [clip for index in range(100) for clip in sampler.clips(index).clips]
     assert {clip.start for clip in drawn if clip.episode_id == "episode-000"} == {0}
     assert not any(clip.episode_id == "episode-000" and clip.num_frames == 13 for clip in drawn)
@@ -182,19 +179,19 @@ def test_rows_fit_the_stage_and_its_views(world: Any, tokenizer: Path) -> None:
     rows[4] = dataclasses.replace(rows[4], stage1_ok=False)
     rows[5] = dataclasses.replace(rows[5], views=("left_wrist",))
     episodes = EpisodeSet(world.episodes, rows)
-    joint, primary = open_frames(episodes, tokenizer), open_frames(episodes, tokenizer, primary_alone=True)
+    source = open_frames(episodes, tokenizer)
     names = {row.episode_id: number for number, row in enumerate(rows)}
 
-    def numbers(source: FrameSource, stage: Any) -> set[int]:
-        return {names[row.episode_id] for row in training_rows(source, episodes, stage=stage)}
+    def numbers(stage: Any, *needed: str) -> set[int]:
+        return {names[row.episode_id] for row in training_rows(source, episodes, stage=stage, needed=needed)}
 
-    assert numbers(joint, 2) == {0, 1, 4, 6, 7}
-    assert numbers(joint, 1) == {0, 1, 3, 6, 7}
-    assert numbers(primary, 1) == {0, 1, 2, 3, 6, 7}
+    assert numbers(2, *VIEWS) == {0, 1, 4, 6, 7}
+    assert numbers(2, "head") == {0, 1, 2, 4, 6, 7}
+    assert numbers(1) == {0, 1, 2, 3, 6, 7}
     with pytest.raises(DataError, match="top"):
-        open_frames(episodes, tokenizer, views=("top",))
-    with pytest.raises(ArtifactError, match="episode-002"):
-        joint.row("episode-002")
+        numbers(2, "top")
+    with pytest.raises(ArtifactError, match="elsewhere"):
+        source.row("elsewhere")
 
 
 def test_a_clip_has_the_same_latents_cached_and_encoded_on_the_way(world: Any, tokenizer: Path, tmp_path: Path) -> None:
@@ -204,10 +201,10 @@ def test_a_clip_has_the_same_latents_cached_and_encoded_on_the_way(world: Any, t
     assert source.description["tokenizer"] == store.description["tokenizer"]
     assert source.latent_shape == store.latent_shape
     batches = (
-        ClipBatch((Clip("episode-003", 0, 17, 1), Clip("episode-006", 0, 17, 1)), None),
-        ClipBatch((Clip("episode-001", 4, 5, 2), Clip("episode-007", 8, 5, 2)), None),
-        ClipBatch((Clip("episode-004", 8, 9, 1),), "left_wrist"),
-        ClipBatch((Clip("episode-004", 4, 13, 1),), "primary"),
+        ClipBatch((Clip("episode-003", 0, 17, 1), Clip("episode-006", 0, 17, 1)), VIEWS),
+        ClipBatch((Clip("episode-001", 4, 5, 2), Clip("episode-007", 8, 5, 2)), VIEWS),
+        ClipBatch((Clip("episode-004", 8, 9, 1),), ("left_wrist",)),
+        ClipBatch((Clip("episode-004", 4, 13, 1),), ("head",), primary=True),
     )
     for batch in batches:
         cached, online = (ClipLoader(kind, views=VIEWS).load(batch) for kind in (store, source))

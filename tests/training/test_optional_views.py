@@ -80,30 +80,29 @@ def rows(store: LatentStore) -> list[ClipRow]:
 def test_batches_hold_clips_of_one_set_of_views(inputs: dict[str, Path]) -> None:
     store = LatentStore.open(inputs["latents"])
     config = ClipSampling(lengths=(9,), optional_views=OPTIONAL)
-    sampler = ClipSampler(rows(store), config, splits=["train"], start_step=4, batch_size=2, seed=3)
+    sampler = ClipSampler(rows(store), config, views=VIEWS, splits=["train"], start_step=4, batch_size=2, seed=3)
     drawn: Counter[str] = Counter()
     for index in range(600):
         batch = sampler.clips(index)
-        views = batch.slots(VIEWS)
-        assert {store.row(clip.episode_id).views for clip in batch.clips} == {views}
+        assert {store.row(clip.episode_id).views for clip in batch.clips} == {batch.views}
         assert sampler.replacement(index, 0, 0).episode_id[:3] == batch.clips[0].episode_id[:3]
         drawn.update(clip.episode_id for clip in batch.clips)
     # Grouping changes nothing of how often an episode is drawn.
     assert min(drawn.values()) > 0.7 * 1200 / 6
     assert sampler.trained(VIEWS) is None
     weighted = config.model_copy(update={"source_weights": {"three": 0.0}})
-    sampler = ClipSampler(rows(store), weighted, splits=["train"], start_step=4, batch_size=2, seed=3)
+    sampler = ClipSampler(rows(store), weighted, views=VIEWS, splits=["train"], start_step=4, batch_size=2, seed=3)
     assert sampler.trained(VIEWS) == TrainedClips(views=RIGHT, strides=(1,))
 
 
 def test_single_views_are_drawn_where_they_are(inputs: dict[str, Path]) -> None:
     store = LatentStore.open(inputs["latents"])
     config = ClipSampling(lengths=(9,), optional_views=OPTIONAL, view_weights={"joint": 0.4, "left_wrist": 0.6})
-    sampler = ClipSampler(store.rows, config, splits=["train"], start_step=4, batch_size=2, seed=3)
+    sampler = ClipSampler(store.rows, config, views=VIEWS, splits=["train"], start_step=4, batch_size=2, seed=3)
     batches = [sampler.clips(index) for index in range(200)]
-    assert {batch.view for batch in batches} == {None, "left_wrist"}
+    assert {batch.views for batch in batches} == {VIEWS, RIGHT, HEAD, ("left_wrist",)}
     for batch in batches:
-        assert all(set(batch.slots(VIEWS)) <= set(store.row(clip.episode_id).views) for clip in batch.clips)
+        assert all(set(batch.views) <= set(store.row(clip.episode_id).views) for clip in batch.clips)
     assert config.needed_views(VIEWS) == HEAD
     assert ClipSampling(view_weights={"head": 1.0, "joint": 0.0}).needed_views(VIEWS) == HEAD
     assert ClipSampling().needed_views(VIEWS) == VIEWS
@@ -116,14 +115,14 @@ def test_a_clip_is_trained_in_a_batch_as_it_would_be_alone(inputs: dict[str, Pat
     with torch.no_grad():
         for parameter in model.parameters():  # what starts at zero would hide the controls
             parameter.add_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
-    for name, absent in (("three", ()), ("two", ("left_wrist",)), ("one", OPTIONAL)):
+    for name, views in (("three", VIEWS), ("two", RIGHT), ("one", HEAD)):
         clips = tuple(Clip(f"{name}-{number}", 4, 9, 1) for number in range(2))
-        together = loader.load(ClipBatch(clips, None, absent))
+        together = loader.load(ClipBatch(clips, views))
         velocity = model(
             together.latents, torch.full((2,), 0.5), action_maps=together.action_maps, views=together.views
         )
         for number, clip in enumerate(clips):
-            alone = loader.load(ClipBatch((clip,), None, absent))
+            alone = loader.load(ClipBatch((clip,), views))
             assert torch.equal(alone.latents[0], together.latents[number])
             assert alone.action_maps is not None
             assert together.action_maps is not None

@@ -44,7 +44,6 @@ from worldline_core.model.checkpoint import (
 from worldline_core.model.lpips import load_lpips
 from worldline_core.model.tokenizers import WanTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import TrainedClips
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
@@ -123,7 +122,7 @@ class DistillationRun:
         info = read_checkpoint_info(Path(inputs["stage2"]))
         native = info.config.native_size
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
-        store = open_source(config.input, config.clips, inputs, episodes, config.views, device)
+        store = open_source(config.input, inputs, episodes, device)
         tracks = ActionTracks.open(Path(inputs["tracks"]), None if native is None else episodes)
         contract = info.contract
         if not set(config.views) <= set(info.views):
@@ -135,8 +134,8 @@ class DistillationRun:
             )
         found = {"tokenizer": store.description["tokenizer"], "grid_size": store.latent_shape[1:]}
         contract.require(where=store.root, **found)
-        needed = config.clips.needed_views(config.views) if config.clips.optional_views else None
-        rows = training_rows(store, episodes, stage=2, tracks=tracks, views=needed)
+        needed = config.clips.needed_views(config.views)
+        rows = training_rows(store, episodes, stage=2, needed=needed, tracks=tracks)
         contract.require_tracks((row.episode_id for row in rows), tracks)
         loader = ClipLoader(
             store, views=tuple(config.views), tracks=tracks, wrist_projection=contract.wrist_projection,
@@ -208,8 +207,8 @@ class DistillationRun:
     def _sampler(self, batch_size: int, seed: int, clips: ClipSampling, plan: BatchPlan) -> ClipSampler:
         """Clips of the training splits."""
         return ClipSampler(
-            self.rows, clips, splits=self.config.splits, start_step=self.store.start_step, batch_size=batch_size,
-            seed=seed, plan=plan,
+            self.rows, clips, views=self.config.views, splits=self.config.splits, start_step=self.store.start_step,
+            batch_size=batch_size, seed=seed, plan=plan,
         )  # fmt: skip
 
     def _work(self, step: str) -> Path:
@@ -251,18 +250,10 @@ class DistillationRun:
             batch_size=trainer.batch_size,
             seed=trainer.seed,
             plan=batch_plan(trainer, self._work(step)),
-            absent_views=self.config.clips.absent_views,
             generated_history=self.config.trajectory_regression.trajectories.history == "generated",
             kept_latents=isinstance(self.config.input, FrameInput),
         )
         return loader.load
-
-    def _trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
-        """Views and strides of the clips; None: all, at stride 1."""
-        recorded = {view for row in self.rows if row.split in self.config.splits for view in row.views}
-        views = tuple(view for view in slots if view in self.config.views and view in recorded)
-        found = TrainedClips(views=views, strides=tuple(sorted(set(self.config.clips.strides))))
-        return None if found == TrainedClips(views=slots, strides=(1,)) else found
 
     def _train[BatchT: Batch](
         self,
@@ -307,7 +298,7 @@ class DistillationRun:
                 kind="causal",
                 action_contract=self.stage2_info.contract,
                 causal=config.spec,
-                trained=self._trained(model.config.views),
+                trained=self._sampler(1, 0, config.clips, ALONE).trained(model.config.views),
                 metadata={
                     "distillation": step,
                     "step": result.steps,

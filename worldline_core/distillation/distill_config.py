@@ -139,7 +139,6 @@ class DistillConfig(StrictModel):
     """Stage III. What it trains, the model keeps: ``spec`` is saved with it and read by everything that rolls it out.
 
     ``block_size`` counts latent frames (4 in the paper: 16 video frames). ``sigmas``: nodes of the few-step sampler.
-    ``clips.optional_views``: of ``views``, those that a recording may lack: it is trained on in the others.
     ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` the recordings' frames, which
     are encoded when the teacher sees them; the trajectories keep the latents of their clips.
     """

@@ -326,7 +326,6 @@ class TrajectoryLoader:
     """Draws trajectories at random; what a step sees depends on (seed, step) alone.
 
     Args:
-        absent_views: optional views that a recording with some views lacks.
         generated_history: whether the teacher saw its own clean blocks before each block (else the recorded ones).
         kept_latents: whether the clips' latents are with the trajectories.
     """
@@ -339,7 +338,6 @@ class TrajectoryLoader:
         batch_size: int,
         seed: int,
         plan: BatchPlan,
-        absent_views: Callable[[Sequence[str]], tuple[str, ...]],
         generated_history: bool,
         kept_latents: bool = False,
     ) -> None:
@@ -350,12 +348,10 @@ class TrajectoryLoader:
         self.plan = plan
         self.generated_history = generated_history
         self.kept_latents = kept_latents
-        # A batch has one shape, so its clips have one length and lack the same views: a group of such clips is drawn by its
-        # size, then clips within it.
-        kinds = [
-            (clip.num_frames, absent_views(loader.source.row(clip.episode_id).views))
-            for clip in store.clips(range(len(store)))
-        ]
+        # A batch has one shape, so its clips have one length and the same views: a group of such clips is drawn by its size,
+        # then clips within it.
+        recorded = [(clip, loader.source.row(clip.episode_id).views) for clip in store.clips(range(len(store)))]
+        kinds = [(clip.num_frames, tuple(view for view in loader.views if view in views)) for clip, views in recorded]
         self._kinds = sorted(set(kinds))
         self._groups = [[row for row, kind in enumerate(kinds) if kind == wanted] for wanted in self._kinds]
         self._shares = np.array([len(group) for group in self._groups]) / len(store)
@@ -365,10 +361,10 @@ class TrajectoryLoader:
         index, part = self.plan.drawn(index)
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         number = int(random.choice(len(self._groups), p=self._shares))
-        group, (_, absent) = self._groups[number], self._kinds[number]
+        group, (_, views) = self._groups[number], self._kinds[number]
         draws = random.integers(len(group), size=self.batch_size * self.plan.together)
         rows = [group[int(draw)] for draw in draws[part * self.batch_size : (part + 1) * self.batch_size]]
-        clips = ClipBatch(self.store.clips(rows), None, absent)
+        clips = ClipBatch(self.store.clips(rows), views)
         if self.kept_latents:
             batch = self.loader.conditioned(clips, self.store.latents(rows).to(self.loader.device))
         else:

@@ -52,10 +52,6 @@ class ClipSampling(StrictModel):
             raise ValueError(f"lengths {odd}: a causal tokenizer codes clips of 4 k + 1 frames")
         return self
 
-    def absent_views(self, recorded: Sequence[str]) -> tuple[str, ...]:
-        """Optional views that a recording lacks."""
-        return tuple(view for view in self.optional_views if view not in recorded)
-
     def needed_views(self, views: Sequence[str]) -> tuple[str, ...]:
         """Those of a model's views that every episode must have."""
         weights = self.view_weights
@@ -64,18 +60,15 @@ class ClipSampling(StrictModel):
 
 
 class ReadingConfig(StrictModel):
-    """How clips are read, whatever they are.
+    """How clips are read; what is trained on does not depend on it, but for clips that are skipped.
 
-    ``workers``: processes that read ahead, each ``prefetch`` micro-batches; 0 reads in the training process when a batch
-    is needed. What is trained on does not depend on either.
-    ``on_unreadable``: "raise" stops at the first clip that cannot be read; "skip" takes another clip in its place, names
-    it in the log and in ``run/skipped_clips-*.jsonl``, counts it, and stops after ``max_skipped``.
+    ``workers``: processes that read two micro-batches ahead each; 0 reads in the training process when a batch is needed.
+    ``on_unreadable``: "raise" stops at the first clip that cannot be read; "skip" takes another clip in its place and
+    names it in the log and in ``run/skipped_clips-*.jsonl``.
     """
 
     workers: int = Field(default=0, ge=0)
-    prefetch: int = Field(default=2, ge=1)
     on_unreadable: Literal["raise", "skip"] = "raise"
-    max_skipped: int = Field(default=100, ge=1)
 
 
 class LatentInput(ReadingConfig):
@@ -96,16 +89,14 @@ class LatentInput(ReadingConfig):
 
 
 class FrameInput(ReadingConfig):
-    """Frames straight from the EpisodeSet; the tokenizer encodes them during training.
+    """Frames straight from the EpisodeSet, which the tokenizer encodes during training.
 
-    ``image_size``: (H, W) that frames are resized to, as in encode_latents. ``start_step``: clips start at multiples of
-    it. ``open_files``: video files that a process keeps open.
+    ``image_size``: (H, W) that frames are resized to, as in encode_latents. ``start_step``: clips start at multiples of it.
     """
 
     kind: Literal["frames"] = "frames"
     image_size: ImageSize = (64, 96)
     start_step: int = Field(default=1, ge=1)
-    open_files: int = Field(default=16, ge=1)
 
 
 ClipInput = Annotated[LatentInput | FrameInput, Field(discriminator="kind")]

@@ -1,34 +1,33 @@
 """Batches of clips, from the number of a micro-step to tensors.
 
-`ClipDataset` holds the clips of every micro-step as they are read; a `torch.utils.data.DataLoader` reads them, ahead of
-training where there are workers; `ClipLoader` turns what was read into latents and adds action maps and text ids.
+A `torch.utils.data.DataLoader` reads clips, ahead of training where there are workers; `ClipLoader` turns what was read into
+latents and adds action maps and text ids.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, get_worker_info
+from torch.utils.data import DataLoader, Dataset
 
 from worldline_core.actions.action_maps import control_frames, render_action_maps, stack_controls
 from worldline_core.actions.actions_config import WristProjection
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, native_vectors
-from worldline_core.errors import ArtifactError, ConfigError, DataError, TrainingError, WorldLineError
+from worldline_core.errors import ConfigError, DataError, TrainingError, WorldLineError
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic
-from worldline_core.training.clip_config import PRIMARY, ReadingConfig
+from worldline_core.training.clip_config import ReadingConfig
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
 from worldline_core.training.clip_source import ClipSource, ResidentLatents, ResidentTracks
 from worldline_core.training.processes import processes
@@ -38,11 +37,12 @@ logger = logging.getLogger(__name__)
 START_METHOD = "spawn"
 """How loader processes start: forked ones would share the threads and CUDA state of this one."""
 _ATTEMPTS = 20
+MOST_SKIPPED = 100
+"""Unreadable clips of one process after which a run that skips them stops."""
 
 
-@dataclass(frozen=True)
-class ReadBatch:
-    """Clips as read: ``data`` is (b, v, ...) as the source gives it, valid until the next batch is read.
+class ReadBatch(NamedTuple):
+    """Clips as read, (b, v, ...) as the source gives them.
 
     ``batch`` names the clips that are in it, replacements included; ``skipped`` those that were replaced, with the reason.
     """
@@ -51,60 +51,44 @@ class ReadBatch:
     data: Tensor
     skipped: tuple[tuple[Clip, str], ...] = ()
 
-    def pin_memory(self) -> ReadBatch:
-        """The same in page-locked memory; the DataLoader calls this."""
-        return replace(self, data=self.data.pin_memory())
 
-
+@dataclass(frozen=True)
 class ClipDataset(Dataset[ReadBatch | WorldLineError]):
     """The clips of every micro-step. An error is an item like any other: it reaches the training process as it is."""
 
-    def __init__(
-        self, source: ClipSource, sampler: ClipSampler, views: tuple[str, ...], reading: ReadingConfig
-    ) -> None:
-        self.source = source
-        self.sampler = sampler
-        self.views = views
-        self.reading = reading
+    source: ClipSource
+    sampler: ClipSampler
+    reading: ReadingConfig
 
     def __getitem__(self, index: int) -> ReadBatch | WorldLineError:
+        skips = self.reading.on_unreadable == "skip"
+        replacement = partial(self.sampler.replacement, index) if skips else None
         try:
-            return read_batch(
-                self.source, self.sampler.clips(index), self.views,
-                None if self.reading.on_unreadable == "raise" else partial(self.sampler.replacement, index),
-            )  # fmt: skip
+            return read_batch(self.source, self.sampler.clips(index), replacement)
         except WorldLineError as error:
             return error
 
 
 def read_batch(
-    source: ClipSource,
-    batch: ClipBatch,
-    views: tuple[str, ...],
-    replacement: Callable[[int, int], Clip] | None = None,
+    source: ClipSource, batch: ClipBatch, replacement: Callable[[int, int], Clip] | None = None
 ) -> ReadBatch:
-    """Read the clips of a batch; in a loader process into shared memory, so that nothing is copied later.
+    """Read the clips of a batch.
 
     Args:
-        views: the model's view slots.
         replacement: of a clip that cannot be read, by its place and the attempt; None: reading ends there.
 
     Raises:
         DataError: a clip cannot be read, or nothing readable can be found for it.
         ArtifactError: the source does not hold what is asked of it.
     """
-    slots = batch.slots(views)
-    shape = (len(batch.clips), len(slots), *source.shape(batch.clips[0].num_frames))
-    data = _memory(int(np.prod(shape)) * source.dtype.itemsize)
-    data = data.view(torch.from_numpy(np.empty(0, source.dtype)).dtype).view(shape)
     clips: list[Clip] = []
+    data: list[Tensor] = []
     skipped: list[tuple[Clip, str]] = []
-    for place, (clip, out) in enumerate(zip(batch.clips, data.numpy(), strict=True)):
+    for place, clip in enumerate(batch.clips):
         for attempt in range(_ATTEMPTS):
-            # The task-facing view of a recording has a name of its own.
-            recorded = (source.row(clip.episode_id).primary_view,) if batch.view == PRIMARY else slots
+            views = (source.row(clip.episode_id).primary_view,) if batch.primary else batch.views
             try:
-                source.read(clip, recorded, out)
+                data.append(source.read(clip, views))
             except DataError as error:
                 if replacement is None:
                     raise
@@ -121,16 +105,15 @@ def read_batch(
                 got=skipped[-1][1],
                 next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
             )
-    return ReadBatch(replace(batch, clips=tuple(clips)), data, tuple(skipped))
+    return ReadBatch(replace(batch, clips=tuple(clips)), torch.stack(data), tuple(skipped))
 
 
 def read_ahead(
     dataset: ClipDataset, first: int, stop: int | None, *, pinned: bool = False
 ) -> Iterator[ReadBatch | WorldLineError]:
-    """The items of a dataset from ``first`` on, in order, read ahead where the configuration asks for it.
+    """The items of a dataset from ``first`` to ``stop``, in order, read ahead by the configured workers.
 
     Args:
-        stop: nothing is read from this micro-step on.
         pinned: in page-locked memory, which a GPU reads at full speed.
     """
     workers = dataset.reading.workers
@@ -139,7 +122,6 @@ def read_ahead(
         batch_size=None,
         sampler=count(first) if stop is None else range(first, max(stop, first + 1)),
         num_workers=workers,
-        prefetch_factor=dataset.reading.prefetch if workers else None,
         multiprocessing_context=START_METHOD if workers else None,
         worker_init_fn=_start_worker,
         collate_fn=_as_it_is,
@@ -149,62 +131,39 @@ def read_ahead(
     return iter(loader)
 
 
-_shared: dict[int, Tensor] = {}
-_turn = count()
+def _as_it_is[T](item: T) -> T:
+    return item
 
 
-def _memory(size: int) -> Tensor:
-    """Bytes for a batch: in a loader process shared ones, used again when training is past the batch that held them.
+def _start_worker(number: int) -> None:
+    import cv2
 
-    The page faults of fresh memory cost about as much as decoding into it. A process has ``prefetch`` batches ahead at most,
-    and training holds one.
+    del number
+    cv2.setNumThreads(1)
+
+
+def _record_skipped(run: Path, index: int, skipped: tuple[tuple[Clip, str], ...]) -> None:
+    """Write down what a micro-step skipped; a step that is done again after a kill adds nothing.
+
+    Raises:
+        DataError: too many clips have been skipped.
     """
-    worker = get_worker_info()
-    if worker is None:
-        return torch.empty(size, dtype=torch.uint8)
-    clips: Any = worker.dataset
-    number = next(_turn) % (clips.reading.prefetch + 2)
-    if number not in _shared or len(_shared[number]) < size:
-        _shared[number] = torch.empty(size, dtype=torch.uint8).share_memory_()
-    return _shared[number][:size]
-
-
-class SkippedClips:
-    """The clips that a run skipped, in a file beside its training state: a continued run goes on counting.
-
-    What was skipped is a function of the micro-step, so a step that is done again after a kill adds nothing.
-    """
-
-    def __init__(self, folder: Path, limit: int) -> None:
-        self.path = folder / f"skipped_clips-{processes()[0]}.jsonl"
-        self.limit = limit
-        self._rows = read_json_lines(self.path)
-
-    def add(self, index: int, skipped: Sequence[tuple[Clip, str]]) -> None:
-        """Write down what a micro-step skipped.
-
-        Raises:
-            DataError: more than ``limit`` clips have been skipped.
-        """
-        for clip, reason in skipped:
-            row = {"index": index, "clip": str(clip), "reason": reason}
-            if row not in self._rows:
-                logger.warning("Clip skipped: %s", reason)
-                self._rows.append(row)
-                write_bytes_atomic(self.path, "".join(f"{json.dumps(row)}\n" for row in self._rows).encode())
-        if len(self._rows) > self.limit:
-            raise DataError(
-                "Too many clips cannot be read.",
-                where=self.path,
-                expected=f"at most {self.limit} (input.max_skipped)",
-                got=len(self._rows),
-                next_step="the reasons are in this file; run filter again, or raise the limit",
-            )
-
-    @staticmethod
-    def count(folder: Path) -> int:
-        """How many clips all processes have skipped."""
-        return sum(len(read_json_lines(path)) for path in folder.glob("skipped_clips-*.jsonl"))
+    path = run / f"skipped_clips-{processes()[0]}.jsonl"
+    rows = read_json_lines(path)
+    for clip, reason in skipped:
+        row = {"index": index, "clip": str(clip), "reason": reason}
+        if row not in rows:
+            logger.warning("Clip skipped: %s", reason)
+            rows.append(row)
+    write_bytes_atomic(path, "".join(f"{json.dumps(row)}\n" for row in rows).encode())
+    if len(rows) > MOST_SKIPPED:
+        raise DataError(
+            "Too many clips cannot be read.",
+            where=path,
+            expected=f"at most {MOST_SKIPPED}",
+            got=len(rows),
+            next_step="the reasons are in this file; run filter again",
+        )
 
 
 @dataclass(frozen=True)
@@ -212,7 +171,7 @@ class Batch:
     """One micro-batch. Outcome labels are not here on purpose: they never reach the model.
 
     ``fps``: frames per second of each clip as it is shown (a stride lowers the rate); None where no rates are known.
-    ``frames``: where clips are read as frames, those that the latents are of, valid until the next batch is read.
+    ``frames``: where clips are read as frames, those that the latents are of.
     ``weights``: of the squared error, where some places count more than others (what the task moves).
     """
 
@@ -237,9 +196,10 @@ class ClipLoader:
 
     Args:
         source: where clips are read from. With resident latents, action tracks are resident, too.
+        views: the model's slots.
         text: turns instructions into ids; its prompts may name a clip's duration and size.
         tracks: controls; the maps get the width that the tracks were made for.
-        wrist_projection: how maps of wrist views are projected; needed with ``tracks``.
+        wrist_projection: how maps of wrist views are projected.
         native_size: of the control vectors that are given instead of maps, where the model takes these.
         action_frames: control frames whose maps a latent frame takes.
         frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
@@ -254,7 +214,7 @@ class ClipLoader:
         tracks: ActionTracks | None = None,
         text: TextEncoder | None = None,
         frame_rates: Mapping[str, float] | None = None,
-        wrist_projection: WristProjection | None = None,
+        wrist_projection: WristProjection = "current_camera",
         native_size: int | None = None,
         action_frames: int = 1,
         device: str = "cpu",
@@ -264,7 +224,7 @@ class ClipLoader:
         self.tracks = tracks
         self.text = text
         self.frame_rates = frame_rates or {}
-        self.wrist_projection: WristProjection | None = wrist_projection
+        self.wrist_projection: WristProjection = wrist_projection
         self.native_size = native_size
         self.action_frames = action_frames
         self.device = device
@@ -278,17 +238,16 @@ class ClipLoader:
     def batches(
         self, sampler: ClipSampler, reading: ReadingConfig, run: Path | None = None, stop: int | None = None
     ) -> Callable[[int], Batch]:
-        """A function that gives the batch of a micro-step, read ahead by processes where the configuration asks for it.
+        """A function that gives the batch of a micro-step, read ahead by the configured workers.
 
         Asked for in order, batches are there already; any other order starts reading anew. The function raises DataError
         and ArtifactError for clips that cannot be read, and TrainingError where a loader process has ended.
 
         Args:
-            run: folder in which skipped clips are counted; None: they are only named in the log.
+            run: folder in which skipped clips are written down.
             stop: nothing is read from this micro-step on.
         """
-        dataset = ClipDataset(self.source, sampler, self.views, reading)
-        skips = None if run is None else SkippedClips(run, reading.max_skipped)
+        dataset = ClipDataset(self.source, sampler, reading)
         pinned = torch.device(self.device).type == "cuda" and not isinstance(self.source, ResidentLatents)
         ahead: tuple[int, Iterator[ReadBatch | WorldLineError]] | None = None
 
@@ -305,15 +264,14 @@ class ClipLoader:
                     where=f"micro-step {index}: {'; '.join(map(str, sampler.clips(index).clips))}",
                     expected="clips",
                     got=error,
-                    next_step="see its traceback above; if memory ran out, lower input.workers, input.prefetch or the "
-                    "batch",
+                    next_step="see its traceback above; if memory ran out, lower input.workers or the batch",
                 ) from error
             if isinstance(read, WorldLineError):
                 del batches
                 raise read
             ahead = (index + 1, batches)
-            if skips is not None:
-                skips.add(index, read.skipped)
+            if read.skipped and run is not None:
+                _record_skipped(run, index, read.skipped)
             return self.finish(read)
 
         return load
@@ -325,7 +283,7 @@ class ClipLoader:
             ArtifactError: if the source or the tracks lack an episode.
             DataError: if a clip is damaged, or cached latents are not finite.
         """
-        return self.finish(read_batch(self.source, batch, self.views))
+        return self.finish(read_batch(self.source, batch))
 
     def finish(self, read: ReadBatch) -> Batch:
         """What a model sees of clips that were read.
@@ -338,7 +296,7 @@ class ClipLoader:
 
     def conditioned(self, batch: ClipBatch, latents: Tensor, frames: Tensor | None = None) -> Batch:
         """Latents of a batch's clips, with the conditions that this loader adds; raises as `finish` does."""
-        clips, views = batch.clips, batch.slots(self.views)
+        clips, views = batch.clips, batch.views
         maps = None if self.tracks is None else self.action_maps(clips, views)
         ids = mask = None
         if self.text is not None:
@@ -354,15 +312,12 @@ class ClipLoader:
         return ClipFacts(clip.num_frames, self._rate(clip), self.source.image_size)
 
     def _rate(self, clip: Clip) -> float:
-        rate = self.frame_rates.get(clip.episode_id)
-        if rate is None:
-            raise ArtifactError("The frame rate of an episode is not known.", where=clip.episode_id)
-        return rate / clip.stride
+        return self.frame_rates[clip.episode_id] / clip.stride
 
     def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v a t h w"]:
         """Maps at latent resolution (or vectors) of the controls that each latent frame takes (docs/method.md section 2)."""
-        if self.tracks is None or self.wrist_projection is None:
-            raise ConfigError("Action maps need action tracks and how wrist views are projected", where="ClipLoader")
+        if self.tracks is None:
+            raise ConfigError("Action maps need action tracks", where="ClipLoader")
         if self._resident is not None:
             samples, image_size = self._resident.batch(clips, self.action_frames, views), self._resident.image_size
         else:
@@ -378,16 +333,5 @@ class ClipLoader:
         if clip.episode_id not in self._tracks:
             self._tracks[clip.episode_id] = tracks.tracks(clip.episode_id)
         frames = [clip.frames[index] for index in control_frames(clip.num_frames, self.action_frames)]
-        projection = self.wrist_projection or "current_camera"
-        return self._tracks[clip.episode_id].clip(frames, wrist_projection=projection, start=clip.start)
-
-
-def _as_it_is[T](item: T) -> T:
-    return item
-
-
-def _start_worker(number: int) -> None:
-    import cv2
-
-    del number
-    cv2.setNumThreads(1)
+        track = self._tracks[clip.episode_id]
+        return track.clip(frames, wrist_projection=self.wrist_projection, start=clip.start)

@@ -1,11 +1,8 @@
-"""Which clips a step trains on: a pure function of (seed, micro-step, rank), so that a run needs no other state to continue.
-
-Batches hold clips of one kind: one length, one stride, one set of views.
-"""
+"""Which clips a step trains on: a pure function of (seed, micro-step, rank), so that a run needs no other state to continue."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -40,20 +37,14 @@ class Clip:
 
 @dataclass(frozen=True)
 class ClipBatch:
-    """Clips of equal length that share their views.
+    """Clips of equal length, and the model's view slots that all of them fill.
 
-    ``view`` is None for all views but the ``absent`` ones (which no clip of the batch has), else one view or "primary".
+    ``primary``: each episode's task-facing view, whatever its name, fills the first slot.
     """
 
     clips: tuple[Clip, ...]
-    view: str | None
-    absent: tuple[str, ...] = ()
-
-    def slots(self, views: tuple[str, ...]) -> tuple[str, ...]:
-        """The model's view slots, of ``views``, that the clips fill: the task-facing view always takes the first."""
-        if self.view is None:
-            return tuple(view for view in views if view not in self.absent)
-        return (views[0],) if self.view == PRIMARY else (self.view,)
+    views: tuple[str, ...]
+    primary: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,23 +93,22 @@ def longest_clip(num_frames: int, start: int, stride: int) -> int:
 
 @dataclass(frozen=True)
 class _Kind:
-    """Clips of one length and stride, of episodes that lack the same optional views (``absent``).
-
-    ``cumulative``: cumulated weights of the rows.
-    """
+    """Clips of one length and stride, of episodes with the same views; ``cumulative`` weights of the rows."""
 
     length: int
     stride: int
-    absent: tuple[str, ...]
+    views: tuple[str, ...]
     rows: list[ClipRow]
     cumulative: np.ndarray
 
 
 class ClipSampler:
-    """Draws batches of clips. Every process draws the same large batch and takes its own part.
+    """Draws batches of clips of one length, stride and set of views. Every process draws the same large batch and takes its
+    own part.
 
     Args:
         rows: the episodes to draw from, of those in ``splits``.
+        views: the model's slots.
         start_step: clips start at multiples of it.
         batch_size: clips of a micro-batch.
         plan: which micro-batches are this process's, and how many are drawn as one.
@@ -132,30 +122,29 @@ class ClipSampler:
         rows: Sequence[ClipRow],
         config: ClipSampling,
         *,
+        views: Sequence[str],
         splits: Sequence[str],
         start_step: int,
         batch_size: int,
         seed: int,
         plan: BatchPlan = ALONE,
     ) -> None:
-        self.batch_size = batch_size
+        self.views, self.start_step, self.batch_size, self.seed, self.plan = views, start_step, batch_size, seed, plan
         self.single_view_factor = config.single_view_factor
-        self.seed = seed
-        self.plan = plan
-        self.start_step = start_step
-        self._view_weights: Mapping[str, float] = dict(sorted((config.view_weights or {}).items()))
+        self._view_weights = dict(sorted((config.view_weights or {JOINT: 1.0}).items()))
         candidates = [row for row in rows if row.split in splits]
+        slots = {row.episode_id: tuple(view for view in views if view in row.views) for row in candidates}
         self._kinds: list[_Kind] = []
         kind_weights: list[float] = []
         for length in config.lengths:
             for stride in config.strides:
                 fitting = [row for row in candidates if longest_clip(row.num_frames, 0, stride) >= length]
                 total = sum(config.source_weights.get(row.source, 1.0) for row in fitting)
-                for absent in sorted({config.absent_views(row.views) for row in fitting}):
-                    alike = [row for row in fitting if config.absent_views(row.views) == absent]
+                for shared in sorted({slots[row.episode_id] for row in fitting}, reverse=True):
+                    alike = [row for row in fitting if slots[row.episode_id] == shared]
                     weights = [config.source_weights.get(row.source, 1.0) for row in alike]
                     if sum(weights) > 0:
-                        self._kinds.append(_Kind(length, stride, absent, alike, np.cumsum(_normalised(weights))))
+                        self._kinds.append(_Kind(length, stride, shared, alike, np.cumsum(_normalised(weights))))
                         kind_weights.append(sum(weights) / total)
         if not self._kinds:
             longest = max((row.num_frames for row in candidates), default=0)
@@ -169,39 +158,41 @@ class ClipSampler:
 
     def clips(self, index: int) -> ClipBatch:
         """The clips of this process's micro-step ``index``."""
+        return self._batch(index)[0]
+
+    def _batch(self, index: int) -> tuple[ClipBatch, _Kind]:
         index, part = self.plan.drawn(index)
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         kind = self._kinds[int(random.choice(len(self._kinds), p=self._kind_weights))]
-        view = None
-        if self._view_weights:
-            present = [weight * (name not in kind.absent) for name, weight in self._view_weights.items()]
+        name = JOINT
+        if set(self._view_weights) != {JOINT}:
+            here = (JOINT, PRIMARY, *kind.views)
+            present = [weight * (name in here) for name, weight in self._view_weights.items()]
             name = list(self._view_weights)[int(random.choice(len(present), p=_normalised(present)))]
-            view = None if name == JOINT else name
-        size = self.batch_size * (1 if view is None else self.single_view_factor)
-        return ClipBatch(self._draw(random, kind, size, part), view, kind.absent)
+        size = self.batch_size * (1 if name == JOINT else self.single_view_factor)
+        clips = self._draw(random, kind, size, part)
+        return ClipBatch(clips, self._slots(name, kind), primary=name == PRIMARY), kind
+
+    def _slots(self, name: str, kind: _Kind) -> tuple[str, ...]:
+        return kind.views if name == JOINT else (self.views[0],) if name == PRIMARY else (name,)
 
     def replacement(self, index: int, place: int, attempt: int) -> Clip:
         """Another clip of the length, stride and views of micro-step ``index``, for its unreadable clip at ``place``."""
-        batch = self.clips(index)
-        wanted = (batch.clips[place].num_frames, batch.clips[place].stride, batch.absent)
-        kind = next(kind for kind in self._kinds if (kind.length, kind.stride, kind.absent) == wanted)
+        kind = self._batch(index)[1]
         index, part = self.plan.drawn(index)
         counter = [0, 0, 1 + attempt, 1 + place]  # a stream of its own
         random = np.random.Generator(np.random.Philox(key=[self.seed, index], counter=counter))
         return self._draw(random, kind, 1, part)[0]
 
-    def trained(self, views: tuple[str, ...]) -> TrainedClips | None:
-        """Strides of the clips and those of the model's view slots that they fill; None: all slots, at stride 1."""
-        drawn = [name for name, weight in self._view_weights.items() if weight > 0] or [JOINT]
-        batches = [
-            ClipBatch((), None if name == JOINT else name, kind.absent) for kind in self._kinds for name in drawn
-        ]
-        shown = {slot for batch in batches for slot in batch.slots(views)}
+    def trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
+        """Strides of the clips and those of the model's ``slots`` that they fill; None: all slots, at stride 1."""
+        drawn = [name for name, weight in self._view_weights.items() if weight > 0]
+        shown = {slot for kind in self._kinds for name in drawn for slot in self._slots(name, kind)}
         found = TrainedClips(
-            views=tuple(view for view in views if view in shown),
+            views=tuple(view for view in slots if view in shown),
             strides=tuple(sorted({kind.stride for kind in self._kinds})),
         )
-        return None if found == TrainedClips(views=views, strides=(1,)) else found
+        return None if found == TrainedClips(views=slots, strides=(1,)) else found
 
     def _draw(self, random: np.random.Generator, kind: _Kind, size: int, part: int) -> tuple[Clip, ...]:
         draws = random.random((size * self.plan.together, 2))[part * size : (part + 1) * size]
@@ -216,4 +207,4 @@ class ClipSampler:
 
 def _normalised(weights: Sequence[float]) -> np.ndarray:
     values = np.asarray(weights, dtype=np.float64)
-    return values / values.sum() if values.sum() > 0 else values
+    return values / values.sum()

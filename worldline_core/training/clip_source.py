@@ -1,7 +1,6 @@
 """Where clips are read from: cached latents on disk or on the training device, or frames of an EpisodeSet.
 
-Reading is split in two so that it can run in other processes: `ClipSource.read` touches files and fills an array;
-`ClipSource.latents` turns that array into what the model sees, on the model's device.
+`ClipSource.read` touches files and runs in any process; `ClipSource.latents` turns what it returned into what the model sees.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import torch
 from einops import rearrange
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -38,7 +37,7 @@ from worldline_core.model.tokenizers import (
 )
 from worldline_core.progress import with_progress
 from worldline_core.store.artifact_files import read_json, read_rows
-from worldline_core.training.clip_config import PRIMARY, ClipInput, ClipSampling, FrameInput
+from worldline_core.training.clip_config import ClipInput, FrameInput
 from worldline_core.training.clip_sampler import Clip, ClipRow, latent_frame_count, longest_clip
 
 logger = logging.getLogger(__name__)
@@ -55,8 +54,7 @@ class ClipSource(ABC):
         start_step: clips start at multiples of it.
         latent_shape: (c, h, w) of one view's latent frame.
         image_size: (H, W) of the frames that the latents are of.
-        description: at least ``tokenizer`` (its fingerprint) and ``views``.
-        dtype: of what `read` gives.
+        description: at least ``tokenizer`` (its fingerprint).
     """
 
     root: Path
@@ -64,7 +62,6 @@ class ClipSource(ABC):
     latent_shape: tuple[int, int, int]
     image_size: tuple[int, int]
     description: dict[str, Any]
-    dtype: np.dtype[Any]
 
     def __init__(self, rows: Sequence[ClipRow]) -> None:
         self.rows = list(rows)
@@ -86,12 +83,8 @@ class ClipSource(ABC):
         return self._by_id[episode_id]
 
     @abstractmethod
-    def shape(self, num_frames: int) -> tuple[int, ...]:
-        """Shape of what `read` gives for one view of a clip."""
-
-    @abstractmethod
-    def read(self, clip: Clip, views: tuple[str, ...], out: np.ndarray) -> None:
-        """Fill ``out`` (v, *shape) with the views of a clip. Works in any process.
+    def read(self, clip: Clip, views: tuple[str, ...]) -> Shaped[Tensor, "v ..."]:
+        """Some views of a clip, in host memory.
 
         Raises:
             DataError: the clip is damaged; the message names it.
@@ -99,7 +92,7 @@ class ClipSource(ABC):
         """
 
     @abstractmethod
-    def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
+    def latents(self, read: Shaped[Tensor, "b v ..."], device: str) -> Float[Tensor, "b v c t h w"]:
         """Latents (float32) of clips that were read, on ``device``."""
 
 
@@ -136,8 +129,6 @@ class LatentStore(ClipSource):
     - ``clips`` (tokenizers with a longer memory): for every stride and start frame the latents of the whole remaining
       clip.
     """
-
-    dtype: np.dtype[Any] = np.dtype(np.float32)
 
     def __init__(self, root: Path, description: dict[str, Any], rows: Sequence[LatentRow]) -> None:
         super().__init__(rows)
@@ -179,13 +170,8 @@ class LatentStore(ClipSource):
         # Open shards stay in the process that opened them.
         return {**self.__dict__, "_shards": {}}
 
-    def shape(self, num_frames: int) -> tuple[int, ...]:
-        """(c, t, h, w) of a clip's latents."""
-        channels, height, width = self.latent_shape
-        return channels, latent_frame_count(num_frames), height, width
-
-    def read(self, clip: Clip, views: tuple[str, ...], out: np.ndarray) -> None:
-        """Fill ``out`` (v, c, t, h, w) with the clip's latents.
+    def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
+        """The clip's latents.
 
         Raises:
             ArtifactError: if the episode, stride or view is not stored, or a shard is damaged.
@@ -194,12 +180,12 @@ class LatentStore(ClipSource):
         selected = self.stored_views(clip, views)
         with self.shard(clip.episode_id) as shard:
             frames = [shard.get_slice(name)[:, :, first:stop] for name, first, stop in self.parts(clip)]
-        torch.from_numpy(out).copy_(torch.cat(frames, dim=2)[selected])
-        if not np.isfinite(out).all():
-            raise self.not_finite(clip.episode_id)
+        latents = torch.cat(frames, dim=2)[selected].float()
+        self.require_finite(latents, clip.episode_id)
+        return latents
 
     def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
-        return read.to(device, copy=True)  # what clips are read into is used again
+        return read.to(device)
 
     def parts(self, clip: Clip) -> list[tuple[str, int, int]]:
         """Tensors that a clip's latent frames are in, in order: (name, first latent frame, stop)."""
@@ -253,18 +239,18 @@ class LatentStore(ClipSource):
                 next_step="encode the latents again",
             ) from error
 
-    def not_finite(self, episode_id: str) -> DataError:
-        return DataError(
-            "Cached latents hold values that are not finite.",
-            where=f"{self._shard_of[episode_id]}, episode {episode_id}",
-            next_step="delete this Latents artifact and encode it again; check the tokenizer",
-        )
+    def require_finite(self, latents: Tensor, episode_id: str) -> None:
+        """Raises DataError for latents of an episode that are not finite."""
+        if not bool(torch.isfinite(latents).all()):
+            raise DataError(
+                "Cached latents hold values that are not finite.",
+                where=f"{self._shard_of[episode_id]}, episode {episode_id}",
+                next_step="delete this Latents artifact and encode it again; check the tokenizer",
+            )
 
 
 class ResidentLatents(ClipSource):
     """All latents of a store on one device, in half precision: what is "read" of a clip are the numbers of its frames."""
-
-    dtype: np.dtype[Any] = np.dtype(np.int64)
 
     def __init__(self, store: LatentStore, device: str) -> None:
         super().__init__(store.rows)
@@ -272,41 +258,29 @@ class ResidentLatents(ClipSource):
         self.root, self.start_step, self.image_size = store.root, store.start_step, store.image_size
         self.latent_shape, self.description = store.latent_shape, store.description
         self._first: dict[str, tuple[int, int]] = {}  # by tensor: number of its first frame, frames of a view
+        frames: list[Tensor] = []
         count = 0
-        for row in self.rows:
-            with store.shard(row.episode_id) as shard:
-                for name in _names(shard, row.episode_id):
-                    views, _, frames = shard.get_slice(name).get_shape()[:3]
-                    self._first[name] = (count, frames)
-                    count += views * frames
-        self._frames = torch.empty((count, *self.latent_shape), dtype=torch.float16, device=device)
         for row in with_progress(self.rows, "reading latents", "episode"):
             with store.shard(row.episode_id) as shard:
-                for name in _names(shard, row.episode_id):
-                    frames = rearrange(shard.get_tensor(name), "v c t h w -> (v t) c h w")
-                    if not bool(torch.isfinite(frames).all()):
-                        raise store.not_finite(row.episode_id)
-                    self._frames[self._first[name][0] :][: len(frames)] = frames
+                for name in (name for name in shard.keys() if name.startswith(f"{row.episode_id}/")):  # noqa: SIM118
+                    tensor = shard.get_tensor(name)
+                    store.require_finite(tensor, row.episode_id)
+                    self._first[name] = (count, tensor.shape[2])
+                    frames.append(rearrange(tensor, "v c t h w -> (v t) c h w").to(device, torch.float16))
+                    count += len(frames[-1])
+        self._frames = torch.cat(frames)
 
-    def shape(self, num_frames: int) -> tuple[int, ...]:
-        """(t,) of a clip's latents."""
-        return (latent_frame_count(num_frames),)
-
-    def read(self, clip: Clip, views: tuple[str, ...], out: np.ndarray) -> None:
-        """Fill ``out`` (v, t) with the numbers of the clip's latent frames; raises as `LatentStore.read` does."""
-        selected = np.array(self.store.stored_views(clip, views))
-        place = 0
+    def read(self, clip: Clip, views: tuple[str, ...]) -> Int[Tensor, "v t"]:
+        """Numbers of the clip's latent frames; raises as `LatentStore.read` does."""
+        selected = torch.tensor(self.store.stored_views(clip, views))
+        numbers = []
         for name, first, stop in self.store.parts(clip):
             number, per_view = self._first[name]
-            out[:, place : place + stop - first] = (number + selected * per_view)[:, None] + np.arange(first, stop)
-            place += stop - first
+            numbers.append((number + selected * per_view)[:, None] + torch.arange(first, stop))
+        return torch.cat(numbers, dim=1)
 
     def latents(self, read: Int[Tensor, "b v t"], device: str) -> Float[Tensor, "b v c t h w"]:
         return rearrange(self._frames[read.to(device)], "b v t c h w -> b v c t h w").float().contiguous()
-
-
-def _names(shard: Any, episode_id: str) -> list[str]:
-    return [name for name in shard.keys() if name.startswith(f"{episode_id}/")]  # noqa: SIM118
 
 
 class ResidentTracks:
@@ -355,40 +329,15 @@ def _padded(values: Tensor, arms: int) -> Tensor:
 class FrameSource(ClipSource):
     """Frames of an EpisodeSet, decoded and encoded when they are needed.
 
-    Its episodes are those that have all ``views`` (and perhaps others), or (``primary_alone``) their task-facing one.
-
     Raises:
         CheckpointError: the folder holds no tokenizer.
         ConfigError: the tokenizer cannot code images of this size.
-        DataError: no episode has the views.
-        UnavailableError: the decoder that is asked for cannot be loaded.
     """
 
-    dtype: np.dtype[Any] = np.dtype(np.uint8)
-
     def __init__(
-        self,
-        episodes: EpisodeSet,
-        tokenizer_folder: Path,
-        config: FrameInput,
-        *,
-        views: tuple[str, ...],
-        primary_alone: bool = False,
-        device: str = "cpu",
+        self, episodes: EpisodeSet, tokenizer_folder: Path, config: FrameInput, *, device: str = "cpu"
     ) -> None:
-        needed = [set((row.primary_view,) if primary_alone else views) for row in episodes.rows]
-        pairs = zip(episodes.rows, needed, strict=True)
-        super().__init__([ClipRow.from_episode(row, row.views) for row, names in pairs if names <= set(row.views)])
-        if not self.rows:
-            raise DataError(
-                "No episode has the views that are trained on.",
-                where=episodes.root,
-                expected="the task-facing view" if primary_alone else ", ".join(views),
-                got=f"{len(episodes)} episodes without",
-            )
-        if len(self.rows) < len(episodes):
-            lacking = len(episodes) - len(self.rows)
-            logger.info("%d of %d episodes lack a view that is trained on.", lacking, len(episodes))
+        super().__init__([ClipRow.from_episode(row, row.views) for row in episodes.rows])
         self._tokenizer: VideoTokenizer | None = load_tokenizer(tokenizer_folder, device)
         space = self._tokenizer.spatial_compression
         height, width = config.image_size
@@ -401,16 +350,12 @@ class FrameSource(ClipSource):
             )
         self.root = episodes.root
         self.episodes = episodes
-        self.config = config
         self.image_size = config.image_size
         self.start_step = config.start_step
         self.latent_shape = (self._tokenizer.latent_channels, height // space, width // space)
         self._decoder: FrameDecoder | None = None
-        self.description = {
-            "tokenizer": tokenizer_fingerprint(self._tokenizer, tokenizer_folder),
-            "views": list(views),
-            "decoder": FrameDecoder.name,
-        }
+        fingerprint = tokenizer_fingerprint(self._tokenizer, tokenizer_folder)
+        self.description = {"tokenizer": fingerprint, "decoder": FrameDecoder.name}
 
     def __getstate__(self) -> dict[str, Any]:
         # Loader processes read frames: they open files themselves and have no use for the tokenizer.
@@ -421,22 +366,19 @@ class FrameSource(ClipSource):
     def decoder(self) -> FrameDecoder:
         """This process's decoder."""
         if self._decoder is None:
-            self._decoder = FrameDecoder(self.config.open_files)
+            self._decoder = FrameDecoder()
         return self._decoder
 
-    def shape(self, num_frames: int) -> tuple[int, ...]:
-        """(n, H, W, 3) of one view of a clip."""
-        return num_frames, *self.image_size, 3
-
-    def read(self, clip: Clip, views: tuple[str, ...], out: np.ndarray) -> None:
-        """Fill ``out`` (v, n, H, W, 3), uint8 RGB, with the clip's frames at the training size.
+    def read(self, clip: Clip, views: tuple[str, ...]) -> UInt8[Tensor, "v n h w 3"]:
+        """The clip's frames at the training size, RGB.
 
         Raises:
             DataError: a frame cannot be read; the message names the clip, the view and the file.
             ArtifactError: the episode is not in the set.
         """
         position = self.episodes.position(self.row(clip.episode_id).episode_id)
-        for pictures, view in zip(out, views, strict=True):
+        frames = np.empty((len(views), clip.num_frames, *self.image_size, 3), np.uint8)
+        for pictures, view in zip(frames, views, strict=True):
             where: object = f"{clip}, view {view}"
             try:
                 video = self.episodes.clip(position, view)
@@ -451,6 +393,7 @@ class FrameSource(ClipSource):
                     got=error.got,
                     next_step="repair or drop the episode, or set input.on_unreadable to skip",
                 ) from error
+        return torch.from_numpy(frames)
 
     @torch.no_grad()
     def latents(self, read: UInt8[Tensor, "b v n h w 3"], device: str) -> Float[Tensor, "b v c t h_l w_l"]:
@@ -499,49 +442,44 @@ def training_rows(
     episodes: EpisodeSet,
     *,
     stage: Literal[1, 2],
+    needed: Sequence[str] = (),
     tracks: ActionTracks | None = None,
     outcomes: Sequence[str] | None = None,
-    views: Sequence[str] | None = None,
 ) -> list[ClipRow]:
-    """Rows of the source whose episode is fit for the stage and ended in one of ``outcomes``; Stage II needs action tracks.
+    """Rows of the source whose episode is fit for the stage, ended in one of ``outcomes`` and has the views ``needed``.
 
-    Args:
-        views: those that an episode needs for Stage II, whatever else it lacks; None: all of the source's.
+    Stage I needs the task-facing view, Stage II action tracks.
 
     Raises:
         DataError: if none is left.
     """
 
     def fit(row: EpisodeRow) -> bool:
-        stage2_ok = row.stage2_ok or (views is not None and row.stage2_reason == "missing_view")
+        stage2_ok = row.stage2_ok or row.stage2_reason == "missing_view"  # which may be one that is not needed
         return (row.stage1_ok if stage == 1 else stage2_ok) and (outcomes is None or row.outcome in outcomes)
 
+    def shown(row: ClipRow) -> bool:
+        return {*needed, *((row.primary_view,) if stage == 1 else ())} <= {*row.views}
+
     allowed = {row.episode_id for row in episodes.rows if fit(row)}
-    # Episodes encoded by their task-facing view alone are for Stage I, however fit their other views are.
-    needed = set(source.description.get("views", ()) if views is None else views) if stage == 2 else set[str]()
-    rows = [row for row in source.rows if row.episode_id in allowed and needed <= set(row.views)]
-    fitting = [row for row in rows if tracks is None or row.episode_id in tracks]
-    if len(fitting) < len(rows):
-        logger.warning("%d of %d episodes have no action tracks and are left out.", len(rows) - len(fitting), len(rows))
-    if not fitting:
+    in_view = [row for row in source.rows if row.episode_id in allowed and shown(row)]
+    rows = [row for row in in_view if tracks is None or row.episode_id in tracks]
+    if len(rows) < len(in_view):
+        logger.warning(
+            "%d of %d episodes have no action tracks and are left out.", len(in_view) - len(rows), len(in_view)
+        )
+    if not rows:
         raise DataError(
             "No episode is left to train on.",
-            where=f"stage {stage}",
+            where=f"stage {stage}, views {', '.join(needed) or 'the task-facing one'}",
             expected="episodes that are in the EpisodeSet, the source of clips and (Stage II) the action tracks",
             got=f"{len(allowed)} fit episodes in the set, {len(source.rows)} in the source",
             next_step="see the quarantine tables of curate, filter and render_actions",
         )
-    return fitting
+    return rows
 
 
-def open_source(
-    reading: ClipInput,
-    clips: ClipSampling,
-    inputs: Mapping[str, Path],
-    episodes: EpisodeSet,
-    views: Sequence[str],
-    device: str,
-) -> ClipSource:
+def open_source(reading: ClipInput, inputs: Mapping[str, Path], episodes: EpisodeSet, device: str) -> ClipSource:
     """The configured source: cached ``latents``, or frames that ``tokenizer`` encodes during training.
 
     Raises:
@@ -559,11 +497,4 @@ def open_source(
     if not isinstance(reading, FrameInput):
         store = LatentStore.open(Path(inputs["latents"]))
         return ResidentLatents(store, device) if reading.resident else store
-    return FrameSource(
-        episodes,
-        Path(inputs["tokenizer"]),
-        reading,
-        views=clips.needed_views(views),
-        primary_alone=set(clips.view_weights or {}) == {PRIMARY},
-        device=device,
-    )
+    return FrameSource(episodes, Path(inputs["tokenizer"]), reading, device=device)

@@ -17,8 +17,9 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.model.checkpoint import CHECKPOINT_DTYPE, CheckpointInfo, save_checkpoint
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract
+from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput, ReadingConfig
-from worldline_core.training.clip_loader import Batch, ClipLoader, SkippedClips
+from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 from worldline_core.training.clip_source import ClipSource, open_source, training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
@@ -75,10 +76,9 @@ class Stage:
         model, parent = load_model()
         place_model(model, config.trainer.sharding, precision=config.trainer.precision, device=device).train()
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
-        source = open_source(config.input, config.clips, inputs, episodes, model.config.views, device)
+        source = open_source(config.input, inputs, episodes, device)
         needed = config.clips.needed_views(model.config.views)
-        views = None if needed == model.config.views else needed
-        rows = training_rows(source, episodes, stage=number, tracks=tracks, outcomes=config.outcomes, views=views)
+        rows = training_rows(source, episodes, stage=number, needed=needed, tracks=tracks, outcomes=config.outcomes)
         start, kind = ("scratch", None) if parent is None else (parent.weights_sha256, parent.kind)
         return cls(config, title, output, model, start, kind, episodes, source, rows)
 
@@ -94,6 +94,7 @@ class Stage:
         return ClipSampler(
             self.rows,
             self.config.clips,
+            views=self.model.config.views,
             splits=self.config.splits,
             start_step=self.source.start_step,
             batch_size=trainer.batch_size,
@@ -190,7 +191,9 @@ def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str
     if isinstance(reading, FrameInput):
         facts["input"] = {"kind": reading.kind, "decoder": source.description["decoder"]}
     if reading.on_unreadable == "skip":
-        facts["skipped_clips"] = sum(SkippedClips.count(run) for run in runs)
+        facts["skipped_clips"] = sum(
+            len(read_json_lines(path)) for run in runs for path in run.glob("skipped_clips-*.jsonl")
+        )
     return facts
 
 
@@ -234,7 +237,9 @@ def validation_function(
     # Where steps on one view are mixed in, it is still the joint prediction that counts.
     if clips.view_weights is not None and JOINT in clips.view_weights:
         clips = clips.model_copy(update={"view_weights": None})
-    start_step = loader.source.start_step
-    sampler = ClipSampler(held_out, clips, splits=splits, start_step=start_step, batch_size=size, seed=VALIDATION_SEED)
+    sampler = ClipSampler(
+        held_out, clips, views=loader.views, splits=splits, start_step=loader.source.start_step, batch_size=size,
+        seed=VALIDATION_SEED,
+    )  # fmt: skip
     load = loader.batches(sampler, reading.model_copy(update={"workers": 0}), stop=trainer.validation_batches)
     return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)
