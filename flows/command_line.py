@@ -155,7 +155,7 @@ def _ablations(arguments: argparse.Namespace) -> None:
 
     variants = None if arguments.variant is None else tuple(arguments.variant)
     table = ablations(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, variants)
-    print((Path(str(table.path)) / "table.md").read_text(), f"table: {table.path / 'index.html'}", sep="\n")
+    print((Path(str(table.path)) / "table.md").read_text(), f"table: {table.path / 'table.md'}", sep="\n")
 
 
 def _task(arguments: argparse.Namespace) -> None:

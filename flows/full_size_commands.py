@@ -91,4 +91,4 @@ def rehearse_command(arguments: argparse.Namespace) -> None:
 
     print("\nbesides, in the ablations:", table(besides), sep="\n")
     ablated = ablations(preset, path, (*overrides, *(change.override for change in besides)), artifacts)
-    print((Path(ablated.path) / "table.md").read_text(), f"ablations: {ablated.path / 'index.html'}", sep="\n")
+    print((Path(ablated.path) / "table.md").read_text(), f"ablations: {ablated.path / 'table.md'}", sep="\n")

@@ -12,16 +12,18 @@ from worldline_core.pages.page import MINUS, NARROW_SPACE, number, percent, rend
 
 WIDTH, HEIGHT = 480, 270
 LEFT, RIGHT, TOP, BOTTOM = 62, 14, 12, 30
-VALUE_WIDTH = 70
-"""Room for the number at the right end of a row."""
-ROW_HEIGHT = 46
-CHARACTER = 7.4
-"""Mean width of a letter of a row's label, in the chart's units."""
+VALUE_WIDTH, ROW_HEIGHT = 70, 46
+"""Of a row of an interval chart: room for the number at its right end, and its height."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """One line: points, optionally an interval around each, and a colour class (`c0` .. `c7`)."""
+    """One line: points, optionally an interval around each, and a colour class (`c0` .. `c7`).
+
+    Attributes:
+        faint: a raw curve behind its smoothed one: thin, pale, without an entry in the legend.
+        scatter: points alone, without a line; ``names`` say what each is.
+    """
 
     label: str
     x: Sequence[float]
@@ -32,9 +34,7 @@ class Series:
     dashed: bool = False
     markers: bool = False
     faint: bool = False
-    """A raw curve behind its smoothed one: thin, pale, without an entry in the legend."""
     scatter: bool = False
-    """Points alone, without a line; ``names`` say what each is."""
     names: Sequence[str] = ()
 
 
@@ -44,16 +44,16 @@ class Dot:
 
     label: str
     value: float
-    low: float | None = None
-    high: float | None = None
+    low: float
+    high: float
     colour: str = "c0"
 
 
 def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
     """Round numbers that cover a range."""
-    if not math.isfinite(low) or not math.isfinite(high) or low == high:
+    if low == high:
         return [low]
-    raw = (high - low) / max(wanted, 1)
+    raw = (high - low) / wanted
     magnitude = 10.0 ** math.floor(math.log10(raw))
     step = next(m * magnitude for m in (1, 2, 2.5, 5, 10) if m * magnitude >= raw * 0.999)
     first = math.ceil(low / step - 1e-9)
@@ -80,7 +80,7 @@ class Axis:
     def at(self, value: float) -> float:
         """Where a value is drawn; values outside of the range are drawn at its edge."""
         value = min(max(float(value), self.low), self.high)
-        low, high, value = (math.log10(max(v, 1e-300)) if self.log else v for v in (self.low, self.high, value))
+        low, high, value = (math.log10(v) if self.log else v for v in (self.low, self.high, value))
         share = 0.5 if high == low else (value - low) / (high - low)
         return round(self.start + share * (self.stop - self.start), 2)
 
@@ -94,17 +94,13 @@ class Axis:
         return [t for t in ticks if self.low * 0.999 <= t <= self.high * 1.001]
 
 
-def value_range(series: Sequence[Series], log: bool) -> tuple[float, float]:
+def _value_range(series: Sequence[Series], log: bool) -> tuple[float, float]:
     """Range of all finite values with a little air; logarithmic ranges look at positive values only."""
     values = [float(v) for s in series for part in (s.y, s.low or (), s.high or ()) for v in part if math.isfinite(v)]
-    values = [v for v in values if v > 0] if log else values
-    if not values:
-        return (0.1, 1.0) if log else (0.0, 1.0)
+    values = [v for v in values if v > 0 or not log] or [0.1, 1.0]
     low, high = min(values), max(values)
-    if log:
-        return low / 1.15, high * 1.15
     air = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
-    return low - air, high + air
+    return (low / 1.15, high * 1.15) if log else (low - air, high + air)
 
 
 def line_chart(
@@ -128,7 +124,7 @@ def line_chart(
     """
     xs = [float(v) for s in series for v in s.x if math.isfinite(v) and (not log_x or v > 0)]
     x_axis = Axis(min(xs, default=0.0), max(xs, default=1.0), LEFT, WIDTH - RIGHT, log_x)
-    y_axis = Axis(*(y_range or value_range(series, log_y)), HEIGHT - BOTTOM, TOP, log_y)
+    y_axis = Axis(*(y_range or _value_range(series, log_y)), HEIGHT - BOTTOM, TOP, log_y)
     rows = [(y_axis.at(v), percent(v) if in_percent else tick_label(v)) for v in y_axis.ticks()]
     columns = [(x_axis.at(v), tick_label(v)) for v in (x_axis.ticks(6) if x_ticks is None else x_ticks)]
     legend = [item for item in series if not item.faint]
@@ -169,36 +165,17 @@ def interval_chart(
     dots: Sequence[Dot], *, title: str, value_label: str, zero_line: bool = False, digits: int = 3, signed: bool = False
 ) -> Markup:
     """Dots with interval whiskers below their labels, a row each: comparisons with their uncertainty."""
-    values = [v for d in dots for v in (d.value, d.low, d.high) if v is not None and math.isfinite(v)]
-    low, high = min(values, default=0.0), max(values, default=1.0)
-    if zero_line:
-        low, high = min(low, 0.0), max(high, 0.0)
-    air = 0.08 * (high - low) or 0.1
-    axis = Axis(low - air, high + air, 8, WIDTH - VALUE_WIDTH)
-    bottom = 8 + ROW_HEIGHT * len(dots)
+    values = [v for d in dots for v in (d.value, d.low, d.high)] + [0.0] * zero_line
+    air = 0.08 * (max(values) - min(values)) or 0.1
+    axis = Axis(min(values) - air, max(values) + air, 8, WIDTH - VALUE_WIDTH)
     rows = [
         {
-            "dot": dot, "top": 8 + ROW_HEIGHT * i, "at": axis.at(dot.value),
-            "ends": None if dot.low is None or dot.high is None else (axis.at(dot.low), axis.at(dot.high)),
+            "dot": dot, "top": 8 + ROW_HEIGHT * i, "at": axis.at(dot.value), "ends": (axis.at(dot.low), axis.at(dot.high)),
             "shown": number(float(dot.value), digits, signed=signed),
         }
         for i, dot in enumerate(dots)
     ]  # fmt: skip
     return render_macro(
-        "pages/charts.html", "dots", title=title, x_label=value_label, rows=rows, bottom=bottom, width=WIDTH,
-        zero=axis.at(0.0) if zero_line else None, ticks=[(axis.at(v), tick_label(v)) for v in axis.ticks(4)],
+        "pages/charts.html", "dots", title=title, x_label=value_label, rows=rows, bottom=8 + ROW_HEIGHT * len(dots),
+        width=WIDTH, zero=axis.at(0.0) if zero_line else None, ticks=[(axis.at(v), tick_label(v)) for v in axis.ticks(4)],
     )  # fmt: skip
-
-
-def funnel_chart(steps: Sequence[tuple[str, int]], *, title: str) -> Markup:
-    """Bars below their labels that shrink from what was found to what was kept, with counts and shares."""
-    most = max((count for _, count in steps), default=1) or 1
-    rows = [
-        {
-            "label": label, "top": 4 + ROW_HEIGHT * i, "length": max(1.0, round((WIDTH - 8) * count / most, 2)),
-            "count": number(count), "share": percent(count / most),
-        }
-        for i, (label, count) in enumerate(steps)
-    ]  # fmt: skip
-    height = 8 + ROW_HEIGHT * len(steps)
-    return render_macro("pages/charts.html", "bars", title=title, rows=rows, height=height, width=WIDTH)

@@ -1,6 +1,6 @@
 """Static pages from templates: every text is escaped, styles and scripts are inside the page, media lie beside it.
 
-Templates lie beside the code that fills them and are named from the package's root: `report/quality.html`.
+Templates lie beside the code that fills them and are named from the package's root: `report/data.html`.
 """
 
 from __future__ import annotations

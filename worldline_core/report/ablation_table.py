@@ -1,26 +1,24 @@
 """The step ablation_table: variants as rows, the paper's metrics as columns, each number beside the paper's.
 
 ``table.parquet`` holds one value a row: mean, 95 % interval, number of trajectories (banks, for planning), the paper's number, and the
-paired difference to the full model. ``table.md`` and ``index.html`` show it.
+paired difference to the full model. ``table.md`` shows it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from markupsafe import Markup
 from pydantic import Field
 
 from worldline_core.config import StrictModel, read_yaml, validate
 from worldline_core.errors import ArtifactError
 from worldline_core.evaluation.paired import collect_metrics, read_scores
 from worldline_core.evaluation.scores import SUMMARY_FILE, Interval, paired_difference
-from worldline_core.pages.page import Table, interval, render
 from worldline_core.store.artifact_files import read_json, row_schema
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic
 
@@ -96,10 +94,6 @@ class Cell:
     difference_high: float | None = None
     reason: str = ""
 
-    @property
-    def digits(self) -> int:
-        return 1 if self.column in ("success", "gain") else 3
-
 
 class _Measured(NamedTuple):
     """Interval and values by recording of each column, and reasons for what is missing."""
@@ -135,13 +129,6 @@ def ablation_table(config: AblationTableConfig, inputs: Mapping[str, Path], outp
         pq.write_table(pa.Table.from_pylist(rows, schema=row_schema(Cell)), temporary)
     reasons = sorted({f"{COLUMNS[c.column]}: {c.reason}" for row in cells.values() for c in row if c.reason})
     write_bytes_atomic(output / "table.md", _markdown(cells.values(), reasons).encode())
-    tables = [
-        _table("This run", cells.values(), _own),
-        _table("The paper", cells.values(), lambda cell: cell.paper or None),
-        _table("This run, less the full model", cells.values(), _difference),
-    ]
-    page = render("report/ablations.html", title="Ablations", lead=NOTE, tables=tables, reasons=reasons)
-    write_bytes_atomic(output / "index.html", page.encode())
     return {"variants": list(cells), "cells": len(rows), "measured": sum(row["mean"] is not None for row in rows)}
 
 
@@ -192,30 +179,16 @@ def _cell(
 
 def _markdown(rows: Iterable[Sequence[Cell]], reasons: Sequence[str]) -> str:
     def text(cell: Cell) -> str:
-        own, digits = "not measured", cell.digits
-        if cell.mean is not None:
-            own = f"{cell.mean:.{digits}f} [{cell.low:.{digits}f}, {cell.high:.{digits}f}], n={cell.count}"
+        digits = 1 if cell.column in ("success", "gain") else 3
+        if cell.mean is None:
+            return f"not measured ({cell.paper or 'none'})"
+        own = f"{cell.mean:.{digits}f} [{cell.low:.{digits}f}, {cell.high:.{digits}f}], n={cell.count}"
+        if cell.difference is not None:
+            bounds = f"[{cell.difference_low:+.{digits}f}, {cell.difference_high:+.{digits}f}]"
+            own += f"; less the full model {cell.difference:+.{digits}f} {bounds}"
         return f"{own} ({cell.paper or 'none'})"
 
     lines = [("variant", *COLUMNS.values()), ("---",) * (1 + len(COLUMNS))]
     lines += [(row[0].label, *map(text, row)) for row in rows]
     table = ["| " + " | ".join(line) + " |" for line in lines]
     return "\n".join([*table, "", NOTE, *(f"- not measured, {reason}" for reason in reasons), ""])
-
-
-def _table(caption: str, rows: Iterable[Sequence[Cell]], show: Callable[[Cell], object]) -> Table:
-    shown = [[row[0].label, *map(show, row)] for row in rows]
-    return Table(("Variant", *COLUMNS.values()), shown, range(1, 1 + len(COLUMNS)), caption, dense=True)
-
-
-def _own(cell: Cell) -> Markup | None:
-    if cell.mean is None:
-        return None
-    return Markup("{} n={}").format(interval(asdict(cell), cell.digits), cell.count)
-
-
-def _difference(cell: Cell) -> Markup | None:
-    if cell.difference is None:
-        return None
-    bounds = {"mean": cell.difference, "low": cell.difference_low, "high": cell.difference_high}
-    return interval(bounds, cell.digits, signed=True)
