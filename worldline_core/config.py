@@ -12,7 +12,7 @@ from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeAliasType, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeAliasType, Union, cast, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -197,15 +197,11 @@ def validate[Model: BaseModel](model: type[Model], values: Mapping[str, Any], *,
         return model.model_validate(dict(values))
     except ValidationError as error:
         lines = []
-        problems = error.errors()
-        for problem in problems:
-            if problem["type"] == "too_short" and any(_inside(other["loc"], problem["loc"]) for other in problems):
-                continue  # it is short because of an item that is wrong itself
+        for problem in error.errors():
             dotted = ".".join(str(part) for part in problem["loc"])
             if problem["type"] == "extra_forbidden":
-                key, known = str(problem["loc"][-1]), _known_keys(model, problem["loc"][:-1])
-                sections = (section for section in model.model_fields if key in _known_keys(model, (section,)))
-                close = difflib.get_close_matches(key, known, n=1) or [f"{section}.{key}" for section in sections]
+                known = _known_keys(model, problem["loc"][:-1])
+                close = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
                 hint = f"; did you mean {close[0]!r}?" if close else f"; known keys: {', '.join(known)}"
                 lines.append(f"{dotted}: unknown key{hint}")
             else:
@@ -224,10 +220,6 @@ def _take_away(values: dict[str, Any], given: Mapping[str, Any], keys: Sequence[
         values = inner
     if keys[-1] in given and values.get(keys[-1], ...) is None:
         del values[keys[-1]]
-
-
-def _inside(location: Sequence[int | str], outer: Sequence[int | str]) -> bool:
-    return len(location) > len(outer) and tuple(location[: len(outer)]) == tuple(outer)
 
 
 def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
@@ -291,9 +283,7 @@ def load_config[Model: BaseModel](
     """
     if (preset is None) == (path is None):
         raise ConfigError("Give either a preset or a configuration file", got=f"preset={preset}, config={path}")
-    source = preset_path(preset) if preset is not None else path
-    if source is None:
-        raise ConfigError("No configuration given")
+    source = preset_path(preset) if preset is not None else cast("Path", path)
     given = _with_extended(source)
     values = apply_overrides(given, overrides)
     for override in overrides:

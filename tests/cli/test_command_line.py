@@ -95,15 +95,6 @@ def test_the_named_call_is_the_one_that_is_run(tmp_path: Path, capsys: pytest.Ca
     assert "sources[].path" in said
 
 
-def test_an_input_is_fed_to_the_call_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="1"):
-        arguments = ["--artifacts", str(tmp_path / "store"), "--input", f"episodes={tmp_path}"]
-        main(["task", "render_actions", "--name", "render_actions.banks", *arguments])
-    error = capsys.readouterr().err
-    assert "not finished" not in error
-    assert str(tmp_path) in error
-
-
 def test_a_reader_that_ends_first_is_no_error(project_root: Path) -> None:
     code = "import sys; from flows.command_line import main; sys.argv[1:] = ['embodiment', 'list']; main()"
     command = [sys.executable, "-c", code]

@@ -151,36 +151,5 @@ def test_nightly_guards_on_a_real_server_and_worker(
         assert (kinds["report"], kinds["metrics"], kinds["picture"]) == ("markdown", "table", "image")
     assert metric in (history / "index.html").read_text()
 
-    command = [
-        sys.executable,
-        "-m",
-        "flows.command_line",
-        "nightly",
-        "--config",
-        str(config),
-        "--artifacts",
-        str(artifacts),
-    ]
-    third = subprocess.run(
-        [*command, "--night", "third"], env=environment, cwd=project_root, capture_output=True, text=True, check=False, timeout=400
-    )  # fmt: skip
-    assert third.returncode == 1
-    assert metric in third.stderr
-
     filtered = _run(environment, project_root, "step/filter", given)
     assert filtered.returncode == 0, filtered.stdout + filtered.stderr
-    _prefect(environment, project_root, "automation", "create", "--from-file", "examples/nightly_automation.yaml")
-    assert "A night became worse" in _prefect(environment, project_root, "automation", "ls")
-
-
-@pytest.mark.slow
-def test_deployed_pipeline_runs_on_a_worker(
-    environment: dict[str, str], worker_log: Path, project_root: Path, tmp_path: Path
-) -> None:
-    found = _run(
-        environment, project_root, "pipeline/pipeline", {"preset": "smoke", "artifacts": str(tmp_path / "artifacts")}
-    )
-    assert found.returncode == 0, found.stdout + found.stderr
-    reports = sorted(path.parent.name for path in (tmp_path / "artifacts" / "report").glob("*/index.html"))
-    assert len(reports) == 2, worker_log.read_text()
-    assert reports[1] == "latest"  # and before it, in hexadecimal, the report that it leads to

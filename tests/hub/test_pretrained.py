@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from huggingface_hub import ModelCard
 
 from flows.command_line import main
 from tests.hub.conftest import Hub, Repository
@@ -31,33 +30,6 @@ def publish(hub: Hub, folder: Path, name: str = "ORG/NAME") -> Repository:
     files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     hub.repositories[name] = Repository(private=True, files={path: (content, False) for path, content in files.items()})
     return hub.repositories[name]
-
-
-def test_the_card_says_what_the_manifest_and_the_description_say(tmp_path: Path, folder: Path) -> None:
-    store = tmp_path / "artifacts"
-    trained, filtered, curated = (store / step / "0" for step in ("train_stage2", "filter", "curate"))
-    curated.mkdir(parents=True)
-    filtered.mkdir(parents=True)
-    (curated / "sources.json").write_text(
-        '[{"label": "agibot", "kind": "lerobot_v3", "license": "CC-BY-NC-SA-4.0", "redistribution": "no", "names": ["agibot"],'
-        ' "found": 2, "kept": 2, "reasons": {}, "image_size": null, "fps": null, "stride": null, "conventions": {}}]'
-    )
-    write_manifest(filtered, {"inputs": {"episodes": {"path": "curate/0", "digest": "1"}}})
-    trained.parent.mkdir(parents=True)
-    folder.rename(trained)
-    environment = {"packages": {"torch": "2.11"}}
-    inputs = {"episodes": {"path": "filter/0", "digest": "2"}}
-    write_manifest(trained, {"step": "train_stage2", "version": 1, "inputs": inputs, "environment": environment})
-    main(["card", str(trained), "--license", "apache-2.0"])
-    card = (trained / "run" / "card" / "README.md").read_text()
-    assert card.startswith("---\nlibrary_name: worldline\n")
-    for said in (
-        "license: apache-2.0", "source agibot: 2 episodes, licence CC-BY-NC-SA-4.0", "source galaxea: 1 episodes, licence not stated",
-        "steps: 20, seed 0", "- loss: 0.25", "- sigma_px_ref: 40.0", "- fps: 8.0", "torch 2.11", "Of the weights: apache-2.0",
-    ):  # fmt: skip
-        assert said in card
-    results = ModelCard.load(trained / "run" / "card" / "README.md").data.eval_results
-    assert ("loss", 0.25) in [(found.metric_type, found.metric_value) for found in results]
 
 
 @pytest.mark.parametrize("absolute", [False, True])

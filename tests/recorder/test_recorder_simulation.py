@@ -14,7 +14,6 @@ from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.recorder.bodies import BODIES, REACH_X
 from worldline_core.recorder.controllers import ArmSolver, Waypoint, plan_waypoints, sample_waypoints, tool_rotation
-from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES
 from worldline_core.recorder.scene import SceneModel, build_scene, sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder
 
@@ -28,24 +27,6 @@ def scene(request: pytest.FixtureRequest) -> SceneModel:
 
 def random_joints(scene: SceneModel, random: np.random.Generator) -> list[np.ndarray]:
     return [random.uniform(*arm.limits.T) for arm in scene.arms]
-
-
-def test_committed_kinematics_equal_the_full_model(scene: SceneModel) -> None:
-    kinematics = mujoco.MjModel.from_xml_path(str(EMBODIMENTS / f"{scene.robot.name}.xml"))
-    small, full = mujoco.MjData(kinematics), mujoco.MjData(scene.model)
-    embodiment = load_embodiment(scene.robot.name)
-    random = np.random.default_rng(3)
-    for _ in range(5):
-        for arm, joints in enumerate(random_joints(scene, random)):
-            full.qpos[scene.arms[arm].qpos] = joints
-            for name, value in zip(embodiment.arms[arm].joints, joints, strict=True):
-                small.qpos[kinematics.joint(name).qposadr[0]] = value
-        mujoco.mj_kinematics(kinematics, small)
-        mujoco.mj_kinematics(scene.model, full)
-        for arm, indices in zip(scene.robot.arms, scene.arms, strict=True):
-            site = indices.tool_site
-            np.testing.assert_allclose(small.site(f"{arm.name}/tool").xpos, full.site_xpos[site], atol=1e-9)
-            np.testing.assert_allclose(small.site(f"{arm.name}/tool").xmat, full.site_xmat[site], atol=1e-9)
 
 
 def test_arm_kinematics_of_the_embodiment_equal_mujoco(scene: SceneModel) -> None:
@@ -66,13 +47,6 @@ def test_committed_descriptions_are_what_the_recorder_writes(scene: SceneModel) 
     name = scene.robot.name
     assert (EMBODIMENTS / f"{name}.xml").read_text() == kinematics_xml(scene)
     assert (EMBODIMENTS / f"{name}.yaml").read_text() == embodiment_yaml(scene)
-
-
-def test_state_columns_follow_the_embodiment(scene: SceneModel) -> None:
-    expected: list[str] = []
-    for arm in load_embodiment(scene.robot.name).arms:
-        expected += [*arm.joints, f"{arm.name}/gripper"]
-    assert list(scene.state_names) == expected
 
 
 def test_inverse_kinematics_reaches_the_table(scene: SceneModel) -> None:
@@ -99,19 +73,6 @@ def test_recorded_actions_alone_reproduce_the_motion() -> None:
     np.testing.assert_array_equal(again.qpos, motion.qpos)
     assert again.outcome == motion.outcome
     assert not np.array_equal(other.qpos, motion.qpos)
-
-
-def test_arms_follow_their_commands_closely() -> None:
-    recorder = EpisodeRecorder("xarm7_bronze")
-    motion = recorder.move(
-        sample_layout(recorder.scene.robot, "carry", np.random.default_rng(1)), np.random.default_rng(2), 33
-    )
-    assert motion is not None
-    joints = [column for column, name in enumerate(recorder.scene.state_names) if not name.endswith("gripper")]
-    assert np.abs(motion.state[:, joints] - motion.action[:, joints]).max() < 0.15
-    # Both arms travel: otherwise following commands could not be seen.
-    assert np.ptp(motion.state[:, joints[:7]], axis=0).max() > 0.3
-    assert np.ptp(motion.state[:, joints[7:]], axis=0).max() > 0.3
 
 
 def test_a_single_arm_uses_the_whole_table_and_pads_never_touch_what_is_placed() -> None:
@@ -142,9 +103,3 @@ def test_waypoints_are_met_in_time_and_at_rest() -> None:
     np.testing.assert_allclose(positions, [[0, 0, 0], [0.5, 1, 1.5], [1, 2, 3], [1, 2, 3], [1, 2, 3]])
     np.testing.assert_allclose(yaw, [0, 0.25, 0.5, 0.5, 0.5])
     np.testing.assert_allclose(opening[[0, 1, 2, 4]], [1.0, 0.5, 0.0, 1.0])
-
-
-def test_test_scenes_are_not_training_scenes() -> None:
-    assert len(TRAIN_SCENES) == 12 and len(TEST_SCENES) == 4
-    assert not set(TRAIN_SCENES) & set(TEST_SCENES)
-    assert len({scene.table for scene in SCENES.values()}) == len(SCENES)

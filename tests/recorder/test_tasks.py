@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,23 +10,19 @@ from pydantic import ValidationError
 
 mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
 
-from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
-from worldline_core.recorder.attempts import BankGrid, BankSpec, RecordBanksConfig
+from worldline_core.recorder.attempts import BankSpec, RecordBanksConfig
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.recorder.outcomes import LIFTED, outcome
-from worldline_core.recorder.record import FAILURES_FILE, RecordConfig, RecordGroup, record
-from worldline_core.recorder.rendering import TEST_SCENES
+from worldline_core.recorder.record import RecordGroup
 from worldline_core.recorder.scene import (
     BUTTON_TRAVEL,
     DRAWER_TRAVEL,
     KINDS,
     STANDING,
     TASKS,
-    UNLIT,
     Layout,
     apply_layout,
-    light_buttons,
     sample_layout,
 )
 from worldline_core.recorder.simulate import EpisodeRecorder
@@ -137,20 +131,6 @@ def test_outcomes_are_read_from_the_things(recorder: EpisodeRecorder) -> None:
     assert judged(recorder, carry, qpos)[0] == "failure"
 
 
-def test_a_pressed_button_lights_up(recorder: EpisodeRecorder) -> None:
-    layout = layout_of(recorder, "press", np.random.default_rng(1))
-    qpos = still(recorder, layout)[0]
-    plate = recorder.scene.model.geom("button_0_plate").id
-    light_buttons(recorder.scene, layout, qpos)
-    np.testing.assert_allclose(recorder.scene.model.geom_rgba[plate, :3], UNLIT, atol=1e-6)
-    qpos[joint_of(recorder, "button_0")] = BUTTON_TRAVEL
-    light_buttons(recorder.scene, layout, qpos)
-    np.testing.assert_allclose(
-        recorder.scene.model.geom_rgba[plate, :3],
-        recorder.scene.model.geom_rgba[recorder.scene.model.geom("button_0").id, :3],
-    )
-
-
 def test_layouts_name_what_is_there_and_keep_things_apart(recorder: EpisodeRecorder) -> None:
     random = np.random.default_rng(2)
     distractors = 0
@@ -166,14 +146,6 @@ def test_layouts_name_what_is_there_and_keep_things_apart(recorder: EpisodeRecor
             distractors += 1
             assert np.linalg.norm(thing.xy - layout.target.xy) > 0.1
     assert distractors > 20
-
-
-def test_a_grid_of_banks_gives_each_an_initial_state_and_each_cell_several_scenes() -> None:
-    grid = BankGrid(embodiments=("ur5e_silver", "xarm7_white"), families=("lift", "close"), scenes=TEST_SCENES, count=5)
-    specs = grid.specs()
-    assert len({spec.name for spec in specs}) == len({spec.layout for spec in specs}) == 20
-    for cell in {(spec.embodiment, spec.family) for spec in specs}:
-        assert {spec.scene for spec in specs if (spec.embodiment, spec.family) == cell} == set(TEST_SCENES)
 
 
 def test_a_bank_mixes_successes_and_failures_of_one_initial_state(recorder: EpisodeRecorder) -> None:
@@ -193,19 +165,3 @@ def test_what_nobody_can_record_is_refused() -> None:
         RecordGroup(embodiment="xarm7_single", count=1)
     with pytest.raises(DataError, match="Unknown body"):
         EpisodeRecorder("so101")
-
-
-@pytest.mark.slow
-def test_a_recording_tells_its_failures_apart_from_its_index(tmp_path: Path) -> None:
-    group = RecordGroup(
-        embodiment="viperx_pearl", split="ood_test", count=3, families=("lift", "place", "close"), held_out_camera=True
-    )
-    try:
-        counts = record(RecordConfig(groups=(group,), seed=6, workers=1), tmp_path)
-    except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
-        pytest.skip(f"off-screen OpenGL is not available here ({error})")
-    rows = EpisodeSet.open(tmp_path).rows
-    failures = json.loads((tmp_path / FAILURES_FILE).read_text())
-    assert {row.episode_id for row in rows if row.outcome == "failure"} == set(failures)
-    assert counts["failures"] == {"incomplete": 1, "missed": 1}
-    assert {row.task_family for row in rows} == {"lift", "place", "state_change"}

@@ -10,21 +10,17 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tasks.execution.command_line import add_task_arguments
 from worldline_core.config import load_config
-from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 from worldline_core.rehearsal.outside_models import OUTSIDE_MODELS, write_outside_models
 from worldline_core.rehearsal.rehearsal import (
     ABLATION_SIZES,
-    TWO_VIEWS,
     changes_of,
     table,
-    write_recordings,
 )
 from worldline_core.report.ablation_table import load_variants
 
@@ -96,31 +92,6 @@ def test_a_missing_folder_of_weights_is_named_before_the_first_step(name: str, p
     (project / "weights" / name).mkdir()
     with pytest.raises(UnavailableError, match=rf"weights/{name}"):
         check_weights(config, project)
-
-
-def test_a_baseline_s_text_tokenizer_is_looked_for_too(project: Path) -> None:
-    overrides = ["train_stage1=null", "rollouts.stage1={config: {sampler: {kind: copy_first_frame}}}"]
-    config = load_config(PipelineConfig, preset=PRESET, overrides=overrides)
-    check_weights(config, project)
-    shutil.rmtree(project / "weights" / "Cosmos3-Nano" / "text_tokenizer")
-    with pytest.raises(
-        UnavailableError,
-        match=r"(?s)rollouts\.backbone\.config\.sampler\.text\.path: weights/.*next step: download the folder text_t",
-    ):
-        check_weights(config, project)
-
-
-@pytest.mark.slow
-def test_recordings_are_those_of_a_robot_at_thirty_frames_a_second(tmp_path: Path) -> None:
-    write_recordings(tmp_path / "two", TWO_VIEWS, split="test")
-    episodes = EpisodeSet.open(tmp_path / "two")
-    assert [(row.fps, row.num_frames, row.views, row.split) for row in episodes.rows] == [
-        (30.0, 129, ("head", "right_wrist"), "test")
-    ] * 2
-    episode = episodes.episode(0)
-    assert np.abs(np.diff(episode.state[:, :-1], axis=0)).max() * 30 < 7  # rad/s: no arm moves faster
-    rotations = episode.cameras["right_wrist"].T_base_camera[:, :3, :3]
-    assert np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max() < 1e-6
 
 
 def test_torchrun_hands_the_name_of_a_call_on() -> None:

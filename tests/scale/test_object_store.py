@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import stat
 import tempfile
 from collections import Counter
@@ -19,7 +18,7 @@ from upath import UPath
 
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import inside, local_file, parse_location
 from worldline_core.scale.account import read_account
@@ -57,20 +56,6 @@ def test_a_set_in_the_store_gives_the_bytes_of_one_in_a_folder(
 ) -> None:
     url = store.upload(recordings, "same")
     assert curated_digest(config(url), tmp_path / "remote") == curated_digest(config(recordings), tmp_path / "local")
-
-
-def test_a_missing_and_a_damaged_object_cost_their_episodes_only(
-    tmp_path: Path, recordings: Path, store: ObjectStore
-) -> None:
-    damaged = tmp_path / "damaged"
-    shutil.copytree(recordings, damaged)
-    video = next((damaged / "datasets").rglob("*head*/**/*.mp4"))
-    video.write_bytes(video.read_bytes()[:2000])
-    with pytest.raises(Exception, match="No episode was kept"):
-        curate(config(store.upload(damaged, "damaged")), {}, tmp_path / "out")
-    rows = EpisodeSetWriter(tmp_path / "out").rejected()
-    assert {row.reason for row in rows} <= {"truncated_video", "unreadable"}
-    assert all("worldline-remote" not in row.detail and "127.0.0.1" not in row.detail for row in rows)
 
 
 @pytest.mark.slow
@@ -204,10 +189,3 @@ def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, recording
     store.upload(recordings, "key")
     url.fs.invalidate_cache()
     assert artifacts.input_digest(url) != first
-
-
-def test_a_set_can_be_opened_where_it_is(recordings: Path, store: ObjectStore) -> None:
-    opened, local = EpisodeSet.open(parse_location(store.upload(recordings, "open"))), EpisodeSet.open(recordings)
-    assert [row.episode_id for row in opened.rows] == [row.episode_id for row in local.rows]
-    assert (opened.frames(2, "head") == local.frames(2, "head")).all()
-    assert (opened.episode(1).state == local.episode(1).state).all()

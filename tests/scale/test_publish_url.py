@@ -41,28 +41,6 @@ def test_there_and_back(tmp_path: Path, finished: Path, store: ObjectStore, kind
     assert not [path for method, path in store.requests[sent:] if method == "PUT" and "/datasets/" in path]
 
 
-def test_an_interrupted_push_is_no_set_and_goes_on(tmp_path: Path, finished: Path, store: ObjectStore) -> None:
-    store.upload(tmp_path / "nothing", "x")
-    where = f"s3://{BUCKET}/interrupted"
-    sent: list[str] = []
-
-    def stops(method: str, path: str) -> str | None:
-        if method == "PUT" and "/interrupted/" in path:
-            sent.append(path)
-            return "broken" if len(set(sent)) > 3 else None
-        return None
-
-    store.misbehave = stops
-    with pytest.raises(UnreachableInputError, match="A store could not be reached"):
-        push(finished, where)
-    store.misbehave = lambda method, path: None
-    with pytest.raises(ArtifactError, match="No finished EpisodeSet is published here"):
-        pull(where, tmp_path / "back")
-    push(finished, where)
-    pull(where, tmp_path / "back")
-    assert digest_folder(tmp_path / "back") == digest_folder(finished)
-
-
 @pytest.mark.parametrize("refused", [".json", ".txt"])
 def test_an_interrupted_second_push_goes_on(tmp_path: Path, finished: Path, store: ObjectStore, refused: str) -> None:
     """Files that the second set lacks are removed and those of another content sent, also after an interruption."""

@@ -75,30 +75,6 @@ def test_one_process_owns_the_artifact(tmp_path: Path, distributed: bool) -> Non
     assert [cached for *_, cached in again] == [True, True]
 
 
-def test_a_helper_does_not_join_work_of_another_launch(tmp_path: Path) -> None:
-    store = ArtifactStore(tmp_path)
-    key = store.key("work", 1, WorkConfig(seconds=1.0), {})
-    partial = tmp_path / "work" / f"{key}.partial"
-    partial.mkdir(parents=True)
-    results: Queue[Any] = CONTEXT.Queue()
-    options = {"distributed": True, "results": results}
-    # Someone else is at work, and says so under another address.
-    (tmp_path / "work" / f".{key}.workers").write_bytes(b"another launch")
-    helper = CONTEXT.Process(target=process, args=(tmp_path, 1), kwargs=options)
-    helper.start()
-    time.sleep(0.8)
-    assert helper.is_alive()
-    assert not (partial / "run").exists()
-    owner = CONTEXT.Process(target=process, args=(tmp_path, 0), kwargs=options)
-    owner.start()
-    processes = [helper, owner]
-    found = sorted(results.get(timeout=30) for _ in processes)
-    for one in processes:
-        one.join(timeout=30)
-    assert found[0][1:3] == found[1][1:3]
-    assert sorted(path.name for path in (Path(found[0][1]) / "run").iterdir()) == [".writers", "rank-0", "rank-1"]
-
-
 def straggle(folder: Path, begun: Any) -> None:
     """A worker of a command that was killed: it does not know yet."""
     with helper_lock(folder):

@@ -94,7 +94,6 @@ def _records(trap: Path, elsewhere: Path) -> dict[str, Callable[[dict[str, Any]]
     """What somebody may have written in the place of a record."""
     pickled = base64.b64encode(pickle.dumps(Trap(trap))).decode()
     lie = json.dumps({"step": "write_one", "path": str(elsewhere), "digest": "0" * 64})
-    made = json.dumps({"__class__": "trap_door.Anything", "data": {}})
 
     def change(result: str | None = None, **serializer: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
         return lambda record: {
@@ -104,15 +103,12 @@ def _records(trap: Path, elsewhere: Path) -> dict[str, Callable[[dict[str, Any]]
 
     return {
         "pickle": lambda r: {"metadata": r["metadata"] | {"serializer": {"type": "pickle"}}, "result": pickled},
-        "a decoder": change(object_decoder="trap_door.anything"), "another place": change(lie), "a class": change(made), "no record": lambda r: {},
-        "half a character": change('"\\ud800"'),
+        "a decoder": change(object_decoder="trap_door.anything"), "another place": change(lie), "no record": lambda r: {},
     }  # fmt: skip
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", ["pickle", "a decoder", "another place", "a class", "no record", "half a character", "a folder"]
-)
+@pytest.mark.parametrize("kind", ["pickle", "a decoder", "another place", "no record"])
 def test_prefects_records_are_not_believed(
     prefect_server: None,
     tmp_path: Path,
@@ -131,17 +127,3 @@ def test_prefects_records_are_not_believed(
             path.mkdir() if change is None else path.write_text(json.dumps(change(record)))
         assert _run(tmp_path, writers, "a", "b") == (one, two)
     assert not (tmp_path / "trap").exists()
-
-
-@pytest.mark.slow
-def test_a_store_that_was_moved_is_found_where_it_is(
-    prefect_server: None, tmp_path: Path, writers: tuple[ArtifactTask, ArtifactTask]
-) -> None:
-    before, after = tmp_path / "before", tmp_path / "after"
-    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: before / "prefect"}):
-        _run(before, writers, "a", "b")
-    before.rename(after)
-    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: after / "prefect"}):
-        one, two = _run(after, writers, "a", "b")
-    assert (one.path.parents[1], two.path.parents[1]) == (after, after)
-    assert not before.exists()

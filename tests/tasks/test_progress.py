@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import pty
 import re
-import subprocess
-import sys
-import termios
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -82,48 +77,3 @@ def test_other_processes_of_the_same_loop_are_silent(piped: pytest.LogCaptureFix
             shown.advance()
     assert list(with_progress("abc", "letters", "letter")) == ["a", "b", "c"]
     assert messages(piped) == []
-
-
-TERMINAL = """
-import logging, time
-from tasks.execution.command_line import log_to_stderr
-from worldline_core.progress import Progress
-
-log_to_stderr()
-with Progress("stage II", 20, "step") as shown:
-    for step in range(20):
-        time.sleep(0.03)
-        if step == 10:
-            logging.getLogger("worldline_core.training").warning("Clip skipped")
-        shown.advance(clips=3, loss=0.25)
-"""
-
-
-def test_a_terminal_has_a_bar_and_messages_stand_on_lines_of_their_own(project_root: Path) -> None:
-    ours, theirs = pty.openpty()
-    termios.tcsetwinsize(theirs, (24, 120))
-    process = subprocess.Popen(
-        [sys.executable, "-c", TERMINAL], cwd=project_root, stderr=theirs,
-        env={**os.environ, "PYTHONPATH": str(project_root)},
-    )  # fmt: skip
-    os.close(theirs)
-    written = b""
-    while True:
-        try:
-            written += (part := os.read(ours, 4096))
-        except OSError:  # the other side is closed
-            break
-        if not part:
-            break
-    os.close(ours)
-    assert process.wait(timeout=30) == 0
-    text = written.decode()
-    assert text.count("Clip skipped") == 1
-    shown = re.split(r"[\r\n]+", text)
-    assert [line for line in shown if re.fullmatch(r"\d\d:\d\d:\d\d \| WARNING \| Clip skipped", line.strip())]
-    bars = [
-        line for line in shown if re.search(r"stage II: .*\d+/20 \[\d\d:\d\d<\d\d:\d\d.*loss 0\.25, .* clips/s", line)
-    ]
-    assert len(bars) > 2
-    assert "20/20" in bars[-1]
-    assert not re.search(r"\d of 20 steps", text)
