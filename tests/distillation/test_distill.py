@@ -31,7 +31,7 @@ from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TrainedClips
-from worldline_core.rollout.speed import long_rollout
+from worldline_core.rollout.rollout import long_rollout
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.artifact_files import digest_file, folder_files
 from worldline_core.training.clip_loader import ClipLoader

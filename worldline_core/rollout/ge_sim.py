@@ -1,15 +1,10 @@
 """Predictions of a simulator behind HTTP in the protocol of GE-Sim 2.0 (github.com/AgibotTech/GE-Sim-V2: docs/replay.md and
 docs/adding_world_models.md), written against its description.
 
-GET /healthz; POST /init gives a ``client_id`` that every later body carries (another client's /init ends the session). /reset,
-/set_task, /set_camera_params and /close take JSON; /set_episode_data, /set_episode_traj and /step take sections, each after its
-length in four bytes, big-endian, the last one JSON. A frame is one JPEG with the views side by side; numbers are float32,
-little-endian. /step takes at most 25 actions and answers with JSON (``frame_shape``: T 3 V H W; ``state_shape``, or null), T
-frames, and the state.
-
-The server is driven by absolute joint targets of two arms of seven joints (AgiBot G1), and by a picture of the tools for every
-frame and view (its "band"): a disc at each tool, larger the nearer the camera, darker the wider closed, and three lines of
-10 cm along the tool's axes.
+Bodies are JSON, or sections, each after its length in four bytes, big-endian, the last one JSON. A frame is one JPEG with the
+views side by side; numbers are float32, little-endian. The server is driven by absolute joint targets of two arms of seven
+joints (AgiBot G1), at most 25 a step, and by a picture of the tools for every frame and view (its "band"): a disc at each tool,
+larger the nearer the camera, darker the wider closed, and three lines of 10 cm along the tool's axes.
 
 Axes: t frames, v views, a arms (left, right).
 """
@@ -42,11 +37,9 @@ from worldline_core.rollout.simulation import Frames
 from worldline_core.untrusted_text import cut
 
 CHUNK = 25
-"""Most actions of a step."""
 REPLAYED = 2 * CHUNK
 """From this many frames on the server takes a band as the whole episode's, and remembers its earlier parts."""
 ACTIONS, GRIPPERS = 16, (7, 15)
-"""Numbers of an action: seven joints and the gripper of the left arm, then of the right one."""
 _JPEG_QUALITY, _MAX_JSON_BYTES = 95, 1 << 16
 _PATIENCE = 3
 """Refused predictions in a row after which the server counts as out of order."""
@@ -66,12 +59,6 @@ class RefusedPredictionError(DataError):
     """One prediction cannot be made, others may be; ``reason`` is its code in the quarantine."""
 
     reason = "simulator_failed"
-
-
-class UnsupportedControlsError(RefusedPredictionError):
-    """The controls are not those of two arms of seven joints."""
-
-    reason = "unsupported_controls"
 
 
 class GeSim:
@@ -99,13 +86,12 @@ class GeSim:
             raise self._unusable("/init", f"no client_id in its answer: {error!r}") from error
 
     def unit(self, frames: int) -> int:
-        """Frames arrive one by one."""
         return 1
 
     def close(self) -> None:
         """End the session."""
         try:
-            self._tell("/close")
+            self._post("/close", self._body())
         except (UnavailableError, RefusedPredictionError):
             return  # the predictions are complete
 
@@ -119,21 +105,23 @@ class GeSim:
         (item,), size, stride = batch, self._config.image_size, self._stride
         controls = self._tracks.tracks(item.controls_of)
         if controls.native is None or controls.controls == "ee_pose" or controls.native.shape[1] != ACTIONS:
-            raise UnsupportedControlsError(
+            error = RefusedPredictionError(
                 "GE-Sim is driven by joint targets of two arms of seven joints and a gripper each",
                 where=f"episode {controls.episode_id}, embodiment {controls.embodiment}",
                 expected=f"{ACTIONS} numbers a frame",
                 got=f"{controls.controls} of {None if controls.native is None else controls.native.shape[1]} numbers",
             )
+            error.reason = "unsupported_controls"
+            raise error
         observed = rearrange((images[0] + 1) * 127.5, "v c h w -> v h w c").round().clamp(0, 255).byte().numpy()
         yield [{view: picture[None] for view, picture in zip(item.views, observed, strict=True)}]
         K = ImageTransform.of(controls.image_size).resize(size).intrinsics(controls.K)
         cameras = controls.clip([0]).T_base_camera[0]
-        self._tell("/reset")
-        self._tell("/set_task", task=self._episodes.rows[item.position].instruction)
-        self._tell("/set_camera_params", intrinsic=K.tolist(), extrinsic=cameras.tolist())
+        self._post("/reset", self._body())
+        self._post("/set_task", self._body(task=self._episodes.rows[item.position].instruction))
+        self._post("/set_camera_params", self._body(intrinsic=K.tolist(), extrinsic=cameras.tolist()))
         picture = _jpeg(resized_frames(observed, size))
-        self._post("/set_episode_data", self._body([picture], frame_shape=[3, len(observed), *size]))
+        self._post("/set_episode_data", self._body(picture, frame_shape=[3, len(observed), *size]))
         shown = controls.clip(range(stride, item.frames * stride, stride))
         if whole := item.frames - 1 >= REPLAYED:
             self._condition(shown, K)
@@ -141,30 +129,26 @@ class GeSim:
             chunk = shown.clip(range(start, min(start + CHUNK, item.frames - 1)))
             if not whole:
                 self._condition(chunk, K)
-            found = self._step(actions_of(chunk))
-            yield [
-                {
-                    view: resized_frames(np.ascontiguousarray(found[:, v]), self.image_size)
-                    for v, view in enumerate(item.views)
-                }
-            ]
+            actions = chunk.native.astype(np.float32)  # type: ignore[union-attr]
+            actions[:, GRIPPERS] = 1 - chunk.gripper[:, 0]  # the server counts 0 open, 1 closed
+            found = self._step(actions)
+            frames = np.ascontiguousarray(found.swapaxes(0, 1))
+            yield [{v: resized_frames(f, self.image_size) for v, f in zip(item.views, frames, strict=True)}]
 
     def _condition(self, tracks: EpisodeTracks, K: np.ndarray) -> None:
         """Send the pictures of the tools and the camera poses of the coming frames."""
-        band, poses = (
-            tool_band(tracks, K, self._config.image_size, self._config.tool_offset_m),
-            tracks.T_base_camera.swapaxes(0, 1),
-        )
+        band = tool_band(tracks, K, self._config.image_size, self._config.tool_offset_m)
+        poses = tracks.T_base_camera.swapaxes(0, 1)
         shape = [3, band.shape[1], band.shape[0], *band.shape[2:4]]
         sections = [_packed(_jpeg(views) for views in band), _floats(poses)]
-        self._post("/set_episode_traj", self._body(sections, traj_shape=shape, c2w_shape=poses.shape))
+        self._post("/set_episode_traj", self._body(*sections, traj_shape=shape, c2w_shape=poses.shape))
 
     def _step(self, actions: np.ndarray) -> np.ndarray:
         """Frames of the next actions (t, 16), uint8 (t, v, H, W, 3)."""
         size, views = self._config.image_size, len(self.views)
         # A JPEG is never much larger than its pixels.
         most = _MAX_JSON_BYTES + 6 * len(actions) * views * math.prod(size) + 4 * CHUNK * ACTIONS
-        answer = self._post("/step", self._body([_floats(actions)], action_shape=actions.shape), most)
+        answer = self._post("/step", self._body(_floats(actions), action_shape=actions.shape), most)
         try:
             _, *pictures, _ = _sections(answer)  # between JSON and the state
             if len(pictures) != len(actions):
@@ -175,11 +159,9 @@ class GeSim:
         self._refused = 0
         return np.stack(frames)
 
-    def _tell(self, path: str, **values: object) -> None:
-        self._post(path, json.dumps({"client_id": self._client, **values}).encode())
-
-    def _body(self, sections: Sequence[bytes], **values: object) -> bytes:
-        return _packed([*sections, json.dumps({"client_id": self._client, **values}).encode()])
+    def _body(self, *sections: bytes, **values: object) -> bytes:
+        meta = json.dumps({"client_id": self._client, **values}).encode()
+        return _packed([*sections, meta]) if sections else meta
 
     def _post(self, path: str, body: bytes | None, most: int = _MAX_JSON_BYTES) -> bytes:
         kind = "application/json" if body is None or body.startswith(b"{") else "application/octet-stream"
@@ -213,18 +195,8 @@ class GeSim:
         )
 
 
-def actions_of(tracks: EpisodeTracks) -> np.ndarray:
-    """Joint targets (t, 16) [rad] with the grippers as the server counts them: 0 open, 1 closed."""
-    assert tracks.native is not None  # noqa: S101  (checked where predictions begin)
-    actions = tracks.native.astype(np.float32)
-    actions[:, GRIPPERS] = 1 - tracks.gripper[:, 0]
-    return actions
-
-
 def tool_band(tracks: EpisodeTracks, K: np.ndarray, size: tuple[int, int], tool_offset_m: float) -> np.ndarray:
-    """Pictures of the tools, uint8 (t, v, H, W, 3) RGB (GE-Sim-V2, docs/replay.md: "trajectory band").
-
-    A tool behind the camera, or outside of the picture, is not drawn.
+    """Pictures of the tools, uint8 (t, v, H, W, 3) RGB; a tool behind the camera or outside of the picture is not drawn.
 
     Args:
         K: (v, 3, 3) in pixels of ``size``.

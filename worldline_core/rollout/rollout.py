@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,8 +37,8 @@ from worldline_core.rollout.rollout_config import (
     TextToVideoConfig,
 )
 from worldline_core.rollout.rollout_set import RolloutSetWriter
+from worldline_core.rollout.samplers import BlockCausalSimulator
 from worldline_core.rollout.simulation import Frames, encode_images
-from worldline_core.rollout.speed import SPEED_FILE, device_name, long_rollout, timed
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.atomic import write_json_atomic
 
@@ -122,7 +126,8 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     in_splits = len(episodes.select(split=config.splits))
     reasons = {"in other splits": len(episodes) - in_splits, "not among those asked for": in_splits - len(chosen)}
     reasons |= Counter(row.reason for row in left_out)
-    causal = world.causal if isinstance(world, WorldLine) else None
+    lacking = Counter(view for item in planned for view in world.views if view not in item.views)
+    account = {"without_view": dict(lacking), "cut_frames": sum(item.sampled - item.frames for item in planned)}
     return {
         "method": config.method,
         "found": len(episodes),
@@ -133,17 +138,8 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         "frames": sum(item.frames for item in planned),
         "checkpoint_kind": world.info.kind if isinstance(world, WorldLine | TextToVideo) else None,
         "steps": world.steps,
-        "recent_blocks": None if causal is None else causal.recent_blocks,
-        **_account(world, planned),
+        **{name: count for name, count in account.items() if count},
     }
-
-
-def _account(world: World, planned: Sequence[Prediction]) -> dict[str, Any]:
-    """Counts of missing views and cut frames; empty where there are none."""
-    lacking = Counter(view for item in planned for view in world.views if view not in item.views)
-    cut = sum(item.sampled - item.frames for item in planned)
-    account = {"without_view": dict(lacking), "cut_frames": cut}
-    return {name: value for name, value in account.items() if value}
 
 
 def _load(
@@ -252,4 +248,61 @@ def _write_speed(
         "seconds": seconds,
         "seconds_per_frame": seconds / frames,
     }
-    write_json_atomic(output / "run" / SPEED_FILE, speed | ({} if blocks is None else {"long_rollout": blocks}))
+    write_json_atomic(output / "run" / "speed.json", speed | ({} if blocks is None else {"long_rollout": blocks}))
+
+
+@dataclass(frozen=True)
+class Elapsed:
+    """Wall seconds, and processor seconds of all threads, which a busy machine does not stretch (and which say nothing
+    about kernels on a GPU).
+    """
+
+    wall: float
+    processor: float
+
+
+def timed[T](work: Callable[[], T], device: str) -> tuple[T, Elapsed]:
+    """Returns the result of ``work`` and its time; waits for the kernels of the current stream on a GPU."""
+    on_gpu = torch.device(device).type == "cuda"
+    if on_gpu:
+        torch.cuda.current_stream(device).synchronize()
+    wall, processor = time.perf_counter(), time.process_time()
+    result = work()
+    if on_gpu:
+        torch.cuda.current_stream(device).synchronize()
+    return result, Elapsed(time.perf_counter() - wall, time.process_time() - processor)
+
+
+def long_rollout(
+    simulator: Callable[[], BlockCausalSimulator], first: Tensor, maps: Tensor, blocks: int, *, warm_up: int = 2
+) -> dict[str, list[float]]:
+    """Seconds of every block of one long rollout under constant controls; its frames are dropped.
+
+    Processor seconds are given only where the processor did the work.
+
+    Args:
+        first, maps: observed latents ``(b v c h w)`` and the action maps of a clip ``(b v a t h w)``.
+        warm_up: blocks of another rollout before it, which are not counted.
+    """
+    device = str(maps.device)
+    times: list[Elapsed] = []
+    for count in (warm_up, blocks):
+        running = simulator()
+        running.start(first, maps[:, :, :, :1])
+        controls = maps[:, :, :, -running.spec.block_size :]
+        times = [timed(partial(running.step, controls), device)[1] for _ in range(count)]
+    seconds = {"block_seconds": [block.wall for block in times]}
+    if maps.device.type == "cpu":
+        seconds["block_processor_seconds"] = [block.processor for block in times]
+    return seconds
+
+
+def device_name(device: str) -> str:
+    """Name of the GPU, or of the processor with the number of threads in use."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_name(device)
+    facts = Path("/proc/cpuinfo")
+    lines = facts.read_text(encoding="utf-8").splitlines() if facts.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    processor = names[0] if names else platform.processor() or platform.machine()
+    return f"{processor}, {torch.get_num_threads()} threads of {os.cpu_count()} cores"

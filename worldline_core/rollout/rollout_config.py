@@ -58,14 +58,11 @@ class BlockCausalConfig(_ModelSampler):
 
     Attributes:
         steps: Euler steps per block; None: as the model was trained.
-        sink_blocks, recent_blocks: window of the cache; None: as the model was trained.
         timed_blocks: blocks of one additional long rollout that measures the cost of each; it changes no prediction.
     """
 
     kind: Literal["block_causal"] = "block_causal"
     steps: int | None = Field(default=None, ge=1)
-    sink_blocks: int | None = Field(default=None, ge=1)
-    recent_blocks: int | None = Field(default=None, ge=0)
     timed_blocks: int = Field(default=0, ge=0)
 
 

@@ -1,14 +1,11 @@
-"""Running predictions: `Session` is driven by action maps, `Simulation` by the commands of a policy.
+"""Running predictions: `Session` is driven by action maps, `Simulation` (of ``WorldLine.start``) by the commands of a policy.
 
-A session begins with the current images of the cameras and predicts one unit (a block or a clip) at a time, under controls that
-may be given as late as the step itself. A causal model predicts block by block: its KV cache is a window of constant size with
-positions counted from the window's start, so they stay within those of a training clip. A Stage II model chains clips: the last
-predicted picture of every view is the observed one of the next clip. Pictures are decoded unit by unit, so memory does not grow
-with the length.
+A session begins with the current images and predicts one unit (a block or a clip) at a time. A causal model's KV cache is a
+window of constant size with positions counted from its start. A Stage II model chains clips: the last predicted picture of every
+view is the observed one of the next clip. Pictures are decoded unit by unit, so memory does not grow with the length.
 
-``WorldLine.start`` begins a simulation: pictures and the robot's state out, controls of the next unit in. Equal seeds and
-controls give equal bytes on a CPU, and the noise of a clip does not depend on who shares its batch. In bfloat16 neither do the
-bytes; in float32 sums of another batch size are rounded otherwise, by one grey level at most.
+Equal seeds and controls give equal bytes on a CPU, and the noise of a clip does not depend on who shares its batch. In bfloat16
+neither do the bytes; in float32 sums of another batch size are rounded otherwise, by one grey level at most.
 
 Axis legend: b clips, v views, a channels of the action maps (of poses: arms), t latent frames, n frames, j columns of the
 embodiment's state, h w pixels or latent cells.
@@ -19,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -72,19 +68,14 @@ class Session:
 
     @torch.no_grad()
     def step(self, maps: Float[Tensor, "b v a t h w"]) -> Frames:
-        """Predict the next unit.
-
-        Args:
-            maps: action maps of the last known latent frame and of those to predict.
-
-        Returns:
-            The predicted frames, without the known one.
+        """The frames of the next unit, under maps of the last known latent frame and of those to predict.
 
         Raises:
             DataError: the controls given to a causal model are not those of one block.
         """
         if self._ended is not None:
-            self._observe(torch.stack([self._last_pictures(clip) for clip in self._ended]))
+            last = [[frames_to_video(clip[v][-1:])[:, 0] for v in self._sampler.views] for clip in self._ended]
+            self._observe(torch.stack([torch.stack(pictures) for pictures in last]))
         frames = self._decode(self._sample(maps))
         self._ended = frames if self._sampler.chained else None
         return frames
@@ -94,10 +85,7 @@ class Session:
     ) -> Iterator[Frames]:
         """Like `step`, for controls that are known in advance: one block is decoded while the next is sampled.
 
-        Args:
-            overlapped: whether to decode while sampling. None: on a GPU, where decoding gets a stream of its own, but not on
-                a CPU, whose cores are busy anyway. Chained clips never overlap: each begins at the last picture of the
-                one before.
+        By default so on a GPU alone, where decoding gets a stream of its own; chained clips never overlap.
         """
         on_gpu = torch.device(self._device).type == "cuda"
         if self._sampler.chained or not (on_gpu if overlapped is None else overlapped):
@@ -110,7 +98,7 @@ class Session:
                 latents = self._sample(given)
                 if beside is not None:
                     beside.wait_stream(torch.cuda.current_stream(self._device))
-                following = decoding.submit(self._decode_beside, latents, beside)
+                following = decoding.submit(self._decode, latents, beside)
                 if waiting is not None:
                     yield waiting.result()
                 waiting = following
@@ -123,21 +111,10 @@ class Session:
             self._first = None
         return self._sampler.step(maps[:, :, :, 1:])
 
-    @torch.no_grad()
-    def _decode_beside(self, latents: Tensor, stream: torch.cuda.Stream | None) -> Frames:
-        """Decode in another thread, on a GPU on a stream of its own."""
-        if stream is None:
-            return self._decode(latents)
-        with torch.cuda.stream(stream):
-            latents.record_stream(stream)
-            return self._decode(latents)
-
     def select(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> Session:
         """A session of these clips that continues from their present state, independently of this one. Naming a clip several
-        times makes branches of it, which share the cached history of a causal model.
-
-        Args:
-            seeds: of the noise from here on, one for each of ``clips``; by default the noise continues unchanged.
+        times makes branches of it, which share the cached history of a causal model. ``seeds``: of the noise from here on, one
+        for each of ``clips``; by default it continues unchanged.
         """
         other = copy(self)
         other._sampler = self._sampler.fork(clips, seeds)
@@ -155,11 +132,15 @@ class Session:
         self._decoders = [self._tokenizer.decoder(clip) for clip in images]
         return self._decode(rearrange(self._first, "b v c h w -> b v c 1 h w"))
 
-    def _last_pictures(self, clip: dict[str, np.ndarray]) -> Float[Tensor, "v 3 h w"]:
-        return torch.stack([frames_to_video(clip[view][-1:])[:, 0] for view in self._sampler.views])
-
-    def _decode(self, latents: Tensor) -> Frames:
-        with torch.autocast(self._device.split(":")[0], torch.bfloat16, enabled=self._bfloat16):
+    @torch.no_grad()
+    def _decode(self, latents: Tensor, stream: torch.cuda.Stream | None = None) -> Frames:
+        """Frames of latents; on a stream of its own where another thread decodes."""
+        if stream is not None:
+            latents.record_stream(stream)
+        with (
+            torch.cuda.stream(stream),
+            torch.autocast(self._device.split(":")[0], torch.bfloat16, enabled=self._bfloat16),
+        ):
             # One clip at a time: the decoder works on whole images, which take a hundred times the memory of latents.
             videos = (decode(clip) for decode, clip in zip(self._decoders, latents, strict=True))
             return [{view: video_to_frames(clip[v]) for v, view in enumerate(self._sampler.views)} for clip in videos]
@@ -252,24 +233,11 @@ class Starts:
         return other
 
 
-@dataclass(frozen=True)
-class Stepping:
-    """Rate, views and action maps with which a model is stepped.
-
-    Attributes:
-        frames: that a step predicts.
-        maps: of the tracks of each clip, at the latent frames of a step; of ``1 + index`` frames, the first is the start's.
-    """
-
-    contract: ActionContract
-    views: tuple[str, ...]
-    image_size: tuple[int, int]
-    frames: int
-    maps: Callable[[Sequence[EpisodeTracks]], Tensor]
-
-
 class Simulation:
     """A batch of running predictions of one robot, stepped by controls (made by ``WorldLine.start``).
+
+    Args:
+        maps: action maps of the tracks of each clip, at the latent frames of a step; the first of a track's frames is the start.
 
     Attributes:
         views, fps, image_size: of the pictures, (H, W).
@@ -280,13 +248,22 @@ class Simulation:
             the robot then is (:mod:`worldline_core.rollout.robot`). At the start those of the observed frame.
     """
 
-    def __init__(self, session: Session, starts: Starts, stepping: Stepping, *, limits: bool) -> None:
-        self._session = session
-        self._starts = starts
-        self._stepping = stepping
-        self.fps = stepping.contract.fps
+    def __init__(
+        self,
+        session: Session,
+        starts: Starts,
+        contract: ActionContract,
+        maps: Callable[[Sequence[EpisodeTracks]], Tensor],
+        *,
+        views: tuple[str, ...],
+        image_size: tuple[int, int],
+        frames: int,
+        limits: bool,
+    ) -> None:
+        self._session, self._starts, self._maps = session, starts, maps
+        self._draws_commands, self.fps = contract.controls == "action", contract.fps
         self._robot = CommandedRobot(starts.kinematics, self.fps, starts.state, limits=limits)
-        self.views, self.image_size, self.frames_per_step = stepping.views, stepping.image_size, stepping.frames
+        self.views, self.image_size, self.frames_per_step = views, image_size, frames
         self.num_frames = 1
         self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in session.observed]
         self.commands = self.states = starts.state[:, None]
@@ -331,16 +308,11 @@ class Simulation:
         """
         commands = self._checked(controls)
         robot, executed, states = self._robot.follow(commands)
-        drawn = executed if self._stepping.contract.controls == "action" else states
+        drawn = executed if self._draws_commands else states
         tracks = [self._project(clip, rows) for clip, rows in enumerate(drawn)]
-        frames = self._session.step(self._stepping.maps(tracks))
-        self._robot, self.commands, self.states, self._tracks, self._drawn = (
-            robot,
-            executed,
-            states,
-            tracks,
-            drawn[:, -1],
-        )
+        frames = self._session.step(self._maps(tracks))
+        self._robot, self.commands, self.states = robot, executed, states
+        self._tracks, self._drawn = tracks, drawn[:, -1]
         self.num_frames += self.frames_per_step
         self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in frames]
         return frames
@@ -350,8 +322,8 @@ class Simulation:
         return self._robot.follow(np.asarray(controls, dtype=np.float64))[1:]
 
     def fork(self, n: int, seeds: Sequence[int] | None = None) -> Simulation:
-        """``n`` branches of every clip (those of a clip follow each other), to be driven separately from here on; this
-        simulation stays as it is. The history of a causal model is shared, not copied.
+        """``n`` branches of every clip (those of a clip follow each other), to be driven separately; this simulation stays as it
+        is. The history of a causal model is shared, not copied.
 
         Args:
             seeds: of the noise of each branch from here on. By default all branches of a clip go on with its noise, so they
@@ -363,10 +335,7 @@ class Simulation:
         return self.select([clip for clip in range(len(self)) for _ in range(n)], seeds)
 
     def select(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> Simulation:
-        """A simulation of these clips in the state that they are in; this one stays as it is.
-
-        Args:
-            seeds: as of :meth:`fork`, one for each of ``clips``.
+        """A simulation of these clips in their present state; this one stays as it is. ``seeds`` as of :meth:`fork`.
 
         Raises:
             DataError: there is no such clip, none is named, or the number of seeds is another one.
@@ -385,9 +354,7 @@ class Simulation:
         return other
 
     def copy(self) -> Simulation:
-        """A snapshot: a simulation in the same state, to go back to. It shares the history's tensors, so one a step costs
-        little more memory than the steps themselves.
-        """
+        """A snapshot to go back to; it shares the history's tensors."""
         return self.select(range(len(self)))
 
     def _project(self, clip: int, rows: np.ndarray) -> EpisodeTracks:

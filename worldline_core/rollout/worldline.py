@@ -24,7 +24,7 @@ from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video, loa
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.observation import Camera, image_size, ordered_views, project_controls
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
-from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts, Stepping
+from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts
 
 
 class WorldLine:
@@ -57,8 +57,6 @@ class WorldLine:
         steps: int | None = None,
         shift: float = 1.0,
         clip_frames: int | None = None,
-        sink_blocks: int | None = None,
-        recent_blocks: int | None = None,
     ) -> None:
         self.model = model.to(device).eval().requires_grad_(False)
         self.info = info
@@ -69,9 +67,7 @@ class WorldLine:
         self.contract = info.contract
         self.causal = info.causal
         if self.causal is not None:
-            window = {"sink_blocks": sink_blocks, "recent_blocks": recent_blocks}
-            changes = {name: value for name, value in window.items() if value is not None}
-            self.causal = self.causal.model_copy(update={"sigmas": sigmas_causal(self.causal, steps), **changes})
+            self.causal = self.causal.model_copy(update={"sigmas": sigmas_causal(self.causal, steps)})
         self.steps = (steps or FULL_STEPS) if self.causal is None else self.causal.steps
         self.shift = shift
         self.clip_frames = clip_frames
@@ -94,8 +90,6 @@ class WorldLine:
         steps: int | None = None,
         shift: float = 1.0,
         clip_frames: int | None = None,
-        sink_blocks: int | None = None,
-        recent_blocks: int | None = None,
     ) -> WorldLine:
         """Load a Stage II or causal checkpoint and the tokenizer that it was trained with.
 
@@ -111,7 +105,6 @@ class WorldLine:
             shift: of a Stage II model's noise levels towards noise (1: even steps, as in the paper).
             clip_frames: of a Stage II model, frames of the longest clip predicted at once (1 + 4 k); longer predictions are
                 chained. By default all is predicted at once.
-            sink_blocks, recent_blocks: the causal model's window, by default the one it was trained with.
 
         Raises:
             CheckpointError: a folder is not what it should be, or tokenizer or decoder are not the model's.
@@ -136,8 +129,7 @@ class WorldLine:
         if decoder is not None:
             codec = SmallDecoder.load(Path(decoder), codec, fingerprint, device)
         return cls(
-            model, info, codec, device=device, bfloat16=bfloat16, steps=steps, shift=shift, clip_frames=clip_frames,
-            sink_blocks=sink_blocks, recent_blocks=recent_blocks,
+            model, info, codec, device=device, bfloat16=bfloat16, steps=steps, shift=shift, clip_frames=clip_frames
         )  # fmt: skip
 
     def predict(
@@ -213,8 +205,9 @@ class WorldLine:
         index = range(1, frames + 2, self.tokenizer.temporal_compression)
         maps = partial(self.action_maps, frames=index, start=int(self.causal is None), views=views)
         session = self.session(starts.pictures(views, self.image_size), starts.seeds, views)
-        stepping = Stepping(self.contract, views, self.image_size, frames, maps)
-        return Simulation(session, starts, stepping, limits=limits)
+        return Simulation(
+            session, starts, self.contract, maps, views=views, image_size=self.image_size, frames=frames, limits=limits
+        )
 
     def chosen_views(self, given: Iterable[str]) -> tuple[str, ...]:
         """Given views in the model's order.
