@@ -1,6 +1,6 @@
 """Planning in closed loop against choosing once, at equal numbers of model calls, in the recorder's MuJoCo world.
 
-    python benchmarks/closed_loop_planning.py --output FOLDER [--count 1] [--arms ...] [--open 12] [--margin 0.2] [--model FOLDER]
+    python benchmarks/closed_loop_planning.py --output FOLDER [--count 1] [--margin 0.2]
 
 A start is a task, a body, a test scene and things on the table; an episode has 49 frames (three chunks of the causal model), 16 more
 than the recordings that the models were trained on, so that a second attempt fits. Proposals are the scripted controllers of the
@@ -8,21 +8,16 @@ candidate banks with the same kinds of error: at the start whole plans; later wh
 robot is, or, while there is time for one, a new attempt at the thing where it is then (`Attempts`). What is chosen is executed in
 MuJoCo, which also says how it ended.
 
-    open        best of N by the measured judge, chosen once
-    closed_*    N/2 candidates at each of three decisions (3 + 2 + 1 chunks predicted: as many model calls), by solver
-    random      a proposal taken blindly, once or after every chunk (`closed_random`)
-    *_goal      best of N once (`open_goal`) or after every chunk (`closed_goal`), by nearness to a goal picture: the last head view of
-                a demonstration that succeeded from this start, which is no candidate; the judge has no part in it
-    oracle      MuJoCo itself chooses, among the candidates of `open` or after every chunk (`closed_oracle`)
+    open           best of N by the measured judge, chosen once
+    closed         N/2 candidates at each of three decisions (3 + 2 + 1 chunks predicted: as many model calls)
+    random         a proposal taken blindly, once or after every chunk (`closed_random`)
 
-Each finished attempt is a line of FOLDER/attempts.jsonl; the same command goes on where it was stopped, and prints the table.
-Candidates that several arms score are predicted once. Needs the extra `sim`.
+FOLDER/attempts.json has every attempt. Needs the extra `sim`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,14 +27,7 @@ import torch
 from benchmarks.harness import command_line
 from worldline_core import Camera, WorldLine
 from worldline_core.evaluation.planning.bracket import MeasuredSelector
-from worldline_core.evaluation.planning.closed_loop import (
-    SOLVERS,
-    ClosedLoopPlanner,
-    GoalPicture,
-    Plan,
-    Situation,
-    judged,
-)
+from worldline_core.evaluation.planning.closed_loop import ClosedLoopPlanner, Plan, Situation, judged
 from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.geometry.embodiment import load_embodiment
@@ -57,7 +45,6 @@ from worldline_core.recorder.record import SPLIT_STREAM
 from worldline_core.recorder.rendering import TEST_SCENES, prepare_rendering
 from worldline_core.recorder.scene import FRAME_RATE, Layout, sample_layout
 from worldline_core.recorder.simulate import REACH_TOLERANCE_M, EpisodeRecorder, ExecutedMotion
-from worldline_core.training.video_teacher import VideoTeacher, load_teacher
 
 SHIPPED = Path("artifacts/shipped")
 SEED = 83
@@ -66,9 +53,8 @@ CHUNK, CHUNKS = 16, 3
 ATTEMPT_SECONDS = 3.5
 BODIES = ("viperx_graphite", "ur5e_silver", "xarm7_white", "viperx_pearl", "ur5e_slate", "xarm7_bronze")
 BLIND_RUNS = 4
-BLIND = ("random", "oracle", "closed_random", "closed_oracle")
-GOAL = ("open_goal", "closed_goal")
-ARMS = (*BLIND, "open", *(f"closed_{solver}" for solver in SOLVERS), *GOAL)
+CANDIDATES = 12
+ARMS = ("random", "closed_random", "open", "closed")
 
 
 class World:
@@ -176,40 +162,13 @@ class Attempts:
         return np.concatenate(list(rows), axis=1)
 
 
-class RememberingPlanner(ClosedLoopPlanner):
-    """A planner that predicts what another one of the same start has predicted only once."""
-
-    def __init__(self, remembered: dict[bytes, float], **options: object) -> None:
-        super().__init__(**options)  # type: ignore[arg-type]
-        self.remembered = remembered
-
-    def _scores(self, simulation, sequences, past, first) -> np.ndarray:
-        begin = b"".join(simulation.pictures[0][view].tobytes() for view in simulation.views)
-        seen = sum(len(piece) for piece in past["head"])
-        keys = [begin + bytes([seen]) + sequence.tobytes() for sequence in sequences]
-        new = [number for number, key in enumerate(keys) if key not in self.remembered]
-        if new:
-            scores = super()._scores(simulation, sequences[new], past, first)
-            self.remembered.update(zip((keys[number] for number in new), scores.tolist(), strict=True))
-        return np.array([self.remembered[key] for key in keys])
-
-
-class Start:
+class PlanningStart:
     """One start, and what the arms make of it."""
 
-    def __init__(
-        self,
-        spec: BankSpec,
-        candidates: int,
-        margin: float,
-        model: WorldLine,
-        selector: MeasuredSelector,
-        encoder: VideoTeacher,
-    ) -> None:
-        self.spec, self.candidates, self.margin = spec, candidates, margin
-        self.model, self.selector, self.encoder = model, selector, encoder
+    def __init__(self, spec: BankSpec, margin: float, model: WorldLine, selector: MeasuredSelector) -> None:
+        self.spec, self.margin = spec, margin
+        self.model, self.selector = model, selector
         self.kinematics = ArmKinematics(load_embodiment(spec.embodiment))
-        self.remembered: dict[bool, dict[bytes, float]] = {False: {}, True: {}}  # by whether the goal picture scores
 
     def drawn(self, recorder: EpisodeRecorder) -> World:
         """The first initial state that all of the first proposals can reach."""
@@ -227,56 +186,36 @@ class Start:
     def first_proposals(self, world: World) -> np.ndarray:
         """(N, 48, J), those of `open`."""
         situation = Situation({}, world.actions[-1], CHUNK * CHUNKS, 0)
-        return Attempts(world)(situation, self.candidates, np.random.default_rng(SEED))
-
-    def goal(self, world: World) -> GoalPicture:
-        """The last head view of a demonstration that succeeds."""
-        random = np.random.default_rng((SEED, 1))
-        situation = Situation({}, world.actions[-1], CHUNK * CHUNKS, 0)
-        for _ in range(20):
-            shown = world.again()
-            shown.execute(Attempts(shown)(situation, 1, random)[0])
-            if shown.ended(shown.actions[:0]).outcome == "success":
-                frames, _ = shown.film(CHUNK * CHUNKS)
-                return GoalPicture(self.encoder, {"head": frames["head"][-1]})
-        raise ValueError(f"{self.spec.name}: none of 20 demonstrations succeeds")
+        return Attempts(world)(situation, CANDIDATES, np.random.default_rng(SEED))
 
     def run(self, arm: str, start: World) -> tuple[float, list[Plan]]:
         """Success (a mean where the arm is one of chance), and the plans of a planner."""
-        world = start.again()
-        if arm in ("random", "oracle"):
-            outcomes = [world.ended(controls).outcome == "success" for controls in self.first_proposals(world)]
-            return float(np.mean(outcomes) if arm == "random" else max(outcomes)), []
+        if arm == "random":
+            outcomes = [start.ended(controls).outcome == "success" for controls in self.first_proposals(start)]
+            return float(np.mean(outcomes)), []
         if arm == "closed_random":
-            runs = [self.blindly(start.again(), np.random.default_rng((SEED, run)), _any) for run in range(BLIND_RUNS)]
+            runs = [self.blindly(start.again(), np.random.default_rng((SEED, run))) for run in range(BLIND_RUNS)]
             return float(np.mean(runs)), []
-        if arm == "closed_oracle":
-            return self.blindly(world, np.random.default_rng(SEED), _successful), []
-        return self.planned(world, arm)
+        return self.planned(start.again(), once=arm == "open")
 
-    def blindly(self, world: World, random: np.random.Generator, choose: Callable[..., np.ndarray]) -> float:
-        """Success of a choice without the model after every chunk, among as many candidates as the planner has."""
+    def blindly(self, world: World, random: np.random.Generator) -> bool:
+        """Success of a blind choice after every chunk, among as many candidates as the planner has."""
         kept = np.empty((0, CHUNK * CHUNKS, len(world.actions[0])))
         for chunk in range(CHUNKS):
-            frames = CHUNK * (CHUNKS - chunk)
-            situation = Situation({}, world.actions[-1], frames, world.frame)
-            fresh = Attempts(world)(situation, self.candidates // 2 - len(kept), random)
-            chosen = choose(world, np.concatenate((kept, fresh)), random)
+            situation = Situation({}, world.actions[-1], CHUNK * (CHUNKS - chunk), world.frame)
+            fresh = Attempts(world)(situation, CANDIDATES // 2 - len(kept), random)
+            chosen = random.choice(np.concatenate((kept, fresh)))
             world.execute(chosen[:CHUNK])
             kept = chosen[None, CHUNK:]
-        return float(world.ended(world.actions[:0]).outcome == "success")
+        return world.ended(world.actions[:0]).outcome == "success"
 
-    def planned(self, world: World, arm: str) -> tuple[float, list[Plan]]:
+    def planned(self, world: World, *, once: bool) -> tuple[float, list[Plan]]:
         """Success of a planner's choices, and its plans."""
         frames, cameras = world.film(0)
-        once, by_goal = arm in ("open", "open_goal"), arm in GOAL
-        planner = RememberingPlanner(
-            self.remembered[by_goal],
-            world=self.model, cameras={view: cameras[view] for view in self.model.views},
-            embodiment=self.kinematics, instruction=world.layout.instruction, propose=Attempts(world),
-            score=self.goal(world) if by_goal else judged(self.selector),
-            solver="best_of_n" if once or by_goal else arm.removeprefix("closed_"),
-            candidates=self.candidates if once else self.candidates // 2, seed=SEED, margin=self.margin,
+        planner = ClosedLoopPlanner(
+            self.model, {view: cameras[view] for view in self.model.views}, embodiment=self.kinematics,
+            instruction=world.layout.instruction, propose=Attempts(world), score=judged(self.selector),
+            candidates=CANDIDATES if once else CANDIDATES // 2, seed=SEED, margin=self.margin,
         )  # fmt: skip
         plans: list[Plan] = []
         while world.frame < CHUNK * CHUNKS:
@@ -289,86 +228,53 @@ class Start:
         return float(world.ended(world.actions[:0]).outcome == "success"), plans
 
 
-def _any(world: World, candidates: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    return candidates[random.integers(len(candidates))]
-
-
-def _successful(world: World, candidates: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    outcomes = [world.ended(controls).outcome == "success" for controls in candidates]
-    return candidates[int(np.argmax(outcomes))]
-
-
 def table(attempts: list[dict]) -> dict:
-    """Success by arm and by task, differences to choosing once by the same score on the starts of both; 95 % bootstrap intervals
-    over starts."""
+    """Success by arm and by task, and differences to choosing once on the starts of both; 95 % bootstrap intervals over starts."""
     by_arm: dict[str, dict[str, float]] = {}
     for attempt in attempts:
         by_arm.setdefault(attempt["arm"], {})[attempt["start"]] = attempt["success"]
-    calls = {arm: float(np.mean([a["calls"] for a in attempts if a["arm"] == arm])) for arm in by_arm}
     tasks = {attempt["start"]: attempt["task"] for attempt in attempts}
 
     def shown(found) -> str | None:
-        return (
-            None if found is None else f"{found.mean:.3f} ({found.low:.3f} to {found.high:.3f}), {found.count} starts"
-        )
+        return found and f"{found.mean:.3f} ({found.low:.3f} to {found.high:.3f}), {found.count} starts"
 
     return {
         arm: {
-            "model_calls": calls[arm],
-            "success": shown(bootstrap_mean(list(by_arm[arm].values()))),
-            "minus_open": shown(paired_difference(by_arm[arm], by_arm.get("open_goal" if arm in GOAL else "open", {}))),
+            "success": shown(bootstrap_mean(list(values.values()))),
+            "minus_open": shown(paired_difference(values, by_arm.get("open", {}))),
             "by_task": {
-                task: round(float(np.mean([v for name, v in by_arm[arm].items() if tasks[name] == task])), 3)
-                for task in sorted({tasks[name] for name in by_arm[arm]})
+                task: round(float(np.mean([v for name, v in values.items() if tasks[name] == task])), 3)
+                for task in sorted({tasks[name] for name in values})
             },
         }
-        for arm in ARMS
-        if arm in by_arm
+        for arm, values in by_arm.items()
     }
 
 
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--model", type=Path, default=SHIPPED / "models" / "causal")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS)
     parser.add_argument("--count", type=int, default=1, help="starts of every task with every body")
-    parser.add_argument(
-        "--open", type=int, default=12, help="candidates of `open`; the planner has half at each decision"
-    )
-    parser.add_argument("--margin", type=float, default=0.0, help="of the planner; another one, another FOLDER")
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--margin", type=float, default=0.0, help="of the planner")
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    torch.set_num_threads(1)
     prepare_rendering()
     options.output.mkdir(parents=True, exist_ok=True)
-    path = options.output / "attempts.jsonl"
-    attempts = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
-    done = {(attempt["start"], attempt["arm"]) for attempt in attempts}
-    grid = BankGrid(
-        embodiments=BODIES,
-        families=("lift", "place", "close", "press", "carry"),
-        scenes=TEST_SCENES,
-        count=options.count,
-    )
-    model = WorldLine.from_pretrained(options.model)
+    families = ("lift", "place", "close", "press", "carry")
+    grid = BankGrid(embodiments=BODIES, families=families, scenes=TEST_SCENES, count=options.count)
+    model = WorldLine.from_pretrained(SHIPPED / "models" / "causal")
     selector = MeasuredSelector(LearnedSegmenter.load(SHIPPED / "models" / "segmenter"))
-    encoder = load_teacher(SHIPPED / "models" / "teacher")
+    attempts: list[dict] = []
     for spec in grid.specs():
-        missing = [arm for arm in options.arms if (spec.name, arm) not in done]
-        if not missing:
-            continue
         recorder = EpisodeRecorder(spec.embodiment)
-        start = Start(spec, options.open, options.margin, model, selector, encoder)
+        start = PlanningStart(spec, options.margin, model, selector)
         world = start.drawn(recorder)
-        for arm in missing:
+        for arm in ARMS:
             success, plans = start.run(arm, world)
-            attempt = {"start": spec.name, "task": spec.family, "arm": arm, "success": success}
-            attempt |= {"calls": sum(plan.model_calls for plan in plans), "scores": [plan.score for plan in plans]}
-            attempts.append(attempt)
-            with path.open("a") as file:
-                file.write(json.dumps(attempt) + "\n")
+            attempts.append({"start": spec.name, "task": spec.family, "arm": arm, "success": success})
+            attempts[-1]["scores"] = [plan.score for plan in plans]
         recorder.close()
+        (options.output / "attempts.json").write_text(json.dumps(attempts, indent=1))
     print(json.dumps(table(attempts), indent=1))
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
@@ -118,14 +118,6 @@ def task_of(instruction: str) -> str:
     return instruction.split()[0] + (" with both arms" if "both arms" in instruction else "")
 
 
-def interval(values: list[float]) -> str | None:
-    """Mean and 95 % bootstrap interval."""
-    if not values:
-        return None
-    found = bootstrap_mean(values, resamples=2000, seed=42)
-    return f"{found.mean:.3f} ({found.low:.3f} to {found.high:.3f}), {len(values)} banks"
-
-
 def main() -> None:
     """Judge every chosen recording; print a table."""
     parser = command_line(__doc__)
@@ -191,8 +183,8 @@ def main() -> None:
             "episodes": len(rows),
             "successes": round(float(success.mean()), 3),
             "area": round(area(values, success), 3),
-            "area_within_banks": interval(within),
-            "told_rightly": round(float((done == success).mean()), 3),
+            "area_within_banks": asdict(bootstrap_mean(within, seed=42)) if within else None,
+            "rules_right": round(float((done == success).mean()), 3),
         }
     print(json.dumps(table, indent=1))
 

@@ -12,7 +12,7 @@ Why both differ is measured step by step: the judge says it of the true video (`
 simulator predicts from the very commands that were given in MuJoCo (`same_commands`: the model's), and of what it predicts while
 the policy acts on its pictures (`simulator`: the closed loop's). `target` is where the thing that is to be moved was in the end.
 
-Each finished attempt is a line of FOLDER/attempts.jsonl; the same command goes on where it was stopped, and prints the tables.
+Each finished attempt is a line of FOLDER/attempts.jsonl; the same command goes on where it was stopped, and prints rates, causes and agreement as JSON.
 Needs the extra `sim`, and LeRobot for learned policies.
 """
 
@@ -34,7 +34,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment.environment import WorldLineVectorEnv, measured_success
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.evaluation.paired import paired_tests
-from worldline_core.evaluation.policy.agreement import STATISTICS, policy_agreement
+from worldline_core.evaluation.policy.agreement import policy_agreement
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.model.tokenizers import resize_frame
 
@@ -76,8 +76,7 @@ class LearnedPolicy:
 
 
 class Attempts(NamedTuple):
-    """A batch that has ended: success of each, its commands ``(b, n, j)``, and by view the pictures that the environment gave,
-    ``(b, n + 1, H, W, 3)``."""
+    """A batch that has ended: success of each, its commands ``(b, n, j)``, and pictures by view ``(b, n + 1, H, W, 3)``."""
 
     success: list[bool]
     commands: np.ndarray
@@ -108,11 +107,9 @@ def replay(commands: np.ndarray) -> Act:
 class Starts:
     """The starts of recordings, in the order of the environments, and what each recorded policy did at them."""
 
-    def __init__(self, recordings: Path, env: MujocoEnv, count: int | None) -> None:
+    def __init__(self, recordings: Path, env: MujocoEnv) -> None:
         self.episodes = EpisodeSet.open(recordings)
-        total = len(env.starts)
-        rows = [env.starts.rows[number] for number in range(total if count is None else min(count, total))]
-        self.names = [row.bank or row.episode_id for row in rows]
+        self.names = [row.bank or row.episode_id for row in env.starts.rows]
         self.recorded: dict[str, dict[str, int]] = {}
         for position, row in enumerate(self.episodes.rows):
             if row.bank in self.names:
@@ -137,16 +134,14 @@ class Worlds:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.inside = WorldLineVectorEnv(
-            options.batch, model=options.model, recordings=options.recordings, embodiment=options.embodiment,
+            options.batch, model=options.model, recordings=options.recordings,
             episode_frames=FRAMES, observe_every=options.observe_every, autoreset=False,
             steps=options.steps,
         )  # fmt: skip
         self.size = self.inside.world.image_size
-        world = MujocoEnv(
-            options.recordings, embodiment=options.embodiment, image_size=self.size, episode_frames=FRAMES
-        )
+        world = MujocoEnv(options.recordings, image_size=self.size, episode_frames=FRAMES)
         self.physics = SyncVectorEnv([lambda: world], autoreset_mode=AutoresetMode.DISABLED)
-        self.starts = Starts(options.recordings, world, options.starts)
+        self.starts = Starts(options.recordings, world)
         self._target, self._instruction = world.target, lambda number: world.starts[number].instruction
         self._judge = measured_success()
 
@@ -216,44 +211,16 @@ def causes(attempts: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {kind: parts for kind, parts in found.items() if parts}
 
 
-def printed(attempts: Sequence[dict[str, Any]], found: dict[str, Any], parts: dict[str, Any]) -> str:
-    """The tables as Markdown."""
-    lines = [
-        "| policy | starts | MuJoCo | its video judged | its commands inside | inside |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name in sorted({a["policy"] for a in attempts}):
-        own = [a for a in attempts if a["policy"] == name]
-        rates = " | ".join(f"{np.mean([a[world] for a in own]):.2f}" for world in WORLDS)
-        lines.append(f"| {name} | {len(own)} | {rates} |")
-    lines += ["", f"| policies | {' | '.join(CAUSES)} |", "|---|---|---|---|"]
-    for kind, of_cause in parts.items():
-        cells = ["{:+.2f} ({:+.2f} to {:+.2f})".format(*of_cause[cause]) for cause in CAUSES]
-        lines.append(f"| {kind} | {' | '.join(cells)} |")
-    lines += ["", f"| policies | {' | '.join(STATISTICS)} | attempts with the same end |", "|---|---|---|---|---|---|"]
-    for kind, facts in found.items():
-        cells = [f"{kind} ({len(facts['policies'])})"]
-        for statistic in STATISTICS:
-            value, bounds = facts[statistic]["value"], facts[statistic]["over_starts_and_policies"]
-            cells.append(
-                "undefined" if None in (value, bounds) else f"{value:.3f} ({bounds[0]:.3f} to {bounds[1]:.3f})"
-            )
-        lines.append(f"| {' | '.join(cells)} | {facts['same_end']:.2f} |")
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument(
         "--recordings", type=Path, required=True, help="of one robot, by `worldline record` with policies"
     )
-    parser.add_argument("--embodiment", help="of the starts, where recordings are of several robots")
     parser.add_argument("--policies", type=Path, nargs="*", default=[], help="folders of LeRobot checkpoints")
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--model", type=Path, help="Stage II or causal checkpoint; by default the shipped causal one")
     parser.add_argument("--steps", type=int, help="Euler steps of the model; by default its own")
     parser.add_argument("--observe-every", type=int, help="steps between two predicted pictures; by default the block")
-    parser.add_argument("--starts", type=int, help="only so many, the first ones")
     parser.add_argument("--batch", type=int, default=8)
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -272,9 +239,11 @@ def main() -> None:
             with path.open("a") as file:
                 file.write(json.dumps(one) + "\n")
     worlds.physics.close()
-    found, parts = table(attempts), causes(attempts)
-    (options.output / "table.json").write_text(json.dumps(found | {"causes": parts}, indent=1))
-    print(printed(attempts, found, parts))
+    rates = {
+        name: {world: float(np.mean([a[world] for a in attempts if a["policy"] == name])) for world in WORLDS}
+        for name in policies
+    }
+    print(json.dumps({"rates": rates, "causes": causes(attempts), "agreement": table(attempts)}, indent=1))
 
 
 if __name__ == "__main__":
