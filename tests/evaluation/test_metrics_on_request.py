@@ -9,8 +9,6 @@ from typing import cast
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import torch
-from scipy.linalg import sqrtm
 
 from flows.pipeline import chain, evaluate, predict, prepare
 from tasks.execution.chain import outline
@@ -19,12 +17,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, metric_of
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
-from worldline_core.evaluation.video.metrics_on_request import (
-    SceneFrames,
-    frechet_distance,
-    frechet_distances,
-    scene_consistency,
-)
+from worldline_core.evaluation.video.metrics_on_request import SceneFrames, scene_consistency
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.report.context import ReportConfig, ReportContext
 from worldline_core.report.results import quality_section
@@ -33,24 +26,14 @@ from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 ALWAYS = VideoEvaluationConfig(segmenters=("colour",), resamples=100)
 
 
-class TinyI3D(torch.nn.Module):
-    """Called as I3D is; its features are means over parts of the picture."""
-
-    def forward(self, video: torch.Tensor, rescale: bool, resize: bool, return_features: bool) -> torch.Tensor:
-        del rescale, resize, return_features
-        return torch.nn.functional.adaptive_avg_pool3d(video, (2, 2, 2)).flatten(1)
-
-
 @pytest.fixture(scope="module")
 def measured(recordings, tmp_path_factory) -> Path:
     """An evaluation with every metric: `good` predicts well, `copy` stands for a model that ignores changed controls."""
     root = tmp_path_factory.mktemp("on_request")
-    torch.jit.script(TinyI3D()).save(str(root / "i3d.pt"))
     config = ALWAYS.model_copy(
         update={
             "metrics": ON_REQUEST,
             "changed_controls": {"good": {"delayed": "copy"}},
-            "fvd_weights": root / "i3d.pt",
         }
     )
     evaluate_video(VideoEvaluationConfig.model_validate(config.model_dump()), recordings.inputs, root / "out")
@@ -72,7 +55,7 @@ def test_every_metric_of_the_registry_tells_good_videos_from_bad_ones(measured):
     assert good["action_following[delayed]@head"]["mean"] > 0.6
     assert "counterfactual_direction[delayed]@head" in good
     differences = {row["metric"]: row for row in summary["differences"]["test"]}
-    for name in ("hsd", "ndtw", "dyn", "scene_consistency", "fvd@head"):
+    for name in ("hsd", "ndtw", "dyn", "scene_consistency"):
         assert {"mean", "low", "high", "count"} <= differences[name].keys()
 
 
@@ -82,7 +65,7 @@ def test_the_report_and_the_table_of_scores_follow_from_the_registry(measured, t
         assert METRICS[name].heading in page
         assert METRICS[name].title in page
     tidy = pq.read_table(measured / "scores.parquet").to_pandas()
-    assert {metric_of(name).name for name in tidy["metric"]} >= set(ON_REQUEST) - {"fvd"}  # pyright: ignore[reportOptionalMemberAccess]
+    assert {metric_of(name).name for name in tidy["metric"]} >= set(ON_REQUEST)  # pyright: ignore[reportOptionalMemberAccess]
     assert not tidy.duplicated(["method", "episode_id", "view", "seed", "metric"]).any()
 
 
@@ -95,11 +78,10 @@ def test_without_a_request_nothing_changes(recordings, tmp_path, measured):
 
 
 def test_metrics_whose_weights_are_not_there_are_named(recordings, tmp_path):
-    evaluate_video(ALWAYS.model_copy(update={"metrics": ("fvd", "action_following")}), recordings.inputs, tmp_path)
+    evaluate_video(ALWAYS.model_copy(update={"metrics": ("action_following",)}), recordings.inputs, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert "FVD is not available" in summary["unavailable"]["fvd"]
+    assert "lpips" in summary["unavailable"]
     assert "no predictions under changed controls" in summary["unavailable"]["action_following"]
-    assert not any(name.startswith("fvd") for name in summary["metrics"]["test"]["good"])
 
 
 def test_what_is_asked_for_must_exist(recordings, tmp_path):
@@ -180,28 +162,3 @@ def cv_smooth(picture: np.ndarray) -> np.ndarray:
     import cv2
 
     return cv2.GaussianBlur(picture, (5, 5), 1.0)
-
-
-def test_frechet_distance_equals_the_root_of_matrices():
-    rng = np.random.default_rng(0)
-    true, predicted = rng.normal(size=(40, 6)), rng.normal(0.4, 1.5, size=(30, 6))
-    a, b = np.cov(true, rowvar=False), np.cov(predicted, rowvar=False)
-    mean = np.square(true.mean(0) - predicted.mean(0)).sum()
-    assert frechet_distance(true, predicted) == pytest.approx(mean + np.trace(a + b - 2 * np.real(sqrtm(a @ b))))
-    assert frechet_distance(true, true) == pytest.approx(0, abs=1e-9)
-
-
-def test_frechet_distances_are_compared_over_the_same_recordings():
-    rng = np.random.default_rng(0)
-    features = {method: {} for method in ("near", "far")}
-    for number in range(12):
-        true = rng.normal(size=4)
-        features["near"][f"e{number}"] = (true, true + 0.1 * rng.normal(size=4))
-        features["far"][f"e{number}"] = (true, true + 2.0)
-    features["near"]["alone"] = (true, true)  # pyright: ignore[reportPossiblyUnboundVariable]
-    names = {"test": [f"e{number}" for number in range(12)] + ["alone"]}
-    metrics, differences = frechet_distances(features, names, [("near", "far")], seed=0)
-    assert metrics["test"]["near"]["mean"] < 1 < metrics["test"]["far"]["low"]
-    (row,) = differences["test"]
-    assert (row["count"], row["metric"]) == (12, "fvd@head")
-    assert row["high"] < 0

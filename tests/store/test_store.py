@@ -122,8 +122,6 @@ def test_steps_name_the_weights_and_tokenizers_that_they_read(tmp_path: Path) ->
     assert read("evaluate_video", {"sam3_weights": "sam3"}) == {}
     both = {"sam3_weights": "sam3", "lpips_weights": "alex", "segmenters": ["learned", "sam3"]}
     assert read("evaluate_video", both) == sam3 | {"lpips": Path("alex")}
-    assert read("evaluate_video", {"fvd_weights": "i3d.pt"}) == {}
-    assert read("evaluate_video", {"fvd_weights": "i3d.pt", "metrics": ["fvd"]}) == {"fvd": Path("i3d.pt")}
     assert read("distill", {"lpips_weights": "alex", "clips": {"lengths": [17]}}) == {"lpips": Path("alex")}
     trainer = {"trainer": {"steps": 1}}
     assert read("train_stage1", trainer) == {}

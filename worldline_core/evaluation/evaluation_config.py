@@ -97,7 +97,6 @@ class VideoEvaluationConfig(StrictModel):
     changed_controls: dict[str, dict[Literal["shuffled", "mirrored", "delayed"], str]] = Field(
         default={}, description="by method, the methods that are the same model under changed controls"
     )
-    fvd_weights: Path | None = Field(default=None, description="local TorchScript file of I3D; none: no FVD")
     resamples: int = Field(default=2000, ge=100)
     seed: int = Field(default=42, ge=0)
 
@@ -132,7 +131,6 @@ class VideoEvaluationConfig(StrictModel):
         return {
             "sam3": self.sam3_weights if "sam3" in self.segmenters else None,
             "lpips": self.lpips_weights,
-            "fvd": self.fvd_weights if "fvd" in self.metrics else None,
         }
 
 

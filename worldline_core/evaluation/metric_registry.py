@@ -13,13 +13,12 @@ from typing import Any, Literal
 
 from worldline_core.errors import ConfigError
 
-Needs = Literal["tool_paths", "frames", "changed_controls", "features"]
+Needs = Literal["tool_paths", "frames", "changed_controls"]
 """Arguments of a metric on request (`compute`):
 
 - ``tool_paths``: (true, found) places of the tools (n, arms, 2) in hundredths of the frame's height;
 - ``frames``: some frames in a row, a `SceneFrames`;
-- ``changed_controls``: predictions of one start under true and changed controls, a `ControlledPair`;
-- ``features``: features of true and of predicted videos, (recordings, channels) each.
+- ``changed_controls``: predictions of one start under true and changed controls, a `ControlledPair`.
 """
 
 
@@ -127,12 +126,6 @@ _METRICS = (
         " the controls say; 0.5 by chance.",
         "this project", perfect=1.0, margin=0.01, needs="changed_controls",
         compute="video.metrics_on_request:counterfactual_direction",
-    ),
-    Metric(
-        "fvd", "FVD",
-        "Fréchet distance of the features of true and predicted head views, over all recordings, where I3D is at hand.",
-        "Unterthiner et al. 2018 (arXiv 1812.01717)", perfect=0.0, margin=1.0, digits=1, lower_is_better=True,
-        needs="features", compute="video.metrics_on_request:frechet_distance",
     ),
 )  # fmt: skip
 METRICS: dict[str, Metric] = {metric.name: metric for metric in _METRICS}

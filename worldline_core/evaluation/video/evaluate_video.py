@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.evaluation.metric_registry import METRICS, requested
@@ -42,14 +40,7 @@ from worldline_core.evaluation.scores import (
 )
 from worldline_core.evaluation.segmenters.segmenter import Segmenter, open_segmenter
 from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement, finite_mean
-from worldline_core.evaluation.video.metrics_on_request import (
-    LEAST_FRAMES,
-    ControlledPair,
-    Features,
-    FrechetDistances,
-    frechet_distances,
-    open_i3d,
-)
+from worldline_core.evaluation.video.metrics_on_request import ControlledPair
 from worldline_core.model.lpips import load_lpips
 from worldline_core.progress import Progress
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -78,11 +69,14 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
     metrics = requested(config.metrics)
     check_changed_controls(config, list(rollouts))
     unavailable: dict[str, str] = {}
-    lpips = _open(load_lpips, config.lpips_weights, "lpips", unavailable)
+    try:
+        lpips = load_lpips(config.lpips_weights)
+    except UnavailableError as error:
+        logger.warning("%s", error)
+        lpips, unavailable["lpips"] = None, f"{error.what}: {error.got}" if error.got else error.what
     if not config.changed_controls:
         missing = "no predictions under changed controls (evaluate_video.changed_controls)"
         unavailable |= {name: missing for name, metric in metrics.items() if metric.needs == "changed_controls"}
-    i3d = _open(open_i3d, config.fvd_weights, "fvd", unavailable) if "fvd" in metrics else None
     parts = output / "run" / "parts"
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}
 
@@ -107,8 +101,7 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
             records += found
             progress.advance()
     pairs = list(controlled_values(config, records, tracks, rollouts))
-    fvd = None if i3d is None else _fvd(config, episodes, rows, rollouts, i3d, parts)
-    return _write(config, records, pairs, fvd, segmenters, unavailable, output)
+    return _write(config, records, pairs, segmenters, unavailable, output)
 
 
 @contextmanager
@@ -125,53 +118,10 @@ def _workers(*, on_gpu: bool) -> Iterator[ThreadPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def _open[W](open_weights: Callable[[Path | None], W], path: Path | None, metric: str, why: dict[str, str]) -> W | None:
-    """A metric's weights where they are available; otherwise `why` gets the reason why they are not."""
-    try:
-        return open_weights(path)
-    except UnavailableError as error:
-        logger.warning("%s", error)
-        why[metric] = f"{error.what}: {error.got}" if error.got else error.what
-        return None
-
-
-def _fvd(
-    config: VideoEvaluationConfig,
-    episodes: EpisodeSet,
-    rows: Sequence[EpisodeRow],
-    rollouts: Mapping[str, RolloutSet],
-    i3d: Features,
-    parts: Path,
-) -> FrechetDistances:
-    """FVD of every method's head views (of the smallest seed), by split."""
-    features: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {method: {} for method in rollouts}
-    groups: dict[str, list[str]] = defaultdict(list)
-    for row in rows:
-        groups[row.split].append(row.episode_id)
-        for method, rollout in rollouts.items():
-            if row.episode_id not in rollout.episode_ids or HEAD not in rollout.views(row.episode_id):
-                continue
-            predicted, stride = VideoFrames(rollout.clip(row.episode_id, HEAD)), stride_of(rollout, row)
-            if (count := len(predicted)) < LEAST_FRAMES:
-                continue
-            true = VideoFrames(episodes.clip(episodes.position(row.episode_id), HEAD), stride)
-            own, other = (
-                np.array(kept_part(path, lambda video=video: i3d(video[list(range(count))]).tolist()))
-                for path, video in (
-                    (part_file(parts, "fvd", TRUE_METHOD, row.episode_id, stride, count), true),
-                    (part_file(parts, "fvd", method, row.episode_id), predicted),
-                )
-            )
-            features[method][row.episode_id] = own, other
-    comparisons = list(combinations(sorted(rollouts), 2)) if config.comparisons is None else config.comparisons
-    return frechet_distances(features, groups, comparisons, config.seed)
-
-
 def _write(
     config: VideoEvaluationConfig,
     records: Sequence[Measured],
     pairs: Sequence[tuple[str, EpisodeRow, int, str, float]],
-    fvd: FrechetDistances | None,
     segmenters: Mapping[str, Segmenter],
     unavailable: Mapping[str, str],
     output: Path,
@@ -219,11 +169,6 @@ def _write(
         "num_episodes": len(found),
         "interval": "95 % bootstrap over trajectories",
     }
-    if fvd is not None:
-        for group, methods in fvd[0].items():
-            for method, interval in methods.items():
-                summary["metrics"][group][method]["fvd@head"] = interval
-            summary["differences"].setdefault(group, []).extend(fvd[1].get(group, []))
     write_json_atomic(output / SUMMARY_FILE, summary)
     return {
         "found": len(found),
