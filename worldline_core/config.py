@@ -307,17 +307,18 @@ def _with_extended(source: Path) -> dict[str, Any]:
     base = preset_path(str(values.pop("extends")))
     if base.resolve() == source.resolve():
         raise ConfigError("A preset cannot extend itself", where=source, got=f"extends: {base.stem}")
-    return _merged(_with_extended(base), values)
+    return merged(_with_extended(base), values)
 
 
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of nested `base` with the leaves of `changes` in it; null takes a key away."""
     result = dict(base)
     for key, change in changes.items():
         below = result.get(key)
         if change is None:
             result.pop(key, None)
         elif isinstance(change, Mapping) and isinstance(below, Mapping):
-            result[key] = _merged(below, change)
+            result[key] = merged(below, change)
         else:
             result[key] = change
     return result

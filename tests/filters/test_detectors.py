@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,19 @@ from worldline_core.filters.calibration import (
     detect_projection,
     lag_by_correlation,
 )
+from worldline_core.filters.detectors import (
+    changed_area,
+    detect_base_motion,
+    detect_blur,
+    detect_corrupted,
+    detect_dark,
+    detect_joint_jump,
+    detect_joint_speed,
+    detect_overexposed,
+    detect_reset,
+    detect_static,
+    without_signal,
+)
 from worldline_core.filters.filter_config import (
     BaseMotionConfig,
     BlurConfig,
@@ -27,25 +41,10 @@ from worldline_core.filters.filter_config import (
     StaticConfig,
     TimeAlignmentConfig,
 )
-from worldline_core.filters.motion import (
-    changed_area,
-    detect_base_motion,
-    detect_joint_jump,
-    detect_joint_speed,
-    detect_reset,
-    detect_static,
-)
-from worldline_core.filters.pictures import (
-    detect_blur,
-    detect_corrupted,
-    detect_dark,
-    detect_overexposed,
-    without_signal,
-)
 from worldline_core.filters.signals import picture_statistics, range_speed
-from worldline_core.filters.verdict import Finding, long_runs, runs
+from worldline_core.filters.verdict import Finding, Verdict, long_runs, runs
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
-from worldline_core.geometry.transforms import hand_eye_residual, mean_pose, rigid_inverse
+from worldline_core.geometry.transforms import hand_eye_residual, rigid_inverse
 from worldline_core.report.inspect import deciding_curve
 
 FPS = 8.0
@@ -92,7 +91,14 @@ def scene(
     return np.stack(frames).astype(np.uint8)
 
 
-NOTHING_LOST = np.zeros(33, bool)
+NOTHING = np.zeros(33, bool)
+TABLE = scene()
+DISC = scene(centres=np.stack([20 + 1.5 * np.arange(33), np.full(33, 30.0)], axis=1))
+
+
+def cut(verdict: Verdict) -> list[int]:
+    assert verdict.bad_frames is not None
+    return np.flatnonzero(verdict.bad_frames).tolist()
 
 
 def test_runs() -> None:
@@ -100,12 +106,6 @@ def test_runs() -> None:
     assert runs(np.zeros(3, bool)) == []
     assert runs(long_runs(np.array([1, 1, 0, 1, 0, 0, 1], bool), 3, gap=1)) == [(0, 4)]
     assert not long_runs(np.array([0, 1, 1, 0], bool), 3, gap=1).any()  # an edge is no gap
-
-
-def static_frames(joint_speed: np.ndarray, gripper: np.ndarray, change: np.ndarray) -> list[int]:
-    verdict = detect_static(joint_speed, gripper, change, FPS, StaticConfig())
-    assert verdict.bad_frames is not None
-    return np.flatnonzero(verdict.bad_frames).tolist()
 
 
 def test_static_stretches_are_found_and_short_pauses_left() -> None:
@@ -116,15 +116,15 @@ def test_static_stretches_are_found_and_short_pauses_left() -> None:
     change = np.where(speed < 0.03, 0.0, 3.0)
     change[:16] = 0.0
     zeros = np.zeros(56)
-    found = static_frames(speed, zeros, change)
-    assert found[0] == 0
+    found = cut(detect_static(speed, zeros, change, FPS, StaticConfig()))
     assert 14 <= found[-1] <= 17  # the pause of 7 frames at the end is shorter than 1.5 s
-    assert len(found) == found[-1] + 1
-    assert static_frames(speed, np.full(56, 1.0), change) == []  # a closing gripper is no rest
-    assert static_frames(speed, zeros, np.full(56, 2.0)) == []  # nor are things that move
+    assert found == list(range(found[-1] + 1))
+    assert (
+        cut(detect_static(speed, np.full(56, 1.0), change, FPS, StaticConfig())) == []
+    )  # a closing gripper is no rest
+    assert cut(detect_static(speed, zeros, np.full(56, 2.0), FPS, StaticConfig())) == []  # nor are things that move
     still = detect_static(zeros, zeros, zeros, FPS, StaticConfig())
-    assert not still.passed
-    assert still.numbers["static_share"] == 1.0
+    assert (still.passed, still.numbers["bad_share"]) == (False, 1.0)
 
 
 def test_range_speed_is_that_of_the_fastest_column() -> None:
@@ -136,53 +136,41 @@ def test_range_speed_is_that_of_the_fastest_column() -> None:
 
 @pytest.mark.parametrize("steps", [1, 3, 5])
 def test_a_quick_way_home_is_a_reset_and_motion_is_not(steps: int) -> None:
-    config = ResetConfig()
     joints = swing()
-    assert not detect_reset(joints, FPS, config).bad_frames.any()  # type: ignore[union-attr]
     back = np.linspace(joints[-1], joints[0], steps + 1)[1:-1]
-    verdict = detect_reset(np.concatenate([joints, back, joints[:16]]), FPS, config)
-    assert verdict.bad_frames is not None
-    assert np.flatnonzero(verdict.bad_frames)[0] == 33
-    assert verdict.numbers["reset_frame"] == 33
-    there_and_back = np.concatenate([joints, joints[::-1]])
-    assert not detect_reset(there_and_back, FPS, config).bad_frames.any()  # type: ignore[union-attr]
-    away = np.concatenate([joints, joints + 1.5])  # a jump, but not home
-    assert not detect_reset(away, FPS, config).bad_frames.any()  # type: ignore[union-attr]
-    assert detect_reset(joints[:1], FPS, config).numbers["reset_frame"] is None
+    home = np.concatenate([joints, back, joints[:16]])
+    assert cut(detect_reset(home, FPS, ResetConfig())) == list(range(33, len(home)))
+    away = joints + 1.5  # a jump, but not home
+    for motion in (joints, np.concatenate([joints, joints[::-1]]), np.concatenate([joints, away]), joints[:1]):
+        assert cut(detect_reset(motion, FPS, ResetConfig())) == []
 
 
 def test_a_broken_reading_that_goes_home_alone_is_no_reset() -> None:
     joints = swing()
     broken = joints.copy()
     broken[20:, 0] = joints[0, 0]
-    assert detect_reset(broken, FPS, ResetConfig()).numbers["reset_frame"] is None
-    assert detect_joint_jump(broken, JointMotionConfig()).numbers["jumps"] == 1
+    assert cut(detect_reset(broken, FPS, ResetConfig())) == []
+    assert cut(detect_joint_jump(broken, JointMotionConfig())) == [20]
     one_joint = np.concatenate([joints[:, :1], joints[:, :1]])  # nothing else could come home with it
-    assert detect_reset(one_joint, FPS, ResetConfig()).numbers["reset_frame"] == 33
+    assert cut(detect_reset(one_joint, FPS, ResetConfig()))[0] == 33
 
 
 def test_joint_readings_that_jump_or_run_away() -> None:
-    config = JointMotionConfig()
     joints = 1.5 * swing()
-    assert not detect_joint_jump(joints, config).bad_frames.any()  # type: ignore[union-attr]
-    assert not detect_joint_speed(joints, FPS, config).bad_frames.any()  # type: ignore[union-attr]
-    spike = joints.copy()
+    spike, slipped, fast = joints.copy(), joints.copy(), joints.copy()
     spike[10:12, 1] += 0.7
-    assert np.flatnonzero(detect_joint_jump(spike, config).bad_frames).tolist() == [10, 11, 12]  # type: ignore[arg-type]
-    slipped = joints.copy()
     slipped[20:, 0] -= 0.5
-    assert np.flatnonzero(detect_joint_jump(slipped, config).bad_frames).tolist() == [20]  # type: ignore[arg-type]
-    fast = joints.copy()
     fast[:, 2] += np.clip(np.arange(33) - 8, 0, 6) * 1.2
-    assert np.flatnonzero(detect_joint_speed(fast, FPS, config).bad_frames).tolist() == list(range(9, 15))  # type: ignore[arg-type]
-    assert not detect_joint_jump(fast, config).bad_frames.any()  # type: ignore[union-attr]
-    assert not detect_joint_speed(spike, FPS, config).bad_frames.any()  # type: ignore[union-attr]
+    for values, jumps, speeds in (
+        (joints, [], []), (spike, [10, 11, 12], []), (slipped, [20], []), (fast, [], list(range(9, 15))),
+    ):  # fmt: skip
+        assert cut(detect_joint_jump(values, JointMotionConfig())) == jumps
+        assert cut(detect_joint_speed(values, FPS, JointMotionConfig())) == speeds
 
 
 def test_picture_statistics_are_what_numpy_says() -> None:
-    gray = scene(centres=np.stack([20 + 1.5 * np.arange(33), np.full(33, 30.0)], axis=1))
-    found = picture_statistics(gray)
-    value = gray.astype(np.float64)
+    found = picture_statistics(DISC)
+    value = DISC.astype(np.float64)
     assert np.allclose(found.mean, value.mean(axis=(1, 2)))
     assert np.allclose(found.contrast, value.std(axis=(1, 2)))
     assert np.abs(found.bright_level - np.percentile(value.reshape(33, -1), 95, axis=1)).max() <= 1
@@ -193,25 +181,24 @@ def test_picture_statistics_are_what_numpy_says() -> None:
     change = np.abs(np.diff(value, axis=0)).mean(axis=(1, 2))
     assert np.allclose(found.change, np.concatenate([[0.0], change]))
     assert (found.flat_share == 0).all()
-    for count in (1, 2, 16, 17):  # sums are taken over batches of pictures
-        few = picture_statistics(gray[:count])
-        assert np.array_equal(few.change, found.change[:count])
-        assert np.array_equal(few.detail, found.detail[:count])
-        assert np.array_equal(few.roughness, found.roughness[:count])
-    half = gray.copy()
+    half = DISC.copy()
     half[:, 32:] = 128
     assert np.allclose(picture_statistics(half).flat_share, 0.5)
 
 
+TRACKS = 0.02 * np.arange(33.0)[:, None, None] * np.array([1.0, 0, 0])
+REST = np.zeros((33, 1, 3))
+
+
+def corrupted(gray: np.ndarray, tracks: np.ndarray = REST, **changes: Any) -> Verdict:
+    given = {"lost": NOTHING, "unreliable": NOTHING, "fps": FPS, "config": CorruptedConfig()} | changes
+    return detect_corrupted(picture_statistics(gray), tracks, **given)
+
+
 @pytest.mark.parametrize("defect", ["blank", "noise", "frozen", "blocks", "band"])
 def test_corrupted_frames(defect: str) -> None:
-    config = CorruptedConfig()
-    gray = scene(centres=np.stack([20 + 1.5 * np.arange(33), np.full(33, 30.0)], axis=1))
-    tracks = 0.02 * np.arange(33.0)[:, None, None] * np.array([1.0, 0, 0])
-    healthy = detect_corrupted(picture_statistics(gray), tracks, NOTHING_LOST, NOTHING_LOST, FPS, config)
-    assert healthy.passed
-    assert not healthy.bad_frames.any()  # type: ignore[union-attr]
-    bad, random = gray.copy(), np.random.default_rng(1)
+    assert corrupted(DISC, TRACKS).clean
+    bad, random = DISC.copy(), np.random.default_rng(1)
     if defect == "blank":
         bad[10:14] = 130
     elif defect == "noise":
@@ -225,111 +212,80 @@ def test_corrupted_frames(defect: str) -> None:
             for _ in range(30):
                 row, column = random.integers(0, 56), random.integers(0, 88)
                 bad[i, row : row + 8, column : column + 8] = 255 - bad[i, row : row + 8, column : column + 8]
-    pictures = picture_statistics(bad)
-    verdict = detect_corrupted(pictures, tracks, NOTHING_LOST, NOTHING_LOST, FPS, config)
-    assert verdict.bad_frames is not None
-    assert np.flatnonzero(verdict.bad_frames).tolist() == [10, 11, 12, 13]
-    assert verdict.passed
+    verdict = corrupted(bad, TRACKS)
+    assert (cut(verdict), verdict.passed) == ([10, 11, 12, 13], True)
     counted = {"blocks": "garbled_frames", "band": "garbled_frames"}.get(defect, f"{defect}_frames")
     assert verdict.numbers[counted] == 4
     if defect == "frozen":
         noise = random.normal(0, 0.005, (33, 1, 3))
-        assert np.linalg.norm(np.diff(noise, axis=0), axis=-1)[9:14].sum() > config.min_frozen_motion_m * 0.8
-        resting = detect_corrupted(pictures, noise, NOTHING_LOST, NOTHING_LOST, FPS, config)
-        assert not resting.bad_frames.any()  # type: ignore[union-attr]
-        wrong = detect_corrupted(pictures, tracks, NOTHING_LOST, np.arange(33) == 12, FPS, config)
-        assert not wrong.bad_frames.any()  # type: ignore[union-attr]
-        resting = detect_corrupted(pictures, np.zeros((33, 1, 3)), NOTHING_LOST, NOTHING_LOST, FPS, config)
-        assert not resting.bad_frames.any()  # type: ignore[union-attr]
-        wrist = detect_corrupted(pictures, tracks, NOTHING_LOST, NOTHING_LOST, FPS, config, wrist=True)
-        assert not wrist.bad_frames.any()  # type: ignore[union-attr]
-
-
-def test_mostly_corrupted_condemns() -> None:
-    gray = scene()
-    gray[8:] = 120
-    verdict = detect_corrupted(
-        picture_statistics(gray), np.zeros((33, 1, 3)), NOTHING_LOST, NOTHING_LOST, FPS, CorruptedConfig()
-    )
-    assert not verdict.passed
-    assert verdict.numbers["blank_frames"] == 25
+        assert np.linalg.norm(np.diff(noise, axis=0), axis=-1)[9:14].sum() > CorruptedConfig().min_frozen_motion_m * 0.8
+        for tracks, changes in (
+            (noise, {}), (TRACKS, {"unreliable": np.arange(33) == 12}), (REST, {}), (TRACKS, {"wrist": True}),
+        ):  # fmt: skip
+            assert cut(corrupted(bad, tracks, **changes)) == []
 
 
 def test_dark_and_overexposed_pictures_are_not_counted_twice() -> None:
     config = ExposureConfig()
-    gray = scene()
-    assert not detect_dark(picture_statistics(gray), NOTHING_LOST, config).bad_frames.any()  # type: ignore[union-attr]
-    assert not detect_overexposed(picture_statistics(gray), config).bad_frames.any()  # type: ignore[union-attr]
+    gray = TABLE.copy()
+    assert detect_dark(picture_statistics(gray), NOTHING, config).clean
+    assert detect_overexposed(picture_statistics(gray), config).clean
     gray[4:8] = gray[4:8] // 12
     gray[20:23] = np.clip(gray[20:23].astype(int) * 3, 0, 255)
     pictures = picture_statistics(gray)
-    dark, white = detect_dark(pictures, NOTHING_LOST, config), detect_overexposed(pictures, config)
-    assert np.flatnonzero(dark.bad_frames).tolist() == [4, 5, 6, 7]  # type: ignore[arg-type]
-    assert np.flatnonzero(white.bad_frames).tolist() == [20, 21, 22]  # type: ignore[arg-type]
-    lost = dark.bad_frames | white.bad_frames  # type: ignore[operator]
-    assert not detect_corrupted(
-        pictures, np.zeros((33, 1, 3)), lost, NOTHING_LOST, FPS, CorruptedConfig()
-    ).bad_frames.any()  # type: ignore[union-attr]
+    assert cut(detect_dark(pictures, NOTHING, config)) == [4, 5, 6, 7]
+    assert cut(detect_overexposed(pictures, config)) == [20, 21, 22]
+    assert cut(corrupted(gray, lost=np.isin(np.arange(33), [4, 5, 6, 7, 20, 21, 22]))) == []
     gray[:30] = 0
-    assert not detect_dark(picture_statistics(gray), NOTHING_LOST, config).passed
+    assert not detect_dark(picture_statistics(gray), NOTHING, config).passed
     # A thing in the gripper may cover a wrist camera.
-    assert detect_dark(
-        picture_statistics(np.full((9, 64, 96), 20, np.uint8)), np.zeros(9, bool), config, wrist=True
-    ).clean
+    covered = picture_statistics(np.full((9, 64, 96), 20, np.uint8))
+    assert detect_dark(covered, np.zeros(9, bool), config, wrist=True).clean
 
 
 def test_noise_is_noise_however_dark() -> None:
-    gray = scene()
+    gray = TABLE.copy()
     gray[10:14] = np.random.default_rng(0).integers(0, 30, gray[10:14].shape)
     gray[20:24] = gray[20:24] // 12
-    pictures, config = picture_statistics(gray), CorruptedConfig()
-    dark = detect_dark(pictures, without_signal(pictures, config)[1], ExposureConfig()).bad_frames
-    assert dark is not None
-    assert np.flatnonzero(dark).tolist() == [20, 21, 22, 23]
-    verdict = detect_corrupted(pictures, np.zeros((33, 1, 3)), dark, NOTHING_LOST, FPS, config)
-    assert verdict.numbers["noise_frames"] == 4
-    assert np.flatnonzero(verdict.bad_frames).tolist() == [10, 11, 12, 13]  # type: ignore[arg-type]
+    pictures = picture_statistics(gray)
+    dark = detect_dark(pictures, without_signal(pictures, CorruptedConfig())[1], ExposureConfig())
+    assert cut(dark) == [20, 21, 22, 23]
+    verdict = corrupted(gray, lost=dark.bad_frames)
+    assert (cut(verdict), verdict.numbers["noise_frames"]) == ([10, 11, 12, 13], 4)
 
 
 def test_blurred_stretches_are_found_whatever_is_seen() -> None:
     config = BlurConfig()
-    random = np.random.default_rng(0)
-    gray = scene()
-    sharpness = np.repeat(random.uniform(300, 900, 17), 2)[:33]  # what is seen changes
-    detail = sharpness / 100
-    pictures = replace(picture_statistics(gray), detail=detail)
-    assert detect_blur(sharpness, pictures, NOTHING_LOST, FPS, config).clean
+    sharpness = np.repeat(np.random.default_rng(0).uniform(300, 900, 17), 2)[:33]  # what is seen changes
+    pictures = replace(picture_statistics(TABLE), detail=sharpness / 100)
+    assert detect_blur(sharpness, pictures, NOTHING, FPS, config).clean
     blurred = sharpness.copy()
     blurred[10:16] *= 0.1
-    verdict = detect_blur(blurred, pictures, NOTHING_LOST, FPS, config)
-    assert np.flatnonzero(verdict.bad_frames).tolist() == list(range(10, 16))  # type: ignore[arg-type]
+    assert cut(detect_blur(blurred, pictures, NOTHING, FPS, config)) == list(range(10, 16))
     assert detect_blur(blurred, pictures, np.arange(33) < 16, FPS, config).clean
-    assert next(iter(verdict.curves)) == "relative_sharpness"
-    never_in_focus = detect_blur(np.full(33, 5.0), pictures, NOTHING_LOST, FPS, config)
+    never_in_focus = detect_blur(np.full(33, 5.0), pictures, NOTHING, FPS, config)
     assert not never_in_focus.passed
-    name, curve = deciding_curve(Finding("blur", "head", 1, never_in_focus))
-    assert (name, curve.threshold, set(curve.values)) == ("sharpness", config.min_sharpness, {5.0})
+    assert deciding_curve(Finding("blur", "head", 1, never_in_focus))[0] == "sharpness"
 
 
 def test_a_driving_base_moves_the_whole_picture_an_arm_does_not() -> None:
     config = BaseMotionConfig()
     centres = np.stack([10 + 2.0 * np.arange(33), 30 + 8 * np.sin(np.arange(33))], axis=1)
-    usable = np.ones(33, bool)
-    arm = changed_area(scene(centres=centres), usable, FPS, config)
-    assert detect_base_motion(arm, FPS, config).clean
+
+    def judged(gray: np.ndarray, *, usable: bool = True) -> Verdict:
+        return detect_base_motion(changed_area(gray, np.full(len(gray), usable), FPS, config), FPS, config)
+
+    lamp = np.concatenate([TABLE[:16], (TABLE[:17] * 1.3).clip(0, 255).astype(np.uint8)])
+    for healthy in (scene(centres=centres), lamp, np.full((3, 8, 8), 9, np.uint8)):
+        assert judged(healthy).clean
     for drift in (1.0, 2.5):
-        driving = changed_area(scene(drift=drift, centres=centres), usable, FPS, config)
-        verdict = detect_base_motion(driving, FPS, config)
+        verdict = judged(scene(drift=drift, centres=centres))
         assert not verdict.passed
-        assert verdict.numbers["moving_share"] > 0.9  # type: ignore[operator]
-        assert detect_base_motion(changed_area(scene(drift=drift), ~usable, FPS, config), FPS, config).clean
-    partly = np.concatenate([scene()[:1].repeat(17, 0), scene(drift=2.5)])
-    verdict = detect_base_motion(changed_area(partly, np.ones(50, bool), FPS, config), FPS, config)
-    assert verdict.passed
-    assert np.flatnonzero(verdict.bad_frames)[0] in range(13, 19)  # type: ignore[arg-type]
-    lamp = np.concatenate([scene()[:16], (scene()[:17] * 1.3).clip(0, 255).astype(np.uint8)])
-    assert detect_base_motion(changed_area(lamp, usable, FPS, config), FPS, config).clean
-    assert detect_base_motion(changed_area(np.full((3, 8, 8), 9, np.uint8), usable[:3], FPS, config), FPS, config).clean
+        assert verdict.numbers["bad_share"] > 0.9  # type: ignore[operator]
+        assert judged(scene(drift=drift), usable=False).clean
+    partly = judged(np.concatenate([TABLE[:1].repeat(17, 0), scene(drift=2.5)]))
+    assert partly.passed
+    assert cut(partly)[0] in range(13, 19)
 
 
 def test_wrist_cameras_are_rigidly_mounted_or_condemned() -> None:
@@ -369,12 +325,6 @@ def test_camera_values() -> None:
     assert not detect_fixed_camera(arm_poses(), config).passed
 
 
-def test_mean_pose_ignores_a_few_outliers_in_position() -> None:
-    poses = MOUNT[None].repeat(21, 0)
-    poses[0, :3, 3] += 5
-    assert np.abs(mean_pose(poses) - MOUNT).max() < 1e-9
-
-
 @pytest.mark.parametrize("lag", [-4, -2, 0, 3, 5])
 def test_the_lag_of_the_images_is_measured(lag: int) -> None:
     rng = np.random.default_rng(lag + 10)
@@ -412,14 +362,6 @@ def view_from_above() -> tuple[np.ndarray, np.ndarray]:
     T[:3, :3] = np.diag([1.0, -1.0, -1.0])  # looks down -z of the base
     T[:3, 3] = [0.4, 0.0, 1.2]
     return K, T[None].repeat(33, 0)
-
-
-def test_points_project_as_by_hand() -> None:
-    K, T = view_from_above()
-    uv, depth = project_points(np.array([[0.4, 0.0, 0.2], [0.5, 0.1, 0.2], [0.4, 0.0, 1.5]]), K, T[:3])
-    assert np.allclose(depth, [1.0, 1.0, -0.3])
-    assert np.allclose(uv[:2], [[47.5, 31.5], [55.5, 23.5]])
-    assert ((depth > MIN_DEPTH_M) & inside_image(uv, (64, 96))).tolist() == [True, True, False]
 
 
 def test_a_tool_among_much_motion_is_found_by_rank() -> None:

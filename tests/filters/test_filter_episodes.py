@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
@@ -259,11 +259,6 @@ def test_a_source_has_its_own_thresholds(filtered: tuple[Path, Path, dict[str, A
 def test_a_wrong_override_is_named(overrides: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         FilterConfig.model_validate({"sources": {"agibot_world": overrides}})
-
-
-def test_views_that_have_no_frames_are_known(filtered: tuple[Path, Path, dict[str, Any]]) -> None:
-    passed = EpisodeSet.open(filtered[1])
-    assert passed.rows[passed.position("e06")].views == VIEWS[:2]
 
 
 def test_a_robot_whose_description_is_not_here_is_left_out_not_fatal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.labelled_clips import FAULTS, HARMLESS, Clip, at_frames
+from tools.labelled_clips import FAULTS, HARMLESS, Clip
 from tools.thumbnails import view_thumbnails
 from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -55,23 +55,6 @@ def test_nothing_is_dropped_for_a_change_that_is_no_fault(recording: Clip, name:
         for v in clip.frames
     )
     assert all(f.verdict.clean for f in findings_of(clip))
-
-
-def test_the_same_seed_gives_the_same_clip(recording: Clip) -> None:
-    for change in (FAULTS["base_motion"], FAULTS["static"]):
-        first, second = (change(recording, np.random.default_rng(5)) for _ in range(2))
-        assert first.severity == second.severity
-        assert all(np.array_equal(first.frames[view], second.frames[view]) for view in first.frames)
-        assert np.array_equal(first.episode.state, second.episode.state)
-
-
-def test_frames_and_states_stay_together(recording: Clip) -> None:
-    index = np.array([0, 0, 5, 4])
-    clip = at_frames(recording, index)
-    assert np.array_equal(clip.frames["head"], recording.frames["head"][index])
-    assert np.array_equal(clip.episode.state, recording.episode.state[index])
-    wrist = clip.episode.cameras["left_wrist"].T_base_camera
-    assert np.array_equal(wrist, recording.episode.cameras["left_wrist"].T_base_camera[index])
 
 
 def test_curves_cover_every_frame(recording: Clip) -> None:

@@ -5,8 +5,8 @@ Stage I (action-free, one view) drops static, reset, corrupted and base-motion f
 needs in addition every required view, valid calibration, aligned clocks and a projection that agrees with the images.
 An episode that only Stage II cannot use stays, with stage2_ok false and the reason.
 
-A detector is a function of the episode's signals, the thresholds and what was found before it; it gives its findings.
-To add one, see docs/filters.md.
+A detector is a function of the episode's signals, the thresholds and what was found before it; docs/filters.md says how to
+add one.
 """
 
 from __future__ import annotations
@@ -35,9 +35,8 @@ from worldline_core.data.episodes.episode_index import (
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWork
 from worldline_core.filters.calibration import find_calibration_faults, find_lags, find_mistake, find_projection
+from worldline_core.filters.detectors import find_base_motion, find_joint_faults, find_picture_faults, find_static
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.filters.motion import find_base_motion, find_joint_faults, find_static
-from worldline_core.filters.pictures import find_picture_faults
 from worldline_core.filters.signals import Signals, measure
 from worldline_core.filters.verdict import Finding, Verdict, runs
 from worldline_core.scale.account import InputRow, check_account, write_account
@@ -147,7 +146,7 @@ def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> EpisodeVerdic
     origin = row.source if row.source in config.sources else "default"
     listed = tuple(_finding_row(row.episode_id, finding, origin) for finding in findings)
     cuts = [(finding, flags) for finding in findings if (flags := _cut_frames(finding)) is not None]
-    bad = np.logical_or.reduce([flags for _, flags in cuts]) if cuts else np.zeros(row.video_frames, dtype=bool)
+    bad = np.logical_or.reduce([np.zeros(row.video_frames, dtype=bool), *(flags for _, flags in cuts)])
     segments = tuple((a, b) for a, b in runs(~bad) if b - a >= shortest)
     blame = next((f for f in findings if f.stage == 1 and not f.verdict.passed), None)
     if blame is None and not segments:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from pydantic import ConfigDict, Field, JsonValue, model_validator
 
-from worldline_core.config import StrictModel, validate
+from worldline_core.config import StrictModel, merged, validate
 from worldline_core.errors import ConfigError
 
 Positive = Annotated[float, Field(gt=0)]
@@ -239,16 +238,5 @@ class FilterConfig(Thresholds):
             return self
         if "sources" in overrides:
             raise ConfigError("Sources cannot be nested", where=f"filter.sources.{name}", got="sources")
-        values = _merged(self.model_dump(mode="json", exclude={"sources"}), overrides)
+        values = merged(self.model_dump(mode="json", exclude={"sources"}), overrides)
         return validate(FilterConfig, values, where=f"filter.sources.{name}")
-
-
-def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of nested `values` with the leaves of `overrides` in it; unknown keys stay, to be refused by name."""
-    result = dict(values)
-    for key, value in overrides.items():
-        inner = result.get(key)
-        if isinstance(inner, Mapping) and isinstance(value, Mapping):
-            value = _merged(inner, value)
-        result[key] = value
-    return result

@@ -42,6 +42,14 @@ class Verdict:
         return self.passed and (self.bad_frames is None or not self.bad_frames.any())
 
 
+def frame_verdict(
+    reason: str, passed: bool, bad: np.ndarray, curves: Mapping[str, Curve], **numbers: float | str | None
+) -> Verdict:
+    """Verdict of a detector of bad frames (n,); the numbers are their share, the given ones and the curves' thresholds."""
+    thresholds = {f"threshold_{name}": float(curve.threshold) for name, curve in curves.items()}
+    return Verdict(reason, bool(passed), {"bad_share": float(bad.mean()), **numbers, **thresholds}, bad, curves)
+
+
 @dataclass(frozen=True)
 class Finding:
     """A verdict of a detector, with the view that it was given for (None: for the whole episode).
