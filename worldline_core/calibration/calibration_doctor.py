@@ -30,7 +30,6 @@ from worldline_core.calibration.evidence import (
     gripper_terms,
     hand_eye_log_likelihood,
     image_terms,
-    inversion_gain,
     observable_views,
     pose_terms,
     rms_hand_eye,
@@ -143,13 +142,12 @@ class _Search:
 
     def explain(self, reading: Reading, terms: dict[str, float], other: tuple[str, str] | None = None) -> Explanation:
         """A reading with its score: the sum of its terms, less the cost of departing from the contract."""
-        found = Explanation(reading.conventions, float(sum(terms.values())), terms, other)
-        cost = COMPLEXITY * (len(found.departures) + (reading.conventions.views is not None) / 2)
-        return replace(found, score=found.score - cost)
+        departures = len(reading.conventions.departures) + (other is not None)
+        cost = COMPLEXITY * (departures + (reading.conventions.views is not None) / 2)
+        return Explanation(reading.conventions, float(sum(terms.values())) - cost, terms, other)
 
     @cached_property
     def as_recorded(self) -> Explanation:
-        """The recording as written."""
         return self.explain(self.recorded, self.terms(self.recorded, self.recorded_poses))
 
     def unsuspicious(self) -> Explanation | None:
@@ -159,8 +157,11 @@ class _Search:
         found = self.explain(self.recorded, {**self.recorded_poses, **images})
         if min(self.recorded_poses.values(), default=0.0) < SUSPICION or bad_terms(found):
             return None
-        if inversion_gain(observation, self.recorded) > 0:
-            return None
+        inverted = self.read(RecordedConventions(gripper="inverted"))
+        if inverted is not None:
+            as_written, other = (gripper_terms(observation, reading) for reading in (self.recorded, inverted))
+            if sum(other.values()) > sum(as_written.values()):
+                return None
         score = sum(images.values())
         for lag in image_lags(observation):
             other = image_terms(observation, self.recorded.with_image_lag(lag), wrist_flow=False)
@@ -169,11 +170,7 @@ class _Search:
         return None if self.fits_exchanged_wrists(images) else found
 
     def fits_exchanged_wrists(self, images: Mapping[str, float]) -> bool:
-        """Whether the pictures fit better with exchanged wrist videos; flow is compared where the rest leaves doubt.
-
-        Args:
-            images: the image terms as recorded, without the flow in wrist views.
-        """
+        """True if the pictures fit better with exchanged wrist videos; flow is compared where the rest leaves doubt."""
         exchanged = self.observation.with_exchanged_wrists()
         if exchanged is None:
             return False
@@ -185,7 +182,7 @@ class _Search:
         return gain > written
 
     def read(self, conventions: RecordedConventions) -> Reading | None:
-        """The episode under these conventions; None where they do not apply, or a lag leaves nothing of it."""
+        """The episode under these conventions; None where they do not apply."""
         try:
             return read(self.observation, conventions)
         except RejectedInputError:
@@ -260,7 +257,6 @@ class _Search:
         return self.explain(reading if partial is None else partial, merged)
 
     def is_suspicious(self, explanation: Explanation) -> bool:
-        """Whether a reading leaves anything suspicious."""
         return any(
             value < SUSPICION and TERM_LIMITS.get(name.split(" ")[0], 0.0) > -np.inf
             for name, value in explanation.evidence.items()
@@ -369,8 +365,7 @@ def camera_lags(observation: Observation, recorded: Reading) -> list[int]:
     """The lags at which moving wrist cameras are most rigid against states and commands, and their neighbours."""
     lags: list[int] = []
     for tools in (recorded.tools, recorded.action_tools):
-        scores = {} if tools is None else _camera_lag_scores(observation, recorded, tools)
-        if scores:
+        if tools is not None and (scores := _camera_lag_scores(observation, recorded, tools)):
             best = _best_lag(scores)
             lags += [lag for lag in (best, best - 1, best + 1) if lag in scores]
     return [lag for lag in dict.fromkeys(lags) if lag != 0]
@@ -419,8 +414,7 @@ def intrinsics_sizes(cameras: Mapping[str, CameraTrack]) -> list[tuple[int, int]
 def tool_offset(observation: Observation, recorded: Reading) -> float | None:
     """Distance of the fingertips beyond the recorded tool poses along +z [m], None if unknown or within usual scatter.
 
-    From the joints' kinematics where the recording has both, else from wrist cameras with a stated mount. Without recorded
-    poses the tool is the embodiment's, and moves with its stated mount.
+    From the joints' kinematics where the recording has both, else from wrist cameras with a stated mount.
     """
     offsets: list[float] = []
     if observation.episode.T_base_ee is None:

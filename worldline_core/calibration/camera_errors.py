@@ -1,9 +1,9 @@
 """Errors of each camera (rotation, place, focal length, principal point, lag), estimated with their uncertainty.
 
-In a fixed view the arms' projected motion is laid over the measured motion (optical flow and change of the picture). In a
-wrist view the flow of the scene that the camera's own motion predicts, at free depths, is compared with the measured one.
-Both give normal equations of the PARAMETERS. Each kind of error is estimated as if it were the only one, because several
-look alike in pictures; the kind that explains most is named.
+In a fixed view the arms' projected motion is laid over the measured motion; in a wrist view the flow of the scene that the
+camera's own motion predicts, at free depths, is compared with the measured one. Both give normal equations of the
+PARAMETERS. Each kind of error is estimated as if it were the only one, because several look alike in pictures; the kind
+that explains most is named.
 
 Axis legend: n steps, r c rows and columns of cells, m cells in one row, p points on the robot, k parameters.
 """
@@ -38,11 +38,11 @@ DEPTH_START_PER_M, MOST_PER_M, DEPTH_PRIOR = 4.0, 15.0, np.array([4.0, 20.0, 20.
 FLOW_ERROR_PX, FLOW_ERROR_SHARE, FAINT_EDGE = 0.5, 0.1, 20.0
 HAND_MARGIN_CELLS = 2.0
 LEAST_INFORMATION = 1e-20
-"""Of a parameter that a resting camera cannot show: only the prior bounds it."""
+"""A parameter that a resting camera cannot show is bounded by its prior alone."""
 _STEPS = np.array([0.01] * 3 + [0.0] * 3 + [0.02, 0.02, 0.02, 0.25])
 HAND_REACH_M = 0.2
 COARSE_CELLS, FINE_CELLS = 1.5, 0.7
-"""Blur of the coarse and of the fine maps, in cells."""
+"""Blur of the maps, in cells."""
 SHAPE_UNKNOWN = 12.0
 """Factor on the uncertainty of the robot's shape without joints: the arm behind the hand is unknown."""
 DEVIATIONS_ALONE, DEVIATIONS_TOGETHER = 5.0, 3.0
@@ -58,7 +58,7 @@ class CameraError:
     """One kind of error of one camera, estimated as the only one: the change that makes its pictures fit best.
 
     Attributes:
-        kind: rotation, translation (of the camera, in its own frame), focal length, principal point, lag (of the pictures).
+        kind: one of ERROR_KINDS; rotation and translation in the camera's own frame.
         estimate: (k,) in `unit` (% of the focal length, or of the image's sides).
         information: (k, k) of the estimate.
         gain: log-likelihood of the pictures with it, less that of the recording as written.
@@ -80,7 +80,7 @@ class CameraError:
 
     @property
     def posterior(self) -> np.ndarray:
-        """Information (k, k) with that of the prior."""
+        """(k, k) information with that of the prior."""
         return self.information + np.eye(len(self.estimate)) / self.prior**2
 
     @property
@@ -113,7 +113,7 @@ class CameraError:
 
 @dataclass(frozen=True)
 class Equations:
-    """Normal equations at a guess: information (k, k) and gradient (k,), and the log-likelihood there."""
+    """Normal equations at a guess: information (k, k), gradient (k,), and the log-likelihood there."""
 
     information: np.ndarray
     gradient: np.ndarray
@@ -143,10 +143,7 @@ class StillView:
         self._maps: dict[tuple[bytes, int, int], tuple[np.ndarray, ...]] = {}
 
     def equations(self, theta: np.ndarray, blur: float, wanted: slice = slice(PARAMETERS)) -> Equations:
-        """Normal equations of the `wanted` parameters, zero for the others.
-
-        The predicted maps move where the parameters move their points, and change where these change speed.
-        """
+        """Normal equations of the `wanted` parameters, zero for the others."""
         parameters, size = np.arange(PARAMETERS)[wanted], PARAMETERS + 1
         key = theta.tobytes(), wanted.start, wanted.stop
         if key not in self._maps:  # the start is evaluated with more than one blur
@@ -301,7 +298,6 @@ class WristView:
         """camera of n + 1 poses, gray (n + 1, h, w), motion of the n steps; hand (n + 1, p, 3), radii (p,) [m]."""
         self.camera = camera
         self._steps: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-        self._found: dict[tuple[bytes, int, int], Equations] = {}
         shows = (motion.texture > MIN_TEXTURE) & (motion.change > MIN_CHANGE)
         shows &= ~_covered(camera, hand, radii, shows.shape)
         step, row, column = np.nonzero(shows)
@@ -318,16 +314,8 @@ class WristView:
         self.certainty = sharp.astype(np.float64) / error_px[:, None, None] ** 2
 
     def equations(self, theta: np.ndarray, blur: float, wanted: slice = slice(PARAMETERS)) -> Equations:
-        """Normal equations of the `wanted` parameters, zero for the others; each step's plane of inverse depth is fitted.
-
-        Flow is not blurred: `blur` has no effect.
-        """
-        key = theta.tobytes(), wanted.start, wanted.stop
-        if key not in self._found:
-            self._found[key] = self._equations(theta, np.arange(PARAMETERS)[wanted])
-        return self._found[key]
-
-    def _equations(self, theta: np.ndarray, wanted: np.ndarray) -> Equations:
+        """Normal equations of the `wanted` parameters, zero for the others; flow is not blurred."""
+        columns = np.arange(PARAMETERS)[wanted]
         information, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
         if len(self.step) < MIN_CELLS:
             return Equations(information, gradient, 0.0)
@@ -338,11 +326,11 @@ class WristView:
             fitted = self._per_step(by_depth, weight, error[..., None])[1]
             depth = np.clip(depth + (self.plane * fitted[self._of, :, 0]).sum(-1), 0.0, MOST_PER_M)
         error, by_depth, weight, distance = self._errors(seen, depth)
-        wanted = wanted[_STEPS[wanted] > 0]
-        both = np.empty((*self.flow.shape, len(wanted) + 1))
+        columns = columns[_STEPS[columns] > 0]
+        both = np.empty((*self.flow.shape, len(columns) + 1))
         both[..., -1] = error
         now = self._flow(seen, depth)
-        for column, i in enumerate(wanted):
+        for column, i in enumerate(columns):
             changed = theta.copy()
             changed[i] += _STEPS[i]
             both[..., column] = (self._flow(self._seen(changed), depth) - now) / _STEPS[i]
@@ -350,15 +338,14 @@ class WristView:
         found = np.tensordot(both, weight @ both, ((0, 1), (0, 1)))
         found -= np.tensordot(cross, fitted, ((0, 1), (0, 1)))
         found /= SAMPLE_CELLS_WRIST
-        information[np.ix_(wanted, wanted)] = found[:-1, :-1] + LEAST_INFORMATION * np.eye(len(wanted))
-        gradient[wanted] = found[:-1, -1]
+        information[np.ix_(columns, columns)] = found[:-1, :-1] + LEAST_INFORMATION * np.eye(len(columns))
+        gradient[columns] = found[:-1, -1]
         return Equations(information, gradient, -float(np.log1p(distance).sum()) / SAMPLE_CELLS_WRIST)
 
     def _errors(
         self, seen: tuple[np.ndarray, np.ndarray], depth: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Measured less predicted flow (m, 2), its slope by the inverse depth (m, 2), weights (m, 2, 2), and the squared
-        error in its deviations (m,)."""
+        """Measured less predicted flow (m, 2), its slope by the inverse depth (m, 2), weights (m, 2, 2), squared error (m,)."""
         now = self._flow(seen, depth)
         slope = (self._flow(seen, depth + 0.5) - now) / 0.5
         error = self.flow - now
@@ -368,13 +355,10 @@ class WristView:
     def _per_step(self, by_depth: np.ndarray, weight: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Projections (s, 3, l) of values (m, 2, l) on each step's plane of inverse depths, and the fitted planes."""
         weighted = (weight @ by_depth[..., None])[..., 0]
-        square = self._sums((weighted * by_depth).sum(-1)[:, None, None] * self.plane[:, :, None] * self.plane[:, None])
-        cross = self._sums(self.plane[:, :, None] * (weighted[..., None] * values).sum(1)[:, None])
+        square = (weighted * by_depth).sum(-1)[:, None, None] * self.plane[:, :, None] * self.plane[:, None]
+        cross = self.plane[:, :, None] * (weighted[..., None] * values).sum(1)[:, None]
+        square, cross = (np.add.reduceat(each, self._first, axis=0) for each in (square, cross))
         return cross, np.linalg.solve(square + np.diag(DEPTH_PRIOR**-2), cross)
-
-    def _sums(self, values: np.ndarray) -> np.ndarray:
-        """Sums (s, ...) over each step of values (m, ...)."""
-        return np.add.reduceat(values, self._first, axis=0)
 
     def _seen(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Homogeneous pixels (m, 3) of the cells' rays after the step, and their motion by a unit of inverse depth (m, 3)."""
@@ -483,10 +467,9 @@ def estimate_camera_errors(observation: Observation, reading: Reading) -> tuple[
 
 
 def _estimate(view: str, evidence: StillView | WristView, shape: float = 1.0) -> list[CameraError]:
-    """The errors of one view. Where one is large, the equations are solved again at the corrected camera.
+    """The errors of one view; `shape` is a factor on the uncertainty of the robot's shape in a fixed view.
 
-    Args:
-        shape: factor on the uncertainty of the robot's shape in a fixed view.
+    Where an error is large, the equations are solved again at the corrected camera.
     """
     start = np.zeros(PARAMETERS)
     fine, coarse, found = evidence.equations(start, FINE_CELLS), None, []
@@ -538,11 +521,7 @@ def combine(episodes: Sequence[Sequence[CameraError]]) -> tuple[CameraError, ...
 
 def significant(errors: Sequence[CameraError], *, together: bool = False) -> tuple[CameraError, ...]:
     """At most one certain and large error for each view: among the kinds that explain its pictures about equally well, the
-    smallest against its usual size.
-
-    Args:
-        together: the errors are those of a source, not of one episode.
-    """
+    smallest against its usual size. `together`: the errors are those of a source, not of one episode."""
     found: dict[str, list[CameraError]] = {}
     deviations = DEVIATIONS_TOGETHER if together else DEVIATIONS_ALONE
     for error in errors:

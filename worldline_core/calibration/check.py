@@ -1,7 +1,6 @@
 """`worldline calibrate check`: every episode of a source or a set diagnosed, pictured, and summed up.
 
-Writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg` into one folder. Nothing is repaired here: the result
-is a line for the source's configuration (`repairing_lines`).
+Writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg` into one folder. Nothing is repaired here.
 """
 
 from __future__ import annotations
@@ -72,12 +71,7 @@ def repairing_lines(item: ListedEpisode, explanation: Explanation) -> tuple[str,
 
 
 def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[ListedEpisode], dict[str, str]]:
-    """The episodes of every source in a file's `curate` section, and its kinematic descriptions by embodiment.
-
-    Raises:
-        ConfigError: the file has no such section, or a mistake in it.
-        DataError: a source cannot be opened, or none holds an episode: what each looked for, and what is there.
-    """
+    """The episodes of every source in a file's `curate` section, and its kinematic descriptions by embodiment."""
     values = apply_overrides(read_yaml(path), overrides)
     if not values.get("curate"):
         raise ConfigError("The file configures no source", where=path, expected="a section `curate` with `sources`")
@@ -104,11 +98,7 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
 
 
 def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
-    """The episodes of an EpisodeSet.
-
-    Raises:
-        DataError: the folder holds no readable index.
-    """
+    """The episodes of an EpisodeSet."""
     episodes = EpisodeSet.open(folder)
 
     def load(position: int) -> LoadedEpisode:
@@ -121,22 +111,6 @@ def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
     return [ListedEpisode(row.episode_id, row.source, partial(load, i)) for i, row in enumerate(episodes.rows)]
 
 
-def chosen_episodes(listed: Sequence[ListedEpisode], wanted: Sequence[str]) -> list[ListedEpisode]:
-    """The episodes with these ids; all of them when none is named.
-
-    Raises:
-        DataError: an id is not there.
-    """
-    known = {item.episode_id for item in listed}
-    if unknown := set(wanted) - known:
-        raise DataError(
-            "No such episode",
-            expected=f"one of {len(known)} ids, such as {', '.join(sorted(known)[:3])}",
-            got=", ".join(sorted(unknown)),
-        )
-    return [item for item in listed if not wanted or item.episode_id in wanted]
-
-
 def check_calibration(
     listed: Sequence[ListedEpisode],
     output: Path,
@@ -146,11 +120,8 @@ def check_calibration(
     """Diagnoses episodes one after another and writes the result; one that cannot be read or judged is listed with its reason.
 
     Raises:
-        DataError: there are no episodes to check.
         OSError: the disk is full or cannot be written, which no other episode would escape.
     """
-    if not listed:
-        raise DataError("There are no episodes to check", got="an EpisodeSet without rows")
     kinematics = KinematicsByName(descriptions or {})
     checked: list[EpisodeCheck] = []
     with Progress("calibrate check", len(listed), "episode") as progress:
@@ -266,5 +237,9 @@ def check_command(
         (listed, descriptions), name = episodes_of_config(config, overrides), config.stem
     else:
         raise ConfigError("Give a source's configuration file or an EpisodeSet", got=f"{config}, {artifact}")
-    chosen = chosen_episodes(listed, episodes)
+    known = {item.episode_id for item in listed}
+    if unknown := set(episodes) - known:
+        expected = f"one of {len(known)} ids, such as {', '.join(sorted(known)[:3])}"
+        raise DataError("No such episode", expected=expected, got=", ".join(sorted(unknown)))
+    chosen = [item for item in listed if not episodes or item.episode_id in episodes]
     return check_calibration(chosen, output or OUTPUT_ROOT / name, descriptions=descriptions)

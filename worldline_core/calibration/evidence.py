@@ -1,13 +1,10 @@
-"""Evidence for a reading of an episode: terms of a log-likelihood, from its poses and from its pictures.
+"""Evidence for a reading of an episode: terms of a log-likelihood; 0 is as in a healthy recording, lower is worse.
 
-0 is as in a healthy recording, lower is worse. Poses: rigid mounts, stated mounts, plausible places, kinematics against
-records. Pictures, in a fixed view: the projected motion of the robot's points against optical flow and image change; in a
-wrist view: the flow of the scene that the camera's own motion predicts (rotation exactly, translation up to one depth for
-each step); in any view: the speed of what moves it against the amount of change. Grippers: does 1 mean open?
-
-The typical values are medians over the healthy training episodes of the shipped recordings (the benchmark of the
-calibration doctor prints them). They hold for other recordings as far as these resemble them, so decisions rest on
-differences between readings.
+Poses: rigid mounts, stated mounts, plausible places, kinematics against records. Pictures, in a fixed view: the projected
+motion of the robot's points against optical flow and image change; in a wrist view: the flow of the scene that the
+camera's own motion predicts (rotation exactly, translation up to one depth for each step); in any view: the speed of what
+moves it against the amount of change. Grippers: does 1 mean open? The typical values are medians over the healthy training
+episodes of the shipped recordings, so decisions rest on differences between readings.
 """
 
 from __future__ import annotations
@@ -38,26 +35,17 @@ class Typical(NamedTuple):
     samples: float
 
 
-class Spread(NamedTuple):
-    """A correlation that healthy recordings reach, and its standard deviation."""
-
-    value: float
-    spread: float
-
-
 # Poses; standard deviations of healthy recordings, unless they are limits.
 WORST_TERM, WORST_HAND_EYE_TERM, WORST_FACING_TERM = -40.0, -60.0, -15.0
-HAND_EYE_M, HAND_EYE_DEG = 0.002, 0.7
-HAND_EYE_SAMPLES = 20.0
-"""Independent frames behind a hand-eye residual."""
+HAND_EYE_M, HAND_EYE_DEG, HAND_EYE_SAMPLES = 0.002, 0.7, 20.0
 MOUNT_M, MOUNT_DEG = 0.01, 3.0
 KINEMATICS_M, KINEMATICS_DEG = 0.005, 2.0
 PRINCIPAL_POINT = 0.03
-"""Of its distance from the image centre, in shares of the side."""
+"""From the image centre, in shares of the side."""
 MAX_REACH_M, MAX_CAMERA_M, MAX_WRIST_CAMERA_M = 2.5, 5.0, 0.5
 """Tool from base, camera from base, wrist camera from its tool."""
 FOLLOWS_COMMANDS_COST = 2.0
-"""Of camera poses that follow the commands rather than the states."""
+"""Camera poses may follow the commands rather than the states."""
 FACING_DEG, FACING_SPREAD_DEG = 45.0, 10.0
 """Between a wrist camera's axis and the direction to its tool."""
 
@@ -68,14 +56,15 @@ ARM_FLOW, ARM_CHANGE = Typical(0.92, 20), Typical(0.74, 20)
 TOOL_FLOW, TOOL_CHANGE = Typical(0.96, 14), Typical(0.5, 14)
 """The same where only tool poses are recorded."""
 WRIST_FLOW, WRIST_ENERGY = Typical(0.55, 12), Typical(0.8, 8)
-FINGERS, FINGER_LINKS = Spread(0.75, 0.4), Spread(0.5, 0.3)
+FINGERS, FINGER_LINKS = (0.75, 0.4), (0.5, 0.3)
+"""Correlation that healthy recordings reach, and its standard deviation."""
 FLOW_TURN_DEG, WORST_TURN_TERM = 8.0, -12.0
 MIN_STEP_PX = 0.7
 """Smallest predicted motion of a cell that flow is compared with."""
 FOLLOWS_CORRELATION = 0.5
 """Above it an angle between measured and predicted flow means something."""
 INVERSE_DEPTHS_PER_M = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
-"""Of the scene before a wrist camera, tried one by one."""
+"""Scene before a wrist camera, tried one by one."""
 MIN_TEXTURE, MIN_CHANGE = 4.0, 5.0
 """Grey levels: where flow can be measured, and where there is any."""
 LARGEST_FLOW_ERROR_PX = 8.0
@@ -85,7 +74,7 @@ MIN_OPENING_RANGE = 0.12
 MIN_OPENING_STEP = 0.02
 """Per frame, of a gripper that moves."""
 FULL_OPENING_STEPS = 16
-"""Steps with a moving gripper for its signs to have their full weight: a few may coincide with something else."""
+"""Steps with a moving gripper for its signs to have their full weight."""
 FINGER_REACH_M, FINGER_LENGTH_M = 0.06, 0.12
 FULL_CHANGE = 20.0
 """Grey levels from which a cell has its full weight."""
@@ -97,7 +86,7 @@ STOPPED_TERM, LARGEST_DEVIATIONS = -10.0, 4.0
 
 def pose_terms(observation: Observation, reading: Reading) -> dict[str, float]:
     """Log-likelihood terms of the poses by name; a term of a view ends with the view's name."""
-    terms = {"workspace": _workspace(reading)}
+    terms = {"workspace": WORST_TERM * float((lengths(reading.tools[..., :3, 3]) > MAX_REACH_M).mean())}
     if observation.episode.state_kind == "joints":
         terms["joint range"] = _joint_range(observation, reading)
     if reading.kinematic_tools is not None:
@@ -110,7 +99,10 @@ def pose_terms(observation: Observation, reading: Reading) -> dict[str, float]:
             terms |= _wrist(reading, camera, i, observation.arms[i])
         else:
             terms[f"in view {view}"] = -30.0 * max(0.0, 0.6 - in_view_share(reading, camera))
-            terms[f"upright {view}"] = _upright(camera)
+            up = float(
+                np.median(camera.T_base_camera[:, 2, 1])
+            )  # of the image's down: pictures are taken the right way up
+            terms[f"upright {view}"] = -6.0 * float(np.clip((up - 0.2) / 0.3, 0.0, 1.0))
     return terms
 
 
@@ -155,10 +147,8 @@ def _wrist(reading: Reading, camera: CameraTrack, i: int, arm: Arm) -> dict[str,
 
 def mount_offset(mount: np.ndarray, stated: np.ndarray) -> tuple[float, float]:
     """Distance and angle between two mounts (4, 4), [m] and [deg]."""
-    return (
-        float(np.linalg.norm(mount[:3, 3] - stated[:3, 3])),
-        float(rotation_angle_deg(mount[:3, :3].T @ stated[:3, :3])),
-    )
+    angle = rotation_angle_deg(mount[:3, :3].T @ stated[:3, :3])
+    return float(np.linalg.norm(mount[:3, 3] - stated[:3, 3])), float(angle)
 
 
 def _intrinsics(camera: CameraTrack) -> float:
@@ -175,10 +165,8 @@ def principal_point_offset(K: np.ndarray, width: int, height: int) -> tuple[floa
 
 def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, float]:
     """Horizontal and vertical field of view."""
-    return (
-        float(np.degrees(2 * np.arctan2(width, 2 * K[0, 0]))),
-        float(np.degrees(2 * np.arctan2(height, 2 * K[1, 1]))),
-    )
+    horizontal, vertical = (np.degrees(2 * np.arctan2(n, 2 * f)) for n, f in ((width, K[0, 0]), (height, K[1, 1])))
+    return float(horizontal), float(vertical)
 
 
 def _place(T_base_camera: np.ndarray) -> float:
@@ -196,19 +184,8 @@ def in_view_share(reading: Reading, camera: CameraTrack) -> float:
     return float(inside.mean())
 
 
-def _upright(camera: CameraTrack) -> float:
-    """Low where the image's down is the base's up: pictures are taken the right way up."""
-    up = float(np.median(camera.T_base_camera[:, 2, 1]))
-    return -6.0 * float(np.clip((up - 0.2) / 0.3, 0.0, 1.0))
-
-
-def _workspace(reading: Reading) -> float:
-    distance = np.linalg.norm(reading.tools[..., :3, 3], axis=-1)
-    return WORST_TERM * float((distance > MAX_REACH_M).mean())
-
-
 def _joint_range(observation: Observation, reading: Reading) -> float:
-    """Joint positions beyond the robot's limits, or beyond two turns where no limits are known."""
+    """Low for joints beyond the robot's limits, or beyond two turns where no limits are known."""
     state = reading.episode.state.astype(np.float64)
     if observation.kinematics is not None:
         outside = observation.kinematics.embodiment.outside_limits(state, tolerance_rad=0.1)
@@ -228,10 +205,7 @@ def _kinematics(by_joints: np.ndarray, recorded: np.ndarray) -> float:
 def image_terms(observation: Observation, reading: Reading, *, wrist_flow: bool = True) -> dict[str, float]:
     """Log-likelihood terms of the pictures by name; a term of a view ends with the view's name.
 
-    The set of terms does not depend on the reading, so that readings can be compared.
-
-    Args:
-        wrist_flow: whether to compute the most expensive term, the flow in wrist views.
+    The set of terms does not depend on the reading. `wrist_flow` is the most expensive term.
     """
     terms = {}
     for view in observable_views(observation):
@@ -241,13 +215,11 @@ def image_terms(observation: Observation, reading: Reading, *, wrist_flow: bool 
         elif view not in observation.wrists:
             flow, change, turn_deg = still_view_agreement(observation, reading, view)
             terms[f"turn {view}"] = turn_log_likelihood(turn_deg)
-            terms[f"flow {view}"] = correlation_log_likelihood(flow, ARM_FLOW if reading.whole_arms else TOOL_FLOW)
-            terms[f"change {view}"] = correlation_log_likelihood(
-                change, ARM_CHANGE if reading.whole_arms else TOOL_CHANGE
-            )
-        terms[f"energy {view}"] = correlation_log_likelihood(
-            energy_correlation(observation, reading, view), WRIST_ENERGY
-        )
+            typical = (ARM_FLOW, ARM_CHANGE) if reading.whole_arms else (TOOL_FLOW, TOOL_CHANGE)
+            terms[f"flow {view}"] = correlation_log_likelihood(flow, typical[0])
+            terms[f"change {view}"] = correlation_log_likelihood(change, typical[1])
+        energy = energy_correlation(observation, reading, view)
+        terms[f"energy {view}"] = correlation_log_likelihood(energy, WRIST_ENERGY)
     return terms
 
 
@@ -274,16 +246,14 @@ def turn_log_likelihood(turn_deg: float) -> float:
 
 
 def still_view_agreement(observation: Observation, reading: Reading, view: str) -> tuple[float, float, float]:
-    """Agreement of a fixed view with the robot's predicted motion.
+    """Agreement of a fixed view with the robot's predicted motion; all 0 without predicted motion in the picture.
 
-    Returns:
-        Correlation of predicted with measured flow where motion is predicted; correlation of predicted with measured
-        change; angle [deg] by which the flow is turned as a whole, 0 where it does not follow at all. All 0 without
-        predicted motion in the picture.
+    Returns: correlations of predicted with measured flow and change; angle [deg] by which the flow is turned as a whole, 0
+        where it does not follow at all.
     """
     states, images = reading.steps(observation.num_images)
-    motion, predicted = observation.motion(view), reading.predicted(view)
-    step, vector = predicted.step[states], predicted.vector[states]
+    motion, vector = observation.motion(view), reading.predicted(view)[states]
+    step = lengths(vector)
     flow, change = motion.flow[images], motion.change[images]
     moving = step > MIN_STEP_PX
     if moving.sum() < 20:
@@ -310,9 +280,9 @@ def cosine(a: np.ndarray, b: np.ndarray) -> float:
 def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) -> float:
     """Correlation of measured flow with the one that the camera's motion predicts, on cells that show a change."""
     camera, motion = reading.cameras[view], observation.motion(view)
-    states, images = reading.steps(observation.num_images)
     if not camera.moving:
         return 0.0
+    states, images = reading.steps(observation.num_images)
     key = b"".join((camera.T_base_camera.tobytes(), camera.K.tobytes(), repr((states, images)).encode()))
     if key not in motion.agreements:
         motion.agreements[key] = _wrist_flow_agreement(camera, motion, states, images)
@@ -347,83 +317,52 @@ def energy_correlation(observation: Observation, reading: Reading, view: str) ->
     states, images = reading.steps(observation.num_images)
     own = observation.wrists.get(view)
     speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
-    return correlation(speed, observation.motion(view).mean_change[images])
-
-
-def correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's, 0 where one does not vary."""
-    if len(a) < 8 or a.std() < 1e-9 or b.std() < 1e-9:
+    change = observation.motion(view).mean_change[images]
+    if len(speed) < 8 or speed.std() < 1e-9 or change.std() < 1e-9:
         return 0.0
-    return float(np.corrcoef(a, b)[0, 1])
+    return float(np.corrcoef(speed, change)[0, 1])
 
 
 def gripper_terms(observation: Observation, reading: Reading) -> dict[str, float]:
     """Log-likelihood terms of the grippers by name; none where none moves."""
-    terms = {}
+    terms: dict[str, float] = {}
+    if reading.gripper is None:
+        return terms
     for i, arm in enumerate(observation.arms):
-        for name, found, typical in _signs(observation, reading, i):
-            terms[f"{name} {arm.wrist_view}"] = _weight(reading, i) * _log_likelihood(found, typical)
+        # A few moving steps may coincide with something else; the weight is the same for all readings.
+        moving = np.abs(np.diff(reading.gripper[:, i])) > MIN_OPENING_STEP
+        weight = min(1.0, float(moving.sum()) / FULL_OPENING_STEPS)
+        for name, found, (typical, spread) in (
+            ("fingers", finger_flow(observation, reading, i), FINGERS),
+            ("finger links", finger_agreement(observation, reading, i), FINGER_LINKS),
+        ):
+            if found is not None:
+                deviations = min(((found - typical) / spread) ** 2, LARGEST_DEVIATIONS**2)
+                terms[f"{name} {arm.wrist_view}"] = -0.5 * weight * deviations
         stopped = stopped_share(reading, i)
         if stopped is not None:
             terms[f"stopped gripper {arm.name}"] = STOPPED_TERM * (1 - stopped)
     return terms
 
 
-def inversion_gain(observation: Observation, reading: Reading) -> float:
-    """Approximate gain of the terms if 1 meant closed: every correlation changes its sign."""
-    gain = 0.0
-    for i in range(len(observation.arms)):
-        for _, found, typical in _signs(observation, reading, i):
-            gain += _weight(reading, i) * (_log_likelihood(-found, typical) - _log_likelihood(found, typical))
-        stopped = stopped_share(reading, i)
-        gain += 0.0 if stopped is None else STOPPED_TERM * (2 * stopped - 1)
-    return gain
-
-
-def _signs(observation: Observation, reading: Reading, arm: int) -> list[tuple[str, float, Spread]]:
-    """(name, correlation, typical value) of what the pictures show of the fingers."""
-    away, along = finger_flow(observation, reading, arm), finger_agreement(observation, reading, arm)
-    return [
-        (name, found, typical)
-        for name, found, typical in (("fingers", away, FINGERS), ("finger links", along, FINGER_LINKS))
-        if found is not None
-    ]
-
-
-def _weight(reading: Reading, arm: int) -> float:
-    """Weight (0..1) of a gripper's signs, by its number of moving steps; the same for all readings."""
-    if reading.gripper is None:
-        return 0.0
-    moving = np.abs(np.diff(reading.gripper[:, arm])) > MIN_OPENING_STEP
-    return min(1.0, float(moving.sum()) / FULL_OPENING_STEPS)
-
-
-def _log_likelihood(correlation: float, typical: Spread) -> float:
-    return -0.5 * min(((correlation - typical.value) / typical.spread) ** 2, LARGEST_DEVIATIONS**2)
-
-
 def finger_agreement(observation: Observation, reading: Reading, arm: int) -> float | None:
-    """Correlation (-1..1) of measured flow with that of the finger links by kinematics, in the wrist view.
-
-    None without a moving gripper, or without known finger joints.
-    """
-    view = observation.arms[arm].wrist_view
-    kinematics = observation.kinematics
-    if kinematics is None or not kinematics.embodiment.arms[arm].gripper.finger_joints or not reading.whole_arms:
+    """Correlation (-1..1) of measured flow in the wrist view with that of the finger links by kinematics, None if unknown."""
+    view, kinematics = observation.arms[arm].wrist_view, observation.kinematics
+    if kinematics is None or not kinematics.embodiment.arms[arm].gripper.finger_joints:
         return None
-    if not _moves(observation, reading, arm):
+    if not reading.whole_arms or not _moves(observation, reading, arm):
         return None
     camera, tool = reading.cameras[view], reading.tools[:, arm, :3, 3]
     near = np.median(lengths(reading.points - tool[:, None]), axis=0) < FINGER_LENGTH_M
     T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
     points = reading.points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
     fixed = replace(camera, T_base_camera=np.eye(4)[None])
-    predicted = predict_motion(points, reading.radii[near], fixed)
     states, images = reading.steps(observation.num_images)
-    moving = predicted.step[states] > MIN_FINGER_STEP_PX
+    predicted = predict_motion(points, reading.radii[near], fixed)[states]
+    moving = lengths(predicted) > MIN_FINGER_STEP_PX
     if moving.sum() < 10:
         return 0.0  # whether there is a term must not depend on the reading
-    return cosine(observation.motion(view).flow[images][moving], predicted.vector[states][moving])
+    return cosine(observation.motion(view).flow[images][moving], predicted[moving])
 
 
 def _moves(observation: Observation, reading: Reading, arm: int) -> bool:
@@ -469,9 +408,6 @@ def stopped_share(reading: Reading, arm: int) -> float | None:
         return None
     opening, command = reading.gripper[:, arm], reading.gripper_command[:, arm]
     gap = opening - command
-    rests = (
-        (np.abs(np.gradient(opening)) < STOPPED_STEP)
-        & (np.abs(gap) > STOPPED_GAP)
-        & (np.abs(np.gradient(command)) < STOPPED_STEP)
-    )
+    still = np.maximum(np.abs(np.gradient(opening)), np.abs(np.gradient(command))) < STOPPED_STEP
+    rests = still & (np.abs(gap) > STOPPED_GAP)
     return float((gap[rests] > 0).mean()) if rests.sum() >= 4 else None

@@ -62,12 +62,10 @@ class Motion:
 
     @cached_property
     def moves(self) -> bool:
-        """Whether anything moves at all."""
         return bool((self.change.max(axis=(1, 2)) > STILL_CHANGE).sum() >= 4)
 
     @cached_property
     def mean_change(self) -> np.ndarray:
-        """(n - 1,) mean change of the picture, of 255."""
         return self.change.mean(axis=(1, 2))
 
 
@@ -87,7 +85,6 @@ class Observation:
     """Cached by kinematics and joints: most readings leave both as they are."""
 
     def motion(self, view: str) -> Motion:
-        """Flow and change of a view, cached."""
         if view not in self._motion:
             self._motion[view] = _motion(self.gray[view])
         return self._motion[view]
@@ -122,20 +119,11 @@ class Observation:
     def num_images(self) -> int:
         return min((len(images) for images in self.gray.values()), default=0)
 
-    @cached_property
-    def posture(self) -> dict[str, float]:
-        """Joints outside of the state that the episode's conventions record (waist, head)."""
-        kinematics = self.kinematics
-        return {} if kinematics is None else kinematics.embodiment.noted_posture(self.episode.conventions)
-
 
 def observe(
     episode: Episode, frames: Mapping[str, Iterable[np.ndarray]], kinematics: ArmKinematics | None
 ) -> Observation:
-    """Measure an episode.
-
-    Args:
-        frames: by view, uint8 (H, W, 3) RGB or (h, w) grey, gone through once; resized to GRAY_WIDTH.
+    """Measures an episode; images by view, uint8 (H, W, 3) RGB or (h, w) grey, are resized to GRAY_WIDTH.
 
     Raises: DataError when images have another shape or the kinematics belong to another number of arms.
     """
@@ -223,19 +211,6 @@ def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ..
 
 
 @dataclass(frozen=True)
-class PredictedMotion:
-    """Motion of the robot that a calibration predicts in a fixed view, by step and image cell.
-
-    Attributes:
-        step: (n - 1, r, c) length of the fastest robot point's projected step that touches the cell [px].
-        vector: (n - 1, r, c, 2) that step.
-    """
-
-    step: np.ndarray
-    vector: np.ndarray
-
-
-@dataclass(frozen=True)
 class Reading:
     """An episode read under given conventions.
 
@@ -261,7 +236,7 @@ class Reading:
     radii: np.ndarray
     whole_arms: bool
     first_image: int
-    _predicted: dict[str, PredictedMotion] = field(default_factory=dict, repr=False)
+    _predicted: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     def with_image_lag(self, frames: int) -> Reading:
         """The same geometry with images that trail the states by so many frames."""
@@ -278,8 +253,8 @@ class Reading:
     def tool_speed(self) -> np.ndarray:
         return tool_travel(self.tools)
 
-    def predicted(self, view: str) -> PredictedMotion:
-        """Predicted motion in a view, cached."""
+    def predicted(self, view: str) -> np.ndarray:
+        """`predict_motion` in a view, cached."""
         if view not in self._predicted:
             self._predicted[view] = predict_motion(self.points, self.radii, self.cameras[view])
         return self._predicted[view]
@@ -309,8 +284,10 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
             return None
         tools, kinematic = kinematic, None
     whole_arms = len(radii) > 0
-    if not whole_arms:
-        points, radii = _hand_points(tools)
+    if not whole_arms:  # from the tool back along its z axis
+        points = tools[:, :, None, :3, 3] - _TOOL_POINTS_M[:, None] * tools[:, :, None, :3, 2]
+        points = points.reshape(len(tools), -1, 3)
+        radii = np.full(points.shape[1], _TOOL_RADIUS_M)
     blocks = arm_blocks(episode)
     columns = [block[-1] for block in blocks] if len(blocks) == tools.shape[1] else []
     cameras = {}
@@ -340,7 +317,8 @@ def _moved_arms(
     both = np.concatenate([episode.state, episode.action]).astype(np.float64)
     key = (id(kinematics), both.tobytes())
     if key not in observation.moved_arms:
-        posture = {name: np.full(len(both), value) for name, value in observation.posture.items()}
+        noted = kinematics.embodiment.noted_posture(observation.episode.conventions)  # waist, head
+        posture = {name: np.full(len(both), value) for name, value in noted.items()}
         links = kinematics.link_poses(both, posture=posture)
         fk = kinematics.tools_of(links).numpy()
         capsules, radius = robot_capsules(kinematics, {k: v[: episode.num_frames] for k, v in links.items()})
@@ -356,20 +334,15 @@ def _sampled(capsules: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.nd
     return points.reshape(len(capsules), -1, 3), np.repeat(radii, len(t))
 
 
-def _hand_points(tools: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points from the tool back along its z axis, for recordings without joints."""
-    points = tools[:, :, None, :3, 3] - _TOOL_POINTS_M[:, None] * tools[:, :, None, :3, 2]
-    points = points.reshape(len(tools), -1, 3)
-    return points, np.full(points.shape[1], _TOOL_RADIUS_M)
+def predict_motion(points: np.ndarray, radii: np.ndarray, camera: CameraTrack) -> np.ndarray:
+    """(n - 1, r, c, 2) [px]: in each cell of a fixed camera, the projected step of the fastest robot point that touches it.
 
-
-def predict_motion(points: np.ndarray, radii: np.ndarray, camera: CameraTrack) -> PredictedMotion:
-    """Projected steps of points (n, p, 3) with radii (p,) [m] in a fixed camera, in cells of its image."""
+    Args:
+        points: (n, p, 3), radii: (p,) [m].
+    """
     rows, columns = camera.height // CELL_PX, camera.width // CELL_PX
     if not len(radii):
-        return PredictedMotion(
-            np.zeros((len(points) - 1, rows, columns)), np.zeros((len(points) - 1, rows, columns, 2))
-        )
+        return np.zeros((len(points) - 1, rows, columns, 2))
     T_camera_base = rigid_inverse(camera.T_base_camera[:1])[0]
     in_camera = points @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
     depth = in_camera[..., 2]
@@ -394,8 +367,5 @@ def predict_motion(points: np.ndarray, radii: np.ndarray, camera: CameraTrack) -
             for j in (i, i + 1):
                 if shown[j][point]:
                     cv2.circle(cells, centres[j][point], radius[j][point], point, -1, cv2.LINE_8, _SUBCELL_BITS)
-    covered = owner >= 0
     frames = np.arange(len(step))[:, None, None]
-    best = np.where(covered, length[frames, owner], 0.0)
-    vector = np.where(covered[..., None], step[frames, owner], 0.0)
-    return PredictedMotion(best, vector)
+    return np.where((owner >= 0)[..., None], step[frames, owner], 0.0)
