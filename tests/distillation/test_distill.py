@@ -53,7 +53,7 @@ def trainer(steps: int, **changes: object) -> dict[str, object]:
     }
 
 
-def config(**distribution_matching: object) -> DistillConfig:
+def config() -> DistillConfig:
     return DistillConfig.model_validate(
         {
             "clips": {"lengths": [17]},
@@ -68,7 +68,7 @@ def config(**distribution_matching: object) -> DistillConfig:
                 "trainer": trainer(3),
                 "trajectories": {"clips": 4, "clips_per_shard": 2, "substeps": [1, 1, 1, 2]},
             },
-            "distribution_matching": {"trainer": trainer(12), **distribution_matching},
+            "distribution_matching": {"trainer": trainer(12)},
         }
     )
 
@@ -207,13 +207,10 @@ def killing(function: Callable, at_call: int) -> Callable:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("real_score", ["stage2", "causal_teacher"])
 def test_a_run_killed_anywhere_ends_with_the_same_bytes(
-    finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_score: str
+    finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings, inputs, whole = config(real_score=real_score), finished.inputs, finished.output
-    if settings != config():
-        distill(settings, inputs, whole := tmp_path / "whole")
+    settings, inputs, whole = config(), finished.inputs, finished.output
     kills = [
         (TeacherForcingObjective, "loss", 3),
         (teacher_trajectories, "write_bytes_atomic", 2),

@@ -8,7 +8,6 @@ import torch
 from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.distillation.distribution_matching import (
     DistributionMatchingObjective,
-    causal_score,
     distribution_gradient,
     distribution_matching_loss,
     fake_score_loss,
@@ -17,19 +16,24 @@ from worldline_core.distillation.distribution_matching import (
 from worldline_core.errors import ConfigError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
+from worldline_core.training.clip_loader import Batch
 from worldline_core.training.training_config import LossWeighting
 
 
 def gaussian_score(mean: torch.Tensor):
     """Velocity of data that is a single point: x0 is `mean`, so v = (x_t - mean) / sigma."""
 
-    def velocity(noisy: torch.Tensor, clean: torch.Tensor, sigma: torch.Tensor) -> torch.Tensor:
-        level = sigma.repeat_interleave(2, dim=1)[:, None, None, :, None, None]
+    def velocity(noisy: torch.Tensor, levels: torch.Tensor) -> torch.Tensor:
         answer = torch.zeros_like(noisy)
-        answer[..., 1:, :, :] = (noisy - mean)[..., 1:, :, :] / level
+        answer[..., 1:, :, :] = (noisy - mean)[..., 1:, :, :] / levels[:, None, None, 1:, None, None]
         return answer
 
     return velocity
+
+
+def levels_of(sigma: float) -> torch.Tensor:
+    """The same noise in every frame but the observed one."""
+    return torch.cat((torch.zeros(2, 1), torch.full((2, 4), sigma)), dim=1)
 
 
 def rollout(model, clip, exit_step: int = 3, **options):
@@ -53,9 +57,8 @@ def test_five_fake_score_updates_then_one_of_the_student() -> None:
 def test_the_student_target_lies_towards_the_real_score_and_away_from_the_fake(clip) -> None:
     generated = clip.latents.clone().requires_grad_()
     real_mean, fake_mean = clip.latents + 1.0, clip.latents - 1.0
-    sigma = torch.full((2, 2), 0.5)
     gradient = distribution_gradient(
-        gaussian_score(real_mean), gaussian_score(fake_mean), generated, clip.noise, sigma, clip.spec.block_size
+        gaussian_score(real_mean), gaussian_score(fake_mean), generated, clip.noise, levels_of(0.5)
     )
     # (x - (z + 1)) / s - (x - (z - 1)) / s = -2 / s
     torch.testing.assert_close(gradient[..., 1:, :, :], torch.full_like(gradient[..., 1:, :, :], -4.0))
@@ -69,27 +72,24 @@ def test_the_student_target_lies_towards_the_real_score_and_away_from_the_fake(c
 def test_equal_scores_leave_the_student_alone(clip) -> None:
     generated = clip.latents.clone().requires_grad_()
     score = gaussian_score(clip.latents)
-    gradient = distribution_gradient(score, score, generated, clip.noise, torch.full((2, 2), 0.3), clip.spec.block_size)
+    gradient = distribution_gradient(score, score, generated, clip.noise, levels_of(0.3))
     loss = distribution_matching_loss(generated, gradient)
     loss.backward()
     assert loss.item() == 0
     assert not bool(generated.grad.any())
 
 
-@pytest.mark.parametrize("score", [causal_score, full_clip_score])
-def test_a_student_update_reaches_the_student_alone(make_model, clip, score) -> None:
-    student, real, fake = make_model(0), make_model(1), make_model(2)
-    options = {"views": clip.views, "spec": clip.spec}
+@pytest.mark.parametrize("prediction", ["velocity", "first_frame_residual"])
+def test_a_student_update_reaches_the_student_alone(make_model, clip, prediction: str) -> None:
+    kind = {} if prediction == "velocity" else {"prediction": prediction, "first_frame_std": 0.5}
+    student, real, fake = (make_model(seed, **kind) for seed in range(3))
     generated = rollout(student, clip, 1, with_gradient=True)
-    gradient = distribution_gradient(
-        score(real, clip.maps, **options),
-        score(fake, clip.maps, **options),
-        generated,
-        clip.noise,
-        torch.full((2, 2), 0.6),
-        clip.spec.block_size,
-    )
-    distribution_matching_loss(generated, gradient).backward()
+    batch = Batch((), clip.views, clip.latents, clip.maps)
+    scores = full_clip_score(real, batch), full_clip_score(fake, batch)
+    gradient = distribution_gradient(*scores, generated, clip.noise, levels_of(0.6))
+    loss = distribution_matching_loss(generated, gradient)
+    loss.backward()
+    assert bool(loss.isfinite())
     assert all(parameter.grad is None for model in (real, fake) for parameter in model.parameters())
     assert any(bool(parameter.grad.any()) for parameter in student.parameters() if parameter.grad is not None)
 
@@ -98,15 +98,8 @@ def test_a_fake_score_update_reaches_the_fake_score_alone(make_model, clip) -> N
     student, fake = make_model(0), make_model(2)
     generated = rollout(student, clip)
     assert not generated.requires_grad
-    score = causal_score(fake, clip.maps, views=clip.views, spec=clip.spec)
-    fake_score_loss(
-        score,
-        generated,
-        clip.noise.flip(0),
-        torch.full((2, 2), 0.6),
-        block_size=clip.spec.block_size,
-        weighting=LossWeighting(),
-    ).backward()
+    score = full_clip_score(fake, Batch((), clip.views, clip.latents, clip.maps))
+    fake_score_loss(score, generated, clip.noise.flip(0), levels_of(0.6), LossWeighting()).backward()
     assert all(parameter.grad is None for parameter in student.parameters())
     assert all(parameter.grad is not None for parameter in fake.parameters())
 
@@ -179,17 +172,3 @@ def test_rollout_equals_the_block_causal_sampler(make_model, make_spec, clip, re
         with_gradient=False,
     )
     assert torch.equal(generated[..., 1:, :, :], torch.cat(predicted, dim=3))
-
-
-def test_residual_predicting_students_generate_and_learn_as_well(make_model, clip) -> None:
-    student, real, fake = (
-        make_model(seed, prediction="first_frame_residual", first_frame_std=0.5) for seed in range(3)
-    )
-    generated = rollout(student, clip, 2, with_gradient=True)
-    sigma = torch.full((2, 2), 0.4)
-    scores = [full_clip_score(m, clip.maps, views=clip.views, spec=clip.spec) for m in (real, fake)]
-    gradient = distribution_gradient(*scores, generated, clip.noise, sigma, clip.spec.block_size)
-    loss = distribution_matching_loss(generated, gradient)
-    loss.backward()
-    assert bool(loss.isfinite())
-    assert any(bool(parameter.grad.any()) for parameter in student.parameters() if parameter.grad is not None)

@@ -9,7 +9,6 @@ import torch
 
 from worldline_core.distillation.teacher_trajectories import euler_nodes, substep_sigmas, teacher_trajectories
 from worldline_core.distillation.trajectory_regression import node_of_each_block
-from worldline_core.errors import ConfigError
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS as NODES
 
 
@@ -40,10 +39,6 @@ def test_substeps_end_on_the_nodes_and_descend() -> None:
     assert all(a > b for a, b in itertools.pairwise(levels))
     # Two sub-steps of the whole range meet in the middle of the unshifted schedule: 5 / 6 at one half.
     assert substep_sigmas(1.0, 0.0, 2)[1] == pytest.approx(5 / 6)
-    with pytest.raises(ConfigError, match="divide an interval"):
-        substep_sigmas(0.5, 0.5, 1)
-    with pytest.raises(ConfigError, match="sub-steps is needed"):
-        euler_nodes(lambda state, sigma: state, torch.ones(1), (1, 2), NODES)
 
 
 def test_a_node_is_picked_for_each_block() -> None:
@@ -74,18 +69,13 @@ def test_trajectories_start_at_the_noise_and_are_repeatable(make_model, clip) ->
     assert torch.equal(nodes, trajectories(model, clip))
 
 
-def test_the_history_is_the_recorded_one_or_the_teachers_own(make_model, clip) -> None:
+def test_the_history_is_the_recorded_one(make_model, clip) -> None:
     model = make_model(0)
     other = clip.latents.clone()
     other[..., 1:3, :, :] += 1.0
     nodes, changed = trajectories(model, clip), trajectories(model, clip, latents=other)
     assert torch.equal(nodes[..., :2, :, :], changed[..., :2, :, :])
     assert not torch.allclose(nodes[:, -1, ..., 2:, :, :], changed[:, -1, ..., 2:, :, :])
-    own, own_changed = (
-        trajectories(model, clip, latents=latents, generated_history=True) for latents in (clip.latents, other)
-    )
-    assert torch.equal(own, own_changed)
-    assert not torch.allclose(own[:, -1], nodes[:, -1])
 
 
 def test_later_controls_do_not_reach_earlier_blocks(make_model, clip) -> None:

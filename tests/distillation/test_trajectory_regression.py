@@ -7,8 +7,9 @@ import torch
 
 from worldline_core.distillation.causal_objective import block_sigmas, frame_sigmas
 from worldline_core.distillation.causal_teacher_forcing import teacher_forcing_loss
-from worldline_core.distillation.distill_config import AuxiliaryWeights, TrajectoryRegressionConfig
-from worldline_core.distillation.trajectory_regression import draw_nodes, trajectory_regression_loss
+from worldline_core.distillation.distill_config import DistillConfig
+from worldline_core.distillation.teacher_trajectories import TrajectoryBatch
+from worldline_core.distillation.trajectory_regression import TrajectoryObjective, draw_nodes
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS as NODES
 from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
@@ -30,17 +31,11 @@ def straight_nodes(clean: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
 
 
 def loss_of(student, nodes, clip, index, **options):
-    return trajectory_regression_loss(
-        student,
-        nodes,
-        clip.latents,
-        clip.maps,
-        index,
-        mask=clip.mask,
-        views=clip.views,
-        spec=clip.spec,
-        config=TrajectoryRegressionConfig.model_validate(options),
+    config = DistillConfig.model_validate(
+        {"clips": {"lengths": [17]}, "block_size": 2, "trajectory_regression": options}
     )
+    batch = TrajectoryBatch((), clip.views, clip.latents, clip.maps, nodes=nodes, history=clip.latents, mask=clip.mask)
+    return TrajectoryObjective(student, config, None).regression(batch, index)
 
 
 @pytest.mark.parametrize("node", range(4))
@@ -58,7 +53,7 @@ def test_a_perfect_student_has_no_loss(clip, node: int) -> None:
 def test_parts_are_weighted(clip) -> None:
     nodes = straight_nodes(clip.latents, clip.noise)
     student = StraightStudent(clip.latents, clip.noise + 0.1)
-    nothing = AuxiliaryWeights(anchor=0, boundary=0, lpips=0, robot=0, robot_motion=0)
+    nothing = dict.fromkeys(("anchor", "boundary", "lpips", "robot", "robot_motion"), 0)
     options = {"next_weight": 3.0, "terminal_weight": 7.0, "auxiliary": nothing}
     total, terms = loss_of(student, nodes, clip, torch.full((2, 2), 3), **options)
     assert set(terms) == {"next", "terminal"}

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
@@ -26,7 +26,6 @@ from torch import Tensor
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
 from worldline_core.actions.robot_masks import kinematic_robot_masks
 from worldline_core.distillation.distill_config import AuxiliaryWeights
-from worldline_core.errors import ConfigError
 from worldline_core.geometry.tensor_transforms import is_rigid, valid_intrinsics
 from worldline_core.model.lpips import LPIPS
 from worldline_core.model.tokenizers import VideoTokenizer
@@ -98,11 +97,9 @@ class _ViewByView(torch.autograd.Function):
         return gradients[0] * ctx.saved_tensors[0], None, None
 
 
-def view_weights(views: Sequence[str], wrist_weight: float = 2.0) -> Float[Tensor, " v"]:
-    """Weight of each view: 1 for the head, `wrist_weight` for every other one (appendix, 2 in the paper)."""
-    if not views:
-        raise ConfigError("the robot losses need at least one view", expected="a list of view names", got="[]")
-    return torch.tensor([1.0 if view == HEAD_VIEW else wrist_weight for view in views])
+def view_weights(views: Sequence[str]) -> Float[Tensor, " v"]:
+    """Weight of each view: 1 for the head, 2 for every other one (appendix)."""
+    return torch.tensor([1.0 if view == HEAD_VIEW else 2.0 for view in views])
 
 
 def mask_normalised_mean(
@@ -172,21 +169,28 @@ def boundary_loss(
     return ((step_predicted - step_target) ** 2).mean()
 
 
+class MaskedBatch(Protocol):
+    """Views of a batch, and where the robot is in them."""
+
+    @property
+    def views(self) -> Sequence[str]: ...
+    @property
+    def mask(self) -> Float[Tensor, "b v t h w"]: ...
+
+
 def auxiliary_losses(
     predicted: Float[Tensor, "b v c t h w"],
     target: Float[Tensor, "b v c t h w"],
-    *,
-    mask: Float[Tensor, "b v t h w"] | None,
-    views: Sequence[str],
+    batch: MaskedBatch,
     block_size: int,
     weights: AuxiliaryWeights,
     perceptual: PerceptualDistance | None = None,
 ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
     """Weighted sum of all auxiliaries of `predicted` against `target`, and the plain value of each for the metrics.
 
-    Both clips hold the observed frame. `mask` may be None only where no robot term is wanted (both robot weights 0);
-    `perceptual` None leaves LPIPS out, which the caller reports.
+    Both clips hold the observed frame. `perceptual` None leaves LPIPS out, which the caller reports.
     """
+    per_view = view_weights(batch.views).to(predicted)
     terms: dict[str, tuple[float, Tensor]] = {}
     if weights.anchor:
         terms["anchor"] = (weights.anchor, anchor_loss(predicted, target))
@@ -194,12 +198,10 @@ def auxiliary_losses(
         terms["boundary"] = (weights.boundary, boundary_loss(predicted, target, block_size))
     if weights.lpips and perceptual is not None:
         terms["lpips"] = (weights.lpips, perceptual(predicted, target))
-    if mask is not None and (weights.robot or weights.robot_motion):
-        per_view = view_weights(views, weights.wrist_view).to(predicted)
-        if weights.robot:
-            terms["robot"] = (weights.robot, robot_reconstruction_loss(predicted, target, mask, per_view))
-        if weights.robot_motion:
-            terms["robot_motion"] = (weights.robot_motion, robot_motion_loss(predicted, target, mask, per_view))
+    if weights.robot:
+        terms["robot"] = (weights.robot, robot_reconstruction_loss(predicted, target, batch.mask, per_view))
+    if weights.robot_motion:
+        terms["robot_motion"] = (weights.robot_motion, robot_motion_loss(predicted, target, batch.mask, per_view))
     total = (predicted * 0.0).sum()
     for weight, value in terms.values():
         total = total + weight * value

@@ -58,7 +58,7 @@ class TeacherForcingObjective(CausalObjective[Batch]):
             history=history,
             views=batch.views,
             fps=batch.fps,
-            spec=self.config.training_spec,
+            spec=self.spec,
             sampling=settings.sigma,
             weighting=settings.weighting,
             weights=batch.weights,

@@ -188,8 +188,7 @@ class DistillationRun:
         """Step 3, from step 2's model; the real and the fake score start from the same weights."""
         settings = self.config.distribution_matching
         student, info = self._model(self.folder(STEPS[1]), settings.trainer, expect_kind="causal")
-        scores = self.stage2 if settings.real_score == "stage2" else self.folder(STEPS[0])
-        real, fake = (self._model(scores, settings.trainer)[0] for _ in range(2))
+        real, fake = (self._model(self.stage2, settings.trainer)[0] for _ in range(2))
         objective = DistributionMatchingObjective(student.train(), real, fake.train(), self.config, self.perceptual)
         other = ParameterGroup("fake", _named_parameters(fake, "fake."), settings.fake_score_rate, averaged=False)
         return self._train(
@@ -250,7 +249,6 @@ class DistillationRun:
             batch_size=trainer.batch_size,
             seed=trainer.seed,
             plan=batch_plan(trainer, self._work(step)),
-            generated_history=self.config.trajectory_regression.trajectories.history == "generated",
             kept_latents=isinstance(self.config.input, FrameInput),
         )
         return loader.load

@@ -37,19 +37,13 @@ class AuxiliaryWeights(StrictModel):
     lpips: float = Field(default=0.005, ge=0)
     robot: float = Field(default=0.005, ge=0)
     robot_motion: float = Field(default=0.1, ge=0)
-    wrist_view: float = Field(default=2.0, gt=0, description="weight of a wrist view against the head view")
 
 
 class WindowConfig(StrictModel):
-    """Finished blocks that stay visible: the first ones and the most recent ones (one and three in the paper).
-
-    ``trained_on``: what the passes over whole clips show a block: the same window, at the same positions ("window"), or
-    every block before it ("full_history"), which no rollout longer than the window ever shows it.
-    """
+    """Finished blocks that stay visible: the first ones and the most recent ones (one and three in the paper)."""
 
     sink_blocks: int = Field(default=1, ge=1)
     recent_blocks: int = Field(default=3, ge=0)
-    trained_on: Literal["window", "full_history"] = "window"
 
 
 class TeacherForcingConfig(StrictModel):
@@ -86,13 +80,11 @@ class TrajectoriesConfig(StrictModel):
     """The offline trajectories of the frozen causal teacher.
 
     ``substeps``: Euler steps of the teacher between neighbouring nodes; 1 everywhere is the plain few-step sampler.
-    ``history``: what each block sees before it, the recorded blocks or the teacher's own.
     """
 
     clips: int = Field(default=512, ge=1)
     clips_per_shard: int = Field(default=16, ge=1)
     substeps: tuple[int, ...] = (2, 2, 3, 9)
-    history: Literal["recorded", "generated"] = "recorded"
     seed: int = Field(default=1, ge=0)
 
 
@@ -110,9 +102,6 @@ class DistributionMatchingConfig(StrictModel):
     """Step 3.
 
     ``fake_score_rate``: learning rate of the fake score as a multiple of the student's.
-    ``real_score``: "stage2" judges a rollout as one clip given the observed frame alone, so that errors piling up from
-    block to block are seen, and costs half the tokens of "causal_teacher", which judges every block given the rollout's
-    own earlier blocks and so takes their errors for granted.
     ``target``: what the auxiliaries compare with: the clean end of the teacher's trajectory from the same noise (the
     paper), or the recorded clip (fresh noise each time).
     """
@@ -121,7 +110,6 @@ class DistributionMatchingConfig(StrictModel):
         steps=600, log_every=30, optimizer=OptimizerConfig(learning_rate=2e-5, betas=(0.0, 0.999), warmup_steps=12)
     )
     fake_score_rate: float = Field(default=4.0, gt=0)
-    real_score: Literal["stage2", "causal_teacher"] = "stage2"
     sigma: SigmaSampling = SigmaSampling(shift=5.0)
     sigma_range: tuple[float, float] = (0.02, 0.98)
     weighting: LossWeighting = LossWeighting()
@@ -186,21 +174,10 @@ class DistillConfig(StrictModel):
 
         Of recent blocks it keeps no more than the longest clip has: it has never seen what is further back.
         """
+        earlier_blocks = (max(self.clips.lengths) - 1) // (TEMPORAL_FACTOR * self.block_size) - 1
         return CausalSpec(
             block_size=self.block_size,
             sink_blocks=self.window.sink_blocks,
-            recent_blocks=min(self.window.recent_blocks, self._earlier_blocks),
+            recent_blocks=min(self.window.recent_blocks, earlier_blocks),
             sigmas=self.sigmas,
         )
-
-    @property
-    def training_spec(self) -> CausalSpec:
-        """Blocks and window of the passes over whole clips; like ``spec``, unless the window says otherwise."""
-        if self.window.trained_on == "window":
-            return self.spec
-        return self.spec.model_copy(update={"recent_blocks": self._earlier_blocks})
-
-    @property
-    def _earlier_blocks(self) -> int:
-        """Whole blocks before the last one of the longest clip."""
-        return (max(self.clips.lengths) - 1) // (TEMPORAL_FACTOR * self.block_size) - 1

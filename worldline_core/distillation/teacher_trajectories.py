@@ -33,7 +33,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from worldline_core.distillation.auxiliary_losses import clip_robot_masks
-from worldline_core.distillation.causal_objective import maps_of, with_observed_frame
+from worldline_core.distillation.causal_objective import maps_of
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.model.block_causal_attention import KVCache, block_bounds
@@ -54,16 +54,7 @@ def substep_sigmas(start: float, stop: float, substeps: int) -> list[float]:
     """Noise levels from `start` down to `stop`, both included, evenly spaced before the shift of the schedule.
 
     With sigma = s u / (1 + (s - 1) u) the sub-steps are even in u, as the full-length sampler spaces its steps.
-
-    Raises:
-        ConfigError: no sub-step, or levels that do not descend within [0, 1].
     """
-    if substeps < 1 or not 1.0 >= start > stop >= 0.0:
-        raise ConfigError(
-            "Cannot divide an interval of noise levels",
-            expected="1 >= start > stop >= 0 and at least one sub-step",
-            got=f"start {start}, stop {stop}, {substeps} sub-steps",
-        )
     first, last = (sigma / (CAUSAL_SHIFT - (CAUSAL_SHIFT - 1) * sigma) for sigma in (start, stop))
     between = [first + (last - first) * i / substeps for i in range(1, substeps)]
     return [start, *(CAUSAL_SHIFT * u / (1 + (CAUSAL_SHIFT - 1) * u) for u in between), stop]
@@ -76,21 +67,11 @@ def euler_nodes(
 
     Args:
         velocity: field at (state, sigma).
-        substeps: Euler steps of each interval, one number per interval.
-
-    Raises:
-        ConfigError: another number of intervals than of sub-step counts.
+        substeps: Euler steps of each interval between nodes.
     """
-    if len(substeps) != len(nodes) - 1:
-        raise ConfigError(
-            "One number of sub-steps is needed for each interval between nodes",
-            expected=len(nodes) - 1,
-            got=list(substeps),
-        )
-    state, states = noise, [noise]
+    states = [noise]
     for (start, stop), count in zip(itertools.pairwise(nodes), substeps, strict=True):
-        state = integrate(velocity, state, substep_sigmas(start, stop, count))
-        states.append(state)
+        states.append(integrate(velocity, states[-1], substep_sigmas(start, stop, count)))
     return states
 
 
@@ -105,13 +86,11 @@ def teacher_trajectories(
     spec: CausalSpec,
     substeps: Sequence[int],
     fps: Float[Tensor, " b"] | None = None,
-    generated_history: bool = False,
 ) -> Float[Tensor, "b k v c u h w"]:
     """States at every node of every block after the observed frame (u = t - 1 latent frames).
 
     Args:
-        latents: recorded clips; frame 0 is the observation. The later frames are the history that each block sees,
-            unless `generated_history` puts the teacher's own clean blocks there.
+        latents: recorded clips; frame 0 is the observation, the later frames are the history that each block sees.
         noise: starting noise; frame 0 is not read.
 
     Raises:
@@ -127,8 +106,7 @@ def teacher_trajectories(
         states = euler_nodes(velocity, noise[..., start:stop, :, :], substeps, spec.sigmas)
         blocks.append(torch.stack(states, dim=1))
         if stop < bounds[-1][1]:
-            clean = states[-1] if generated_history else latents[..., start:stop, :, :]
-            teacher.write_block(clean, cache, action_maps=maps, views=views)
+            teacher.write_block(latents[..., start:stop, :, :], cache, action_maps=maps, views=views)
     return torch.cat(blocks, dim=4)
 
 
@@ -166,7 +144,6 @@ def trajectory_shard(
             spec=config.spec,
             substeps=settings.substeps,
             fps=batch.fps,
-            generated_history=settings.history == "generated",
         )
     tensors = {"nodes": nodes, "mask": robot_masks(loader, batch.clips, batch.views)}
     if isinstance(config.input, FrameInput):
@@ -326,7 +303,6 @@ class TrajectoryLoader:
     """Draws trajectories at random; what a step sees depends on (seed, step) alone.
 
     Args:
-        generated_history: whether the teacher saw its own clean blocks before each block (else the recorded ones).
         kept_latents: whether the clips' latents are with the trajectories.
     """
 
@@ -338,7 +314,6 @@ class TrajectoryLoader:
         batch_size: int,
         seed: int,
         plan: BatchPlan,
-        generated_history: bool,
         kept_latents: bool = False,
     ) -> None:
         self.store = store
@@ -346,7 +321,6 @@ class TrajectoryLoader:
         self.batch_size = batch_size
         self.seed = seed
         self.plan = plan
-        self.generated_history = generated_history
         self.kept_latents = kept_latents
         # A batch has one shape, so its clips have one length and the same views: a group of such clips is drawn by its size,
         # then clips within it.
@@ -370,8 +344,5 @@ class TrajectoryLoader:
         else:
             batch = self.loader.load(clips)
         nodes = self.store.nodes(rows).to(self.loader.device)
-        history = batch.latents
-        if self.generated_history:
-            history = with_observed_frame(history[..., :1, :, :], nodes[:, -1])
         mask = self.store.masks(rows).to(self.loader.device)
-        return TrajectoryBatch(**vars(batch), nodes=nodes, history=history, mask=mask)
+        return TrajectoryBatch(**vars(batch), nodes=nodes, history=batch.latents, mask=mask)

@@ -9,8 +9,6 @@ nodes is taken in expectation (times K); all blocks are trained in one teacher-f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from einops import rearrange
 from jaxtyping import Float, Int
@@ -18,10 +16,9 @@ from torch import Tensor
 
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance, auxiliary_losses
 from worldline_core.distillation.causal_objective import CausalObjective, frame_sigmas, maps_of, with_observed_frame
-from worldline_core.distillation.distill_config import DistillConfig, TrajectoryRegressionConfig
+from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.teacher_trajectories import TrajectoryBatch
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.training.flow_matching import broadcast_sigma
 
 
@@ -34,21 +31,42 @@ class TrajectoryObjective(CausalObjective[TrajectoryBatch]):
 
     def loss(self, batch: TrajectoryBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """Trajectory loss of one batch, and its parts."""
+        del step
         blocks = (batch.latents.shape[3] - 1) // self.spec.block_size
-        total, terms = trajectory_regression_loss(
-            self.model,
-            batch.nodes,
-            batch.history,
-            maps_of(batch),
-            draw_nodes(len(batch.latents), blocks, self.spec.steps, generator),
-            mask=batch.mask,
-            views=batch.views,
-            fps=batch.fps,
-            spec=self.config.training_spec,
-            config=self.config.trajectory_regression,
-            perceptual=self.perceptual,
-        )
+        total, terms = self.regression(batch, draw_nodes(len(batch.latents), blocks, self.spec.steps, generator))
         return total, {name: value.item() for name, value in terms.items()}
+
+    def regression(
+        self, batch: TrajectoryBatch, index: Int[Tensor, "b blocks"]
+    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        """Regression of the next node and of the clean end, plus the auxiliaries against the teacher's clean end.
+
+        Returns:
+            The weighted total, and its parts.
+
+        Args:
+            index: node of each block, see :func:`draw_nodes`.
+        """
+        spec, config, nodes = self.spec, self.config.trajectory_regression, batch.nodes
+        first = batch.history[..., :1, :, :]
+        levels = torch.tensor(spec.sigmas, device=nodes.device, dtype=nodes.dtype)
+        state = with_observed_frame(first, node_of_each_block(nodes, index, spec.block_size))
+        following = with_observed_frame(first, node_of_each_block(nodes, index + 1, spec.block_size))
+        end = with_observed_frame(first, nodes[:, -1])
+        sigma, sigma_next = levels[index], levels[index + 1]
+        velocity = self.model.forward_teacher_forcing(
+            state, batch.history, sigma, action_maps=maps_of(batch), spec=spec, views=batch.views, fps=batch.fps
+        ).float()
+        here = broadcast_sigma(frame_sigmas(sigma, spec.block_size))
+        there = broadcast_sigma(frame_sigmas(sigma_next, spec.block_size))
+        stepped = state + (there - here) * velocity
+        predicted = state - here * velocity
+        # Frame 0 is the observation in both: it adds nothing and is left out of the means.
+        next_loss = spec.steps * ((stepped - following)[..., 1:, :, :] ** 2).mean()
+        terminal_loss = ((predicted - end)[..., 1:, :, :] ** 2).mean()
+        auxiliary, terms = auxiliary_losses(predicted, end, batch, spec.block_size, config.auxiliary, self.perceptual)
+        total = config.next_weight * next_loss + config.terminal_weight * terminal_loss + auxiliary
+        return total, {"next": next_loss.detach(), "terminal": terminal_loss.detach(), **terms}
 
 
 def draw_nodes(clips: int, blocks: int, steps: int, generator: torch.Generator) -> Int[Tensor, "b blocks"]:
@@ -64,57 +82,3 @@ def node_of_each_block(
     clips = torch.arange(index.shape[0], device=index.device)[:, None]
     blocks = torch.arange(index.shape[1], device=index.device)[None, :]
     return rearrange(split[clips, blocks, index], "b n v c s h w -> b v c (n s) h w")
-
-
-def trajectory_regression_loss(
-    student: WorldModel,
-    nodes: Float[Tensor, "b k v c u h w"],
-    clean: Float[Tensor, "b v c t h w"],
-    action_maps: Float[Tensor, "b v a t #h #w"] | None,
-    index: Int[Tensor, "b blocks"],
-    *,
-    mask: Float[Tensor, "b v t h w"] | None,
-    views: Sequence[str],
-    fps: Float[Tensor, " b"] | None = None,
-    spec: CausalSpec,
-    config: TrajectoryRegressionConfig,
-    perceptual: PerceptualDistance | None = None,
-) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
-    """Regression of the next node and of the clean end, plus the auxiliaries against the teacher's clean end.
-
-    Returns:
-        The weighted total, and its parts.
-
-    Args:
-        nodes: the teacher's states, observed frame left out.
-        clean: the history that the teacher saw, observed frame included.
-        index: node of each block, see :func:`draw_nodes`.
-        mask: robot masks at latent resolution, or None where no robot term is wanted.
-    """
-    first = clean[..., :1, :, :]
-    levels = torch.tensor(spec.sigmas, device=nodes.device, dtype=nodes.dtype)
-    state = with_observed_frame(first, node_of_each_block(nodes, index, spec.block_size))
-    following = with_observed_frame(first, node_of_each_block(nodes, index + 1, spec.block_size))
-    end = with_observed_frame(first, nodes[:, -1])
-    sigma, sigma_next = levels[index], levels[index + 1]
-    velocity = student.forward_teacher_forcing(
-        state, clean, sigma, action_maps=action_maps, spec=spec, views=views, fps=fps
-    ).float()
-    here = broadcast_sigma(frame_sigmas(sigma, spec.block_size))
-    there = broadcast_sigma(frame_sigmas(sigma_next, spec.block_size))
-    stepped = state + (there - here) * velocity
-    predicted = state - here * velocity
-    # Frame 0 is the observation in both: it adds nothing and is left out of the means.
-    next_loss = spec.steps * ((stepped - following)[..., 1:, :, :] ** 2).mean()
-    terminal_loss = ((predicted - end)[..., 1:, :, :] ** 2).mean()
-    auxiliary, terms = auxiliary_losses(
-        predicted,
-        end,
-        mask=mask,
-        views=views,
-        block_size=spec.block_size,
-        weights=config.auxiliary,
-        perceptual=perceptual,
-    )
-    total = config.next_weight * next_loss + config.terminal_weight * terminal_loss + auxiliary
-    return total, {"next": next_loss.detach(), "terminal": terminal_loss.detach(), **terms}
