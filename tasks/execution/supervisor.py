@@ -50,14 +50,8 @@ def run_supervised(action: Callable[[], object], *, continues: bool) -> None:
     def stop(number: int, _frame: FrameType | None) -> None:
         raise _StoppedError(number)
 
-    def pause(_number: int, _frame: FrameType | None) -> None:
-        os.killpg(child, signal.SIGSTOP)
-        os.kill(os.getpid(), signal.SIGSTOP)  # returns when the shell continues this process
-        os.killpg(child, signal.SIGCONT)
-
     again = "; the same command continues" if continues else ""
     try:
-        signal.signal(signal.SIGTSTP, pause)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, stop)
         _, status = os.waitpid(child, 0)

@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -269,21 +269,12 @@ def test_two_commands_do_not_write_into_one_folder(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["run"]
 
 
-def make_lock_a_folder(store: Path, key: str) -> None:
-    (store / "count" / f".{key}.lock").mkdir(parents=True)
-
-
-def make_step_a_link(store: Path, key: str) -> None:
-    store.mkdir()
-    (store.parent / "disk").mkdir()
-    (store / "count").symlink_to(store.parent / "disk", target_is_directory=True)
-
-
-@pytest.mark.parametrize("make", [make_lock_a_folder, make_step_a_link])
-def test_an_odd_store_ends_in_one_message(tmp_path: Path, make: Callable[[Path, str], None]) -> None:
+def test_a_step_whose_folder_leads_out_of_the_store_is_refused(tmp_path: Path) -> None:
     store = ArtifactStore(tmp_path / "store")
-    make(store.root, store.key("count", 1, CountConfig(), {}))
-    with pytest.raises(ArtifactError, match=r"cannot be written|link out of the store"):
+    store.root.mkdir()
+    (tmp_path / "disk").mkdir()
+    (store.root / "count").symlink_to(tmp_path / "disk", target_is_directory=True)
+    with pytest.raises(ArtifactError, match="link out of the store"):
         store.run("count", 1, count, CountConfig(), {})
 
 
@@ -300,5 +291,3 @@ def test_a_read_only_store_serves_finished_artifacts(tmp_path: Path, monkeypatch
     monkeypatch.setattr(store_module, "write_json_atomic", refuse)
     store = ArtifactStore(tmp_path / "store")
     assert store.run("count", 1, count, config, {}).path == first.path
-    with pytest.raises(ArtifactError, match=r"cannot be written[\s\S]*Read-only file system"):
-        store.run("count", 2, count, config, {})

@@ -80,18 +80,9 @@ def _degrees(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
     return values
 
 
-def _beyond_limit(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    values[int(random.integers(len(values))), int(random.integers(_JOINTS))] = random.choice([-1, 1]) * 7.5
-    return values
-
-
 def _raw_gripper(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
     values[:, _JOINTS] = 255 * values[:, _JOINTS]
     return values
-
-
-def _slow_clock(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    return values * np.float32(random.uniform(1.1, 1.6))
 
 
 def _lost_frames(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -104,11 +95,6 @@ def _without_column(episode: _Episode, random: np.random.Generator) -> None:
     pq.write_table(pq.read_table(episode.table).drop_columns([name]), episode.table)
 
 
-def _fewer_rows(episode: _Episode, random: np.random.Generator) -> None:
-    table = pq.read_table(episode.table)
-    pq.write_table(table.slice(0, len(table) - int(random.integers(1, 6))), episode.table)
-
-
 def _uneven_rows(episode: _Episode, random: np.random.Generator) -> None:
     table = pq.read_table(episode.table)
     rows = table["observation.state"].to_pylist()
@@ -119,10 +105,6 @@ def _uneven_rows(episode: _Episode, random: np.random.Generator) -> None:
     pq.write_table(table, episode.table)
 
 
-def _video_of_other_rate(episode: _Episode, random: np.random.Generator) -> None:
-    encode_video(episode.video(random), pictures(random), FPS * 1.5, preset="ultrafast")
-
-
 def _video_of_other_length(episode: _Episode, random: np.random.Generator) -> None:
     frames = pictures(random, NUM_FRAMES + int(random.integers(1, 8)))
     encode_video(episode.video(random), frames, FPS, preset="ultrafast")
@@ -130,25 +112,18 @@ def _video_of_other_length(episode: _Episode, random: np.random.Generator) -> No
 
 KINDS = (
     Kind("video_truncated", _on_video(files.truncate), ("truncated_video",)),
-    Kind("video_empty", _on_video(files.empty), ("truncated_video",)),
-    Kind("video_garbage", _on_video(files.garbage), ("unreadable", "truncated_video")),
     Kind("video_missing", _on_video(files.missing), ("missing_file",)),
     Kind("video_pipe", _on_video(files.pipe), ("special_file", "missing_file")),
     Kind("video_linked_out", _on_video(files.link_out), ("path_traversal",)),
     Kind("video_claims_frames", _on_video(files.claim_frames), ("too_large", "truncated_video", "out_of_memory")),
-    Kind("video_other_rate", _video_of_other_rate, ("wrong_fps",)),
     Kind("video_too_long", _video_of_other_length, ("length_mismatch",)),
     Kind("table_truncated", _on_table(files.truncate), ("unreadable",)),
     Kind("table_missing", _on_table(files.missing), ("missing_file",)),
     Kind("column_missing", _without_column, ("missing_column",)),
-    Kind("rows_missing", _fewer_rows, ("length_mismatch",)),
     Kind("rows_uneven", _uneven_rows, ("length_mismatch",)),
     Kind("state_not_finite", _on_state(_not_finite), ("nan_state",)),
-    Kind("action_not_finite", _on_state(_not_finite, "action"), ("nan_state",)),
     Kind("joints_in_degrees", _on_state(_degrees), ("joint_out_of_range",)),
-    Kind("joint_beyond_limit", _on_state(_beyond_limit), ("joint_out_of_range",)),
     Kind("gripper_raw", _on_state(_raw_gripper), ("invalid_gripper",)),
-    Kind("clock_slow", _on_state(_slow_clock, "timestamp"), ("wrong_fps",)),
     Kind("clock_jumps", _on_state(_lost_frames, "timestamp"), ("wrong_fps",)),
 )
 

@@ -57,26 +57,10 @@ StepFunction = Callable[[Any, Mapping[str, Path], Path], dict[str, Any]]
 
 
 @contextmanager
-def _changing(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into one message about the store."""
-    try:
-        yield
-    except OSError as error:
-        raise ArtifactError(
-            "A store's folder cannot be written",
-            where=path,
-            expected="a folder with write permission and room on its disk",
-            got=error.strerror,
-            next_step="correct its rights or remove what is in the way, or choose another folder",
-        ) from error
-
-
-@contextmanager
 def _lock_file(path: Path) -> Iterator[int]:
     """Open a lock file. ``flock`` ends with the process, also after kill -9."""
-    with _changing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         yield descriptor
     finally:
@@ -238,7 +222,7 @@ class ArtifactStore:
             distributed: the step shares its work among the processes of torchrun; otherwise the first process does it all.
 
         Raises:
-            ArtifactError: an input differs from its manifest, or the store cannot be written.
+            ArtifactError: an input differs from its manifest.
             WorldLineError: an error of the step; its unfinished work stays in ``<key>.partial/``.
         """
         digests = {name: self.input_digest(path) for name, path in sorted(inputs.items())}
@@ -275,12 +259,11 @@ class ArtifactStore:
             for name, path in sources.items():
                 if not is_remote(path):
                     verify_artifact(path, self.verify, f"Input {name}")
-            with _changing(partial):
-                if folder.exists():
-                    # Not an artifact without its manifest: somebody deleted the manifest, or copied half of the folder.
-                    shutil.rmtree(folder)
-                resumed = partial.exists()
-                partial.mkdir(parents=True, exist_ok=True)
+            if folder.exists():
+                # Not an artifact without its manifest: somebody deleted the manifest, or copied half of the folder.
+                shutil.rmtree(folder)
+            resumed = partial.exists()
+            partial.mkdir(parents=True, exist_ok=True)
             if (writers := partial / VOLATILE_FOLDER / _WRITERS).exists():
                 with exclusive_lock(writers):  # until helpers of a killed command have ended
                     pass
