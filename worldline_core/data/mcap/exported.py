@@ -1,12 +1,8 @@
 """This project's own MCAP files: episodes and rollouts written for Foxglove and ROS 2 tools, and episodes read back.
 
-Messages have Foxglove's schemas (protobuf) or those of ROS 2 (CDR), all of a frame stamped with the frame's time in
-nanoseconds: `/<view>/image` CompressedImage (png is exact, jpeg is not), `/<view>/calibration` CameraCalibration, `/tf`
-FrameTransform (cameras, tools), `/joint_states` and `/joint_commands` JointStates. In ROS 2 fixed cameras are in
-`/tf_static`. Everything else about an episode is one metadata record. The same input gives the same bytes.
-
-Unlike a recording of another tool, such a file describes itself: all messages of a frame have one time, so nothing is
-resampled; states and gripper openings are exact; robot masks are images.
+All messages of a frame have one time, so nothing is resampled: `/<view>/image` CompressedImage (png is exact, jpeg is not),
+`/<view>/calibration` CameraCalibration, `/tf` FrameTransform (cameras, tools; fixed cameras in ROS 2: `/tf_static`),
+`/joint_states` and `/joint_commands` JointStates. Everything else is one metadata record. The same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -57,13 +53,11 @@ def write_episode_mcap(
     *,
     encoding: Encoding = "protobuf",
 ) -> None:
-    """Write one episode; images are exact (png).
+    """Writes one episode; images are exact (png).
 
     Args:
         frames: by view, uint8 (episode.num_video_frames, H, W, 3) RGB.
         robot_masks: by view, bool (N, H, W).
-
-    Raises: RejectedInputError (length_mismatch) when frames and states differ in number.
     """
     streams = {("image", view): images for view, images in frames.items()}
     streams |= {("robot_mask", view): masks for view, masks in (robot_masks or {}).items()}
@@ -92,15 +86,13 @@ def write_rollout_mcap(
     T_base_ee: np.ndarray | None = None,
     encoding: Encoding = "protobuf",
 ) -> None:
-    """Write predicted videos, as JPEG of quality 95 (on average within 4 of 255).
+    """Writes predicted videos, as JPEG of quality 95 (on average within 4 of 255).
 
     Args:
-        frames_by_view: uint8 (N, H, W, 3) RGB by view.
-        metadata: what to remember about the rollout (method, seed, checkpoint).
-        cameras: calibration to show along with the images; their size must be that of the images.
+        frames_by_view: uint8 (N, H, W, 3) RGB by view, of one length.
+        metadata: facts about the rollout (method, seed, checkpoint).
+        cameras: calibration for the size of the images.
         T_base_ee: (N, A, 4, 4) commanded tool poses.
-
-    Raises: DataError when the views differ in length or there are none.
     """
     lengths = {view: len(images) for view, images in frames_by_view.items()}
     if len(set(lengths.values())) != 1:
@@ -205,9 +197,7 @@ def _metadata(episode: Episode, views: list[str]) -> dict[str, str]:
 def _image(frame: np.ndarray, frame_id: str, image_format: Literal["png", "jpeg"]) -> dict[str, Any]:
     pixels = frame.astype(np.uint8) * 255 if frame.dtype == bool else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
     settings = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if image_format == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
-    done, encoded = cv2.imencode(f".{image_format}", pixels, settings)
-    if not done:
-        raise DataError("Image cannot be compressed", where=frame_id, expected=image_format, got=str(frame.shape))
+    _, encoded = cv2.imencode(f".{image_format}", pixels, settings)
     return {"frame_id": frame_id, "data": encoded.tobytes(), "format": image_format}
 
 
@@ -301,10 +291,7 @@ def _definition(name: str) -> str:
 
 
 def exported_episode_id(file: McapFile) -> str:
-    """The episode id in a file's metadata.
-
-    Raises: RejectedInputError (unreadable) when the file is damaged or holds no episode of this project.
-    """
+    """The episode id in a file's metadata."""
     with expect_layout(file.path, f"metadata {EPISODE_METADATA}"):
         return str(_read_metadata(file)["episode_id"])
 
@@ -322,13 +309,8 @@ def read_exported_episode(file: McapFile) -> LoadedEpisode:
 
 def _read_metadata(file: McapFile) -> dict[str, Any]:
     if EPISODE_METADATA not in file.metadata:
-        raise RejectedInputError(
-            "unreadable",
-            "MCAP file holds no episode of a known layout",
-            where=file.path,
-            expected=f"a metadata record {EPISODE_METADATA}",
-            got=", ".join(file.metadata) or "none",
-        )
+        what = f"MCAP file holds no episode of a known layout (metadata {EPISODE_METADATA})"
+        raise RejectedInputError("unreadable", what, where=file.path, got=", ".join(file.metadata))
     where = f"{file.path}, {EPISODE_METADATA}"
     about = {key: parse_json(value, where) for key, value in file.metadata[EPISODE_METADATA].items()}
     if about.get("format_version") != FORMAT_VERSION:

@@ -66,9 +66,8 @@ class Stream:
     Attributes:
         stamps_ns: times in the messages' headers; None where the schema has none.
         log_ns: times at which the recorder wrote them.
-        values: decoded contents; empty for images.
-        key_frames: of a video, whether decoding can begin with a message.
-        frame: coordinate frame named by the first image.
+        values: decoded contents; empty for images, whose coordinate frame is `frame`.
+        key_frames: messages of a video with which decoding can begin.
     """
 
     topic: str
@@ -139,10 +138,7 @@ class McapFile:
 
     @property
     def first_log_ns(self) -> int:
-        """Log time of the first message.
-
-        Raises: RejectedInputError (missing_topic) for a file without messages.
-        """
+        """Log time of the first message; a file without messages is rejected (missing_topic)."""
         statistics = self._summary.statistics if self._summary is not None else None
         if statistics is None:
             first = min((record.log_time for _, _, record in self._records(None)), default=None)
@@ -153,7 +149,6 @@ class McapFile:
         return first
 
     def check_topics(self, wanted: Collection[str]) -> None:
-        """Raises: RejectedInputError (missing_topic) listing the missing topics and those in the file."""
         missing = sorted(set(wanted) - set(self.topics))
         if missing:
             raise RejectedInputError(
@@ -190,7 +185,6 @@ class McapFile:
                     where=f"{self.path}, topic {topic}",
                     expected=" or ".join(expected),
                     got=f"{kind} ({self.topics.get(topic, '')})",
-                    next_step="correct the topics in curate.sources[]",
                 )
             stream = streams.setdefault(topic, Stream(topic, kind))
             stream.log_ns.append(log_ns)
@@ -233,14 +227,8 @@ def _damage_as_rejection(where: object) -> Iterator[None]:
     try:
         yield
     except _DAMAGE as error:
-        raise RejectedInputError(
-            "unreadable",
-            "MCAP file is damaged or was not finished",
-            where=where,
-            expected="a complete MCAP file",
-            got=repr(error)[:200],
-            next_step="copy the file again, or repair it with `mcap recover`",
-        ) from error
+        what, next_step = "MCAP file is damaged or was not finished", "copy the file again, or try `mcap recover`"
+        raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200], next_step=next_step) from error
 
 
 def check_chunks(path: Path, where: object) -> list[int]:
@@ -263,9 +251,8 @@ def check_chunks(path: Path, where: object) -> list[int]:
                     raise ValueError("a chunk behind the end of the data")
                 unpacked = _unpacked_bytes(stream, length)
                 if unpacked > MAX_CHUNK_BYTES:
-                    raise too_large(
-                        "MCAP chunk is too large", where=where, limit=MAX_CHUNK_BYTES, got=unpacked, unit="bytes"
-                    )
+                    what = "MCAP chunk is too large"
+                    raise too_large(what, where=where, limit=MAX_CHUNK_BYTES, got=unpacked, unit="bytes")
                 chunks.append(position)
             ended = ended or opcode == _DATA_END
             position += 9 + length
@@ -301,8 +288,8 @@ class ImageTrack:
         around_ns: log times between which the topic's messages were counted; None: the file's beginning or end.
         order: (n,) index in the file of the i-th message in time.
         chosen: (t,) index in time of each frame's image; ascending, an image may repeat.
-        key_frames: of a video, (n,) in order of time, whether decoding can begin there.
-        camera: the images must have its calibrated size; None: any size.
+        key_frames: (n,) frames of a video, in order of time, with which decoding can begin.
+        camera: the images must have its size; None: any size.
     """
 
     file: McapFile
@@ -315,11 +302,7 @@ class ImageTrack:
     camera: CameraTrack | None = None
 
     def frames(self) -> Iterator[np.ndarray]:
-        """uint8 (H, W, 3) RGB of each frame, in order.
-
-        Raises: RejectedInputError: unreadable, truncated_video, too_large; missing_calibration when the images are not of
-            the size that is calibrated.
-        """
+        """uint8 (H, W, 3) RGB of each frame, in order; any fault is a RejectedInputError."""
         where = f"{self.file.path}, topic {self.topic}"
         decoded = self._video(where) if self.kind == "video" else self._images(where)
         number, image = next(decoded)
@@ -383,8 +366,7 @@ class ImageTrack:
 def frames_after_loss(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray) -> np.ndarray:
     """(n,) bool: video frames between a gap of more than 1.5 steps and the next key frame.
 
-    After a lost message a decoder returns wrong pictures, without an error, until the next key frame; so the loss is detected
-    by the times of the messages.
+    After a lost message a decoder returns wrong pictures, without an error, until the next key frame.
     """
     lost = np.concatenate([[False], np.diff(times_ns) > 1.5 * step_ns])
     last_loss = np.maximum.accumulate(np.where(lost, np.arange(len(lost)), -1))
@@ -421,14 +403,8 @@ def _picture(frame: av.VideoFrame, where: str) -> tuple[int, np.ndarray]:
 
 
 def _lost_frame(where: str) -> RejectedInputError:
-    expected = "one frame per message, each decodable from those before it"
-    return RejectedInputError(
-        "truncated_video",
-        "Video frames are missing or damaged",
-        where=where,
-        expected=expected,
-        next_step="cut the recording at the damage",
-    )
+    what, next_step = "Video frames are missing or damaged", "cut the recording at the damage"
+    return RejectedInputError("truncated_video", what, where=where, next_step=next_step)
 
 
 def _raw_pixels(image: RawImage, where: str) -> np.ndarray:

@@ -228,10 +228,7 @@ class MessageDecoder:
         self._channels: dict[int, tuple[Kind, Callable[[bytes], Any]]] = {}
 
     def decode(self, channel: Channel, schema: Schema | None, data: bytes) -> tuple[Kind, int | None, Any]:
-        """Kind of a message, its header time [ns] (None where the schema has none), and its content.
-
-        Raises: RejectedInputError: unknown_schema; unreadable where the bytes are not of the schema.
-        """
+        """Kind of a message, its header time [ns] (None where the schema has none), and its content."""
         if channel.id not in self._channels:
             self._channels[channel.id] = self._channel(channel, schema)
         kind, decode = self._channels[channel.id]
@@ -239,13 +236,8 @@ class MessageDecoder:
             raw = decode(data)
             return kind, _header_time(raw), _READERS[kind](raw)
         except _FAULTS as error:
-            raise RejectedInputError(
-                "unreadable",
-                "Message cannot be decoded",
-                where=f"{self._where}, topic {channel.topic}",
-                expected=schema.name if schema else "a schema",
-                got=repr(error)[:200],
-            ) from error
+            what, where = "Message cannot be decoded", f"{self._where}, topic {channel.topic}"
+            raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200]) from error
 
     def _channel(self, channel: Channel, schema: Schema | None) -> tuple[Kind, Callable[[bytes], Any]]:
         name = schema.name if schema is not None else ""
@@ -271,10 +263,5 @@ class MessageDecoder:
             found = (factory.decoder_for(channel.message_encoding, schema) for factory in self._factories)
             return next((decoder for decoder in found if decoder is not None), None)
         except _FAULTS as error:
-            raise RejectedInputError(
-                "unknown_schema",
-                "Schema definition cannot be read",
-                where=f"{self._where}, topic {channel.topic}",
-                expected=schema.name if schema else "a schema",
-                got=repr(error)[:200],
-            ) from error
+            what, where = "Schema definition cannot be read", f"{self._where}, topic {channel.topic}"
+            raise RejectedInputError("unknown_schema", what, where=where, got=repr(error)[:200]) from error

@@ -36,8 +36,7 @@ _KINDS: dict[str, tuple[Kind, ...]] = {
     "transforms": ("transforms",),
 }
 _READING_MARGIN_NS = 10**9
-"""Messages logged up to this long before and after an episode are read too: their own time may lie within it, and the instants at
-its ends need a message on both sides."""
+"""Messages logged up to this long before and after an episode are read too: their own time may be within it."""
 _TOGETHER_NS = 1_000_000
 """Topics that begin within a millisecond begin together: no image is left out for that."""
 _FIXED_TOLERANCE = 1e-6
@@ -51,24 +50,15 @@ class Segment:
     Attributes:
         name: distinguishes it from others of the file; empty for a whole file.
         start_ns, stop_ns: log times; None: from the beginning, to the end.
-        relative: the times count from the file's first message.
         fault: why it cannot be read, where that is known already.
     """
 
     name: str = ""
     start_ns: int | None = None
     stop_ns: int | None = None
-    relative: bool = False
     instruction: str | None = None
     outcome: Outcome | None = None
     fault: RejectedInputError | None = None
-
-    def log_times(self, file: McapFile) -> tuple[int | None, int | None]:
-        """First and last log time [ns]."""
-        if not self.relative:
-            return self.start_ns, self.stop_ns
-        first = file.first_log_ns
-        return first + (self.start_ns or 0), None if self.stop_ns is None else first + self.stop_ns
 
 
 @dataclass(frozen=True)
@@ -85,8 +75,8 @@ class _Recording:
 
     def __init__(self, config: McapTopicsSourceConfig, file: McapFile, segment: Segment) -> None:
         self.config, self.file = config, file
-        start, stop = segment.log_times(file)
-        self.start_log_ns = start
+        self.start_log_ns = start = segment.start_ns
+        stop = segment.stop_ns
         self.around_ns = (
             None if start is None else max(start - _READING_MARGIN_NS, 0),
             None if stop is None else stop + _READING_MARGIN_NS,
@@ -141,13 +131,12 @@ class _Recording:
         taken: list[int] = []
         rows: list[list[float]] = []
         for number, value in enumerate(stream.values):
-            if not isinstance(value, Joints):
-                columns, numbers = readings.columns, value
-            elif readings.names is not None and set(readings.names) <= set(value.names):
-                columns, numbers = [value.names.index(name) for name in readings.names], value.position
-            else:
-                columns, numbers = None, ()
-            if columns is not None and max(columns) < len(numbers):
+            columns, numbers = readings.columns or (), value
+            if isinstance(value, Joints):
+                known = set(readings.names or ()) <= set(value.names)
+                columns = [value.names.index(name) for name in readings.names or () if known]
+                numbers = value.position
+            if columns and max(columns) < len(numbers):
                 taken.append(number)
                 rows.append([numbers[column] for column in columns])
         if not rows:
@@ -158,8 +147,13 @@ class _Recording:
                 expected=", ".join(readings.names or map(str, readings.columns or ())),
                 got=", ".join(sorted({name for v in stream.values for name in getattr(v, "names", ())})) or "an array",
             )
-        arrivals = in_order(self.clocks.times_ns(stream)[taken], self.at(stream.topic))
-        return _Signal(stream.topic, arrivals.times_ns, np.array(rows, np.float64)[arrivals.order])
+        return self._ordered(stream, np.array(rows, np.float64), taken)
+
+    def _ordered(self, stream: Stream, values: np.ndarray, taken: list[int] | None = None) -> _Signal:
+        """Values (n, d) of the taken messages (default: all) in order of time."""
+        times = self.clocks.times_ns(stream)
+        arrivals = in_order(times if taken is None else times[taken], self.at(stream.topic))
+        return _Signal(stream.topic, arrivals.times_ns, values[arrivals.order])
 
     def _tool(self, topic: str) -> tuple[_Signal, str]:
         """Poses (n, 7) of a topic, and the frame that they are given in."""
@@ -169,8 +163,7 @@ class _Recording:
         if len(frames) != 1:
             what = "Tool poses change their frame"
             raise RejectedInputError("invalid_tool_pose", what, where=self.at(topic), got=", ".join(frames))
-        arrivals = in_order(self.clocks.times_ns(stream), self.at(topic))
-        return _Signal(topic, arrivals.times_ns, values[arrivals.order]), frames[0]
+        return self._ordered(stream, values), frames[0]
 
     def _calibration(self, topic: str) -> Calibration:
         """The calibration around the episode, or in the whole file where it was sent only once."""
@@ -241,14 +234,9 @@ class _Recording:
         begin = int(np.searchsorted(primary, first - _TOGETHER_NS))
         grid = instants(int(primary[begin]), last, config.fps) if begin < len(primary) else np.zeros(0, np.int64)
         if len(grid) < 2:
-            raise RejectedInputError(
-                "too_short",
-                "Topics overlap for less than two frames",
-                where=self.file.path,
-                expected=f"at least {1 / config.fps:.3f} s",
-                got=f"{max(last - first, 0) / 1e9:.3f} s",
-                next_step="if the topics' clocks differ, set time: log or time_offsets_ms",
-            )
+            what, next_step = "Topics overlap for less than two frames", "set time: log or time_offsets_ms"
+            got = f"{max(last - first, 0) / 1e9:.3f} s"
+            raise RejectedInputError("too_short", what, where=self.file.path, got=got, next_step=next_step)
         return grid
 
     def chosen_images(self, view: str, grid: np.ndarray) -> np.ndarray:
@@ -277,12 +265,7 @@ class _Recording:
                 where=where,
                 expected=f"an image within {config.max_image_distance_frames} frames of every instant",
                 got=f"{distance.max():.2f} frames at {at_s:.3f} s",
-                evidence={
-                    "view": view,
-                    "gap_s": float(2 * distance.max() / config.fps),
-                    "at_s": at_s,
-                    "instants_without": int(np.count_nonzero(distance > config.max_image_distance_frames)),
-                },
+                evidence={"view": view, "gap_s": float(2 * distance.max() / config.fps), "at_s": at_s},
             )
         return chosen
 
@@ -298,7 +281,6 @@ class _Recording:
                     "truncated_video",
                     "Video frames depend on a message that is missing",
                     where=f"{self.at(stream.topic)}, frame {first}",
-                    expected=f"a message every {arrivals.median_step_ns / 1e6:.1f} ms between key frames",
                     got=f"{int(spoiled.sum())} of {len(chosen)} frames after a gap, before the next key frame",
                     next_step="cut the recording at the gap",
                     evidence={"first_frame": first, "frames": int(spoiled.sum())},
@@ -352,7 +334,11 @@ def read_topics_episode(
     if commands:
         action, beyond = recording.arm_vectors(commands, grid)
         outside += beyond
-    state_names = _state_names(config)
+    state_names: list[str] = []
+    for arm in config.arms:
+        joints = arm.state.joints
+        given = joints.names or tuple(f"joint_{number}" for number in range(1, joints.width + 1))
+        state_names += [f"{arm.name}/{name}" for name in (*given, "gripper")]
     tools = recording.tool_poses(grid)
     times = [each.times_ns for each in (*recording.images.values(), *recording.all_signals())]
     times += recording.moving_times()
@@ -373,7 +359,7 @@ def read_topics_episode(
         T_base_ee=tools,
         gripper=None if tools is None else state[:, [name.endswith("/gripper") for name in state_names]],
         primary_view=config.timing_view,
-        state_names=state_names,
+        state_names=tuple(state_names),
         conventions={
             "layout": LAYOUT,
             "time": config.time,
@@ -385,12 +371,3 @@ def read_topics_episode(
     )
     tracks = {view: recording.track(view, chosen[view], cameras.tracks.get(view)) for view in config.views}
     return LoadedEpisode(episode, tuple(config.views), lambda view: tracks[view].frames(), distortions=cameras.lenses)
-
-
-def _state_names(config: McapTopicsSourceConfig) -> tuple[str, ...]:
-    names: list[str] = []
-    for arm in config.arms:
-        joints = arm.state.joints
-        given = joints.names or tuple(f"joint_{number}" for number in range(1, joints.width + 1))
-        names += [f"{arm.name}/{name}" for name in (*given, "gripper")]
-    return tuple(names)

@@ -2,8 +2,7 @@
 
 A message has up to two times: that of its header, and that at which the recorder wrote it (log). header <= log, and their
 smallest difference over a topic is the offset between the clocks plus the shortest transport time, so topics whose
-smallest differences disagree were stamped by clocks that disagree (Paxson, On calibrating measurements of packet transit
-times, 1998).
+smallest differences disagree were stamped by clocks that disagree (Paxson 1998).
 """
 
 from __future__ import annotations
@@ -96,10 +95,7 @@ class Arrivals:
 
 
 def in_order(times_ns: np.ndarray, where: str) -> Arrivals:
-    """Sorts times (n > 0,) given in the order of the file.
-
-    Raises: RejectedInputError (clock_jump) for a message more than MAX_DISORDER_S earlier than one before it.
-    """
+    """Sorts times (n > 0,) given in the order of the file; more than MAX_DISORDER_S out of order is a clock_jump."""
     back_s = (np.maximum.accumulate(times_ns) - times_ns) / 1e9
     if back_s.max() > MAX_DISORDER_S:
         first = int(np.argmax(back_s > MAX_DISORDER_S))
@@ -120,14 +116,8 @@ def in_order(times_ns: np.ndarray, where: str) -> Arrivals:
 def check_gaps(
     times_ns: np.ndarray, start_ns: int, stop_ns: int, *, max_gap_s: float, max_trim_s: float, where: str
 ) -> None:
-    """Raises: RejectedInputError (time_gap) when messages are missing for too long, inside or at the ends.
-
-    Args:
-        times_ns: (n > 0,) ascending.
-        start_ns, stop_ns: what the topic should cover.
-        max_gap_s: between two messages.
-        max_trim_s: before the first and after the last.
-    """
+    """Raises: RejectedInputError (time_gap) when messages (n > 0, ascending) are missing for too long between start and stop:
+    `max_gap_s` between two of them, `max_trim_s` before the first and after the last."""
     # From the last message before to the first one after: an instant near an end lies between those.
     first = max(int(np.searchsorted(times_ns, start_ns, side="right")) - 1, 0)
     last = min(int(np.searchsorted(times_ns, stop_ns)), len(times_ns) - 1)
@@ -165,10 +155,7 @@ def nearest(times_ns: np.ndarray, grid_ns: np.ndarray) -> np.ndarray:
 
 
 def resampled(times_ns: np.ndarray, values: np.ndarray, grid_ns: np.ndarray, *, hold: bool = False) -> np.ndarray:
-    """(t, d) of values (n, d) at strictly ascending times; linear or, with `hold`, the last one up to each instant.
-
-    Constant beyond the ends.
-    """
+    """(t, d) of values (n, d) at strictly ascending times; linear, constant beyond the ends, or with `hold` the last one."""
     if hold:
         return values[np.maximum(np.searchsorted(times_ns, grid_ns, side="right") - 1, 0)]
     times, grid = times_ns - times_ns[0], grid_ns - times_ns[0]
@@ -196,11 +183,7 @@ def checked_poses(poses: Sequence[tuple[float, ...]], reason: Reason, where: str
 
 @dataclass
 class _Edge:
-    """Poses of a frame in its parent, in the order of the file.
-
-    Attributes:
-        static: all of them came over topics of static transforms.
-    """
+    """Poses of a frame in its parent, in the order of the file; `static`: all came over topics of static transforms."""
 
     parent: str
     where: str
@@ -264,7 +247,6 @@ class TransformTree:
         return bool(set(self._chain(base)) & set(self._chain(frame)))
 
     def moving_times(self, base: str, frame: str) -> list[np.ndarray]:
-        """Times of every moving transform between two connected frames."""
         edges = [self._edges[child] for side in self._between(base, frame) for child in side]
         return [edge.ordered[0] for edge in edges if edge.moving]
 
@@ -274,14 +256,8 @@ class TransformTree:
         common = next((name for name in down if name in up), None)
         if common is None:
             known = ", ".join(f"{edge.parent} -> {child}" for child, edge in sorted(self._edges.items()))
-            raise RejectedInputError(
-                "missing_calibration",
-                "No transforms lead from the base to a frame",
-                where=self._where,
-                expected=f"{base} -> {frame}",
-                got=known or "no transforms",
-                next_step="correct base_frame and the frames, or name all topics of transforms",
-            )
+            what, expected = "No transforms lead from the base to a frame", f"{base} -> {frame}"
+            raise RejectedInputError("missing_calibration", what, where=self._where, expected=expected, got=known)
         return up[: up.index(common)], down[: down.index(common)]
 
     def poses(self, base: str, frame: str, grid_ns: np.ndarray) -> np.ndarray:
@@ -330,22 +306,21 @@ def _intrinsics(calibration: Calibration, *, rectified: bool, where: object) -> 
     K and P belong to the whole sensor (ROS REP 104); a region is cut out first, then binned.
     """
 
-    def refused(what: str, expected: object, got: object) -> RejectedInputError:
-        return RejectedInputError("singular_intrinsics", what, where=where, expected=expected, got=got)
+    def refused(what: str, got: object) -> RejectedInputError:
+        return RejectedInputError("singular_intrinsics", what, where=where, got=got)
 
     numbers, count = (calibration.P, 12) if rectified else (calibration.K, 9)
     if len(numbers) != count:
-        name = "P" if rectified else "K"
-        raise refused("Calibration has a wrong number of values", f"{count} values of {name}", len(numbers))
+        raise refused(f"Calibration has not {count} values of {'P' if rectified else 'K'}", len(numbers))
     K = np.array(numbers, np.float64).reshape(3, -1)[:, :3]
     height, width = calibration.height, calibration.width
     if min(height, width) < 1:
-        raise refused("Calibration has no image size", "at least one pixel", f"{width}x{height}")
+        raise refused("Calibration has no image size", f"{width}x{height}")
     transform = ImageTransform.of((height, width))
     x, y, region_width, region_height = calibration.roi
     if region_width and region_height:
         if x + region_width > width or y + region_height > height:
-            raise refused("Region of interest leaves the image", f"inside of {width}x{height}", calibration.roi)
+            raise refused(f"Region of interest leaves the image of {width}x{height}", calibration.roi)
         transform = transform.crop(y, x, (region_height, region_width))
     across, down = max(calibration.binning[0], 1), max(calibration.binning[1], 1)
     if (across, down) != (1, 1):

@@ -69,7 +69,7 @@ class McapSource:
 class McapTopicsSource:
     """Reads every *.mcap below a folder, or one file; ids are label-path[-episode].
 
-    A file whose markers cannot be read is listed as one episode, which then says why.
+    A file in which no episodes can be looked for is listed as one, which then says why.
     """
 
     looked_for = "*.mcap, and in them what `episodes` declares"
@@ -81,8 +81,7 @@ class McapTopicsSource:
             stem = f"{config.label}-{name.removesuffix('.mcap')}"
             try:
                 checked = _checked(path, name, root)
-                file = McapFile(checked) if isinstance(config.episodes, Markers) else None
-                found = list(_segments(config.episodes, file, name))
+                found = list(_segments(config.episodes, checked, name))
             except RejectedInputError as error:
                 found = [Segment(fault=error)]
             for segment in found:
@@ -98,17 +97,18 @@ class McapTopicsSource:
         return read_topics_episode(self._config, McapFile(path), segment, episode_id, self._config.scene or stem)
 
 
-def _segments(rule: WholeFiles | TimeRanges | Markers, file: McapFile | None, relative_path: str) -> Iterator[Segment]:
-    """Episodes of one file; only markers look into it."""
+def _segments(rule: WholeFiles | TimeRanges | Markers, path: AnyPath, relative_path: str) -> Iterator[Segment]:
+    """Episodes of one file."""
     if isinstance(rule, WholeFiles):
         yield Segment()
     elif isinstance(rule, TimeRanges):
         for part in rule.ranges:
             if fnmatchcase(relative_path, part.file):
-                start, stop = round(part.start_s * 1e9), round(part.stop_s * 1e9)
-                yield Segment(part.name, start, stop, relative=True, instruction=part.instruction)
-    elif file is not None:
-        yield from _between_markers(rule, file)
+                first = McapFile(path).first_log_ns
+                start, stop = (first + round(seconds * 1e9) for seconds in (part.start_s, part.stop_s))
+                yield Segment(part.name, start, stop, part.instruction)
+    else:
+        yield from _between_markers(rule, McapFile(path))
 
 
 def _between_markers(rule: Markers, file: McapFile) -> Iterator[Segment]:
@@ -128,10 +128,9 @@ def _between_markers(rule: Markers, file: McapFile) -> Iterator[Segment]:
         if start is not None:
             begun = log_ns, start
         elif stop is not None and begun is not None:
-            instruction = begun[1].groupdict().get("instruction")
             outcome = stop.groupdict().get("outcome")
             known = outcome if outcome in ("success", "failure") else None
-            yield Segment(f"{count:04d}", begun[0], log_ns, instruction=instruction, outcome=known)
+            yield Segment(f"{count:04d}", begun[0], log_ns, begun[1].groupdict().get("instruction"), known)
             count, begun = count + 1, None
     if begun is not None:
         yield _unpaired(rule, file, count, "the end of the file")
