@@ -190,5 +190,3 @@ def test_a_compression_that_it_does_not_know_is_refused(patch: PatchTokenizer) -
     other = PatchTokenizer(PatchTokenizerConfig(spatial_compression=12))
     with pytest.raises(ConfigError, match="compression 4, 8, 16 or 32"):
         SmallDecoderConfig.of(other, "")
-    with pytest.raises(ConfigError, match="A decoder does not encode"):
-        SmallDecoder(of(patch).config).encode(scenes())

@@ -59,14 +59,6 @@ def test_a_block_after_a_cache_has_no_clean_frame(build: Build) -> None:
     assert bool((build().forward_block(latents, sigma, KVCache(1, 3))[:, :, :, 0] != 0).any())
 
 
-def test_sample_prediction_returns_the_velocity_of_the_emitted_latents(build: Build) -> None:
-    latents, _, sigma = sample()
-    as_velocity, as_sample = build(prediction="velocity"), build(prediction="sample")
-    emitted = as_velocity(latents, sigma).velocity
-    expected = (latents - emitted) / sigma.clamp_min(0.05).view(-1, 1, 1, 1, 1, 1)
-    torch.testing.assert_close(as_sample(latents, sigma).velocity[:, :, :, 1:], expected[:, :, :, 1:])
-
-
 def test_first_frame_residual_adds_the_clean_first_frame(build: Build) -> None:
     latents, _, sigma = sample()
     emitted = build(prediction="velocity")(latents, sigma).velocity + latents[:, :, :, :1]

@@ -23,7 +23,7 @@ def test_a_small_decoder_shows_the_same_latents_otherwise(inputs: dict[str, Path
     tokenizer = load_tokenizer(inputs["tokenizer"])
     torch.manual_seed(0)
     for name, folder in ((tokenizer_fingerprint(tokenizer, inputs["tokenizer"]), "own"), ("0123", "foreign")):
-        SmallDecoder(SmallDecoderConfig.of(tokenizer, name, width=4, depth=1)).save(tmp_path / folder)
+        SmallDecoder(SmallDecoderConfig.of(tokenizer, name, width=4, depth=1), tokenizer).save(tmp_path / folder)
     own = tmp_path / "own"
     config = CONFIG.model_copy(update={"sampler": BlockCausalConfig(decoder=own)})
     assert rollout(config, inputs, tmp_path / "rollout")["predictions"] == 4

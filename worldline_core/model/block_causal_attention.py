@@ -9,13 +9,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from einops import rearrange
 from torch import Tensor
 
-from worldline_core.errors import ConfigError, DataError
+from worldline_core.errors import DataError
 from worldline_core.model.layers import Rotation, grouped_attention, rotate
 
 
@@ -74,10 +73,8 @@ class TeacherForcingAttention:
     """One pass over ``[clean blocks 0..k-1, noisy blocks 1..k]`` in which every block sees what a rollout shows it.
 
     A block, clean or noisy, sees itself and the clean blocks of its window, at positions counted from the start of that
-    window, as :class:`KVCache` holds them. Blocks with windows of one length are alike (the clean and the noisy form of
-    a block, and all blocks whose window is full): they are one unmasked call of attention, with the blocks as batch.
-    Nothing is computed only to be masked away, and no mask of sequence length squared exists (at full size it would hold
-    10^9 entries).
+    window, as :class:`KVCache` holds them. Blocks with windows of one length are one unmasked call of attention, with the
+    blocks as batch: a mask of sequence length squared would hold 10^9 entries at full size.
     """
 
     by: Rotation
@@ -156,37 +153,22 @@ def _joined(parts: Sequence[Tensor]) -> Tensor:
     return torch.cat([part.expand(batch, -1, -1, -1) for part in parts], dim=-2)
 
 
-def _of_clips(values: Tensor, clips: Sequence[int]) -> Tensor:
-    """Keys or values of some clips; what all clips share (a batch of one) stays shared."""
-    return values if len(values) == 1 or list(clips) == list(range(len(values))) else values[list(clips)]
-
-
 class KVCache:
     """Keys and values of the finished blocks that stay visible: the first ones (the sink) and the most recent ones.
 
-    Keys are kept *unrotated* and rotated when read, at positions counted from the start of the window. With rotated
-    keys either the positions grow without end, past anything seen in training, or evicting a block leaves keys at the
-    wrong distance. Here the sink always sits at the clip's start, the recent blocks follow it without a gap, and the
-    block being made comes next: the distances between recent blocks are the true ones, only the distance to the sink
-    stops growing, and the largest position is that of a trained clip. Rotated keys are remembered until the window
-    changes, so the rotation costs once per block, not once per denoising step.
+    Keys are kept *unrotated* and rotated when read, at positions counted from the start of the window. With rotated keys
+    either the positions grow past anything seen in training, or evicting a block leaves keys at the wrong distance. Here the
+    sink sits at the clip's start, the recent blocks follow it without a gap, and the block being made comes next: only the
+    distance to the sink stops growing, and the largest position is that of a trained clip. Rotated keys are remembered until
+    the window changes.
 
     Args:
         sink_blocks: blocks kept from the start of the rollout (block 0 is the observed latent frame).
         recent_blocks: finished blocks kept besides the sink.
         fps: frames per second of each clip, ``(b)``; None: as the model's config says.
-
-    Raises:
-        ConfigError: not even the observed frame is kept.
     """
 
     def __init__(self, sink_blocks: int, recent_blocks: int, fps: Tensor | None = None) -> None:
-        if sink_blocks < 1 or recent_blocks < 0:
-            raise ConfigError(
-                "The cache must keep at least the observed frame",
-                expected="sink_blocks >= 1, recent_blocks >= 0",
-                got=f"{sink_blocks}, {recent_blocks}",
-            )
         self.sink_blocks = sink_blocks
         self.recent_blocks = recent_blocks
         self.fps = fps
@@ -218,10 +200,11 @@ class KVCache:
         self.window = CacheWindow(blocks[:stop] + blocks[start:])
 
     def select(self, clips: Sequence[int]) -> KVCache:
-        """The window of these clips, to go on separately. Tensors are never changed, so what can be shared is: a cache of
-        one clip serves any number of branches without a copy.
+        """The window of these clips, to go on separately. Tensors are never changed, so what can be shared is: what all clips share
+        (a batch of one) serves any number of branches without a copy.
         """
-        return self.map(partial(_of_clips, clips=clips))
+        index = list(clips)
+        return self.map(lambda x: x if len(x) == 1 or index == list(range(len(x))) else x[index])
 
     def map(self, change: Callable[[Tensor], Tensor]) -> KVCache:
         """A cache of the same blocks with other tensors, always visited in the same order."""
@@ -230,8 +213,7 @@ class KVCache:
         other.window = CacheWindow(
             [
                 CachedBlock(
-                    block.frames,
-                    {layer: (change(keys), change(values)) for layer, (keys, values) in block.layers.items()},
+                    block.frames, {n: (change(keys), change(values)) for n, (keys, values) in block.layers.items()}
                 )
                 for block in self.window.blocks
             ]

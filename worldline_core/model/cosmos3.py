@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +29,6 @@ UNUSED_PARAMETERS = (
     "action_modality_embed",
 )
 """Heads for text, sound and native actions: this model emits video and takes its actions as maps."""
-
-
-@dataclass(frozen=True)
-class Cosmos3Report:
-    """Names of the pretrained folder that were left out, and parameters that are new here."""
-
-    ignored: tuple[str, ...]
-    new: tuple[str, ...]
 
 
 def config_from_diffusers(config: Mapping[str, Any], *, where: object, fps: float | None = None) -> WorldModelConfig:
@@ -92,8 +83,9 @@ def config_from_diffusers(config: Mapping[str, Any], *, where: object, fps: floa
 
 def read_cosmos3(
     folder: Path, *, fps: float | None = None, changes: Mapping[str, object] | None = None
-) -> tuple[WorldModel, dict[str, Tensor], Cosmos3Report]:
-    """A model on the meta device, and all of its weights: views of the mapped files, and those that are new.
+) -> tuple[WorldModel, dict[str, Tensor], dict[str, list[str]]]:
+    """A model on the meta device, and all of its weights: views of the mapped files, and those that are new; and the names of the
+    weights that were left out (``ignored``) and that are new (``new``).
 
     The action branch is new: its output layer is zero, so the model starts as the pretrained one.
 
@@ -103,7 +95,7 @@ def read_cosmos3(
 
     Raises:
         UnavailableError: there is no such folder.
-        ArtifactError: the folder is incomplete, damaged, or holds another architecture.
+        CheckpointError: the folder is incomplete, damaged, or holds another architecture.
     """
     root = folder / "transformer" if (folder / "transformer").is_dir() else folder
     if not (root / "config.json").is_file():
@@ -131,23 +123,17 @@ def read_cosmos3(
         new["view_embedding"] = torch.zeros(model.view_embedding.shape)
     tensors = kept | new
     check_fit({name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}, tensors, root)
-    return model, tensors, Cosmos3Report(tuple(sorted(ignored)), tuple(sorted(new)))
+    return model, tensors, {"ignored": sorted(ignored), "new": sorted(new)}
 
 
 def import_backbone(config: ImportBackboneConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Load ``inputs['diffusers']`` (a Cosmos3 folder in diffusers format) and write a base checkpoint.
 
-    The action branch is new and zero, so the result computes exactly what the pretrained model does. Weights go from file to
-    file: what is held is one file of the result.
-
-    Raises:
-        UnavailableError: there are no weights in the folder.
-        ArtifactError: the folder is damaged, or holds another architecture.
+    Weights go from file to file: what is held is one file of the result.
     """
-    dtype = {"bfloat16": torch.bfloat16, "float16": torch.float16}[config.dtype]
     model, tensors, report = read_cosmos3(inputs["diffusers"], fps=config.fps, changes=config.changes)
-    metadata = {"source": "Cosmos3 in diffusers format", "ignored": list(report.ignored), "new": list(report.new)}
     save_checkpoint(
-        output, model, kind="base", action_contract=None, metadata=metadata, dtype=dtype, state_dict=tensors
-    )
-    return {"parameters": sum(parameter.numel() for parameter in model.parameters()), "ignored": len(report.ignored)}
+        output, model, kind="base", action_contract=None, metadata={"source": "Cosmos3 in diffusers format", **report},
+        dtype=getattr(torch, config.dtype), state_dict=tensors,
+    )  # fmt: skip
+    return {"parameters": sum(parameter.numel() for parameter in model.parameters()), "ignored": len(report["ignored"])}

@@ -1,8 +1,7 @@
 """Layers of the mixture of transformers: an understanding half (text) beside a generation half (video).
 
-Rotary positions with one height slot per view, attention, the action branch, and both ends of the network: the sinusoidal time
-embedding, added to noisy tokens only, and the velocity that follows from the output of the head. Module names equal those of
-diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
+Rotary positions with one height slot per view, attention, the action branch, and both ends of the network. Module names equal
+those of diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
 
 Axis order of a video sequence everywhere in this package: ``(t v h w)``.
 """
@@ -11,22 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Literal, Protocol, cast
+from typing import Protocol, cast
 
 import torch
 import torch.nn.functional as F
 from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.utils.checkpoint import (
-    CheckpointPolicy,
-    SelectiveCheckpointContext,
-    checkpoint,  # pyright: ignore[reportUnknownVariableType]
-    create_selective_checkpoint_contexts,  # pyright: ignore[reportUnknownVariableType]
-    noop_context_fn,
-)
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.world_model_config import WorldModelConfig
@@ -36,11 +27,7 @@ Rotation = tuple[Tensor, Tensor]
 
 
 def view_starts(config: WorldModelConfig, views: Sequence[str]) -> list[float]:
-    """Height coordinate, in patch rows, at which each of ``views`` begins.
-
-    Raises:
-        ConfigError: a view has no slot in the config, or is named twice.
-    """
+    """Height coordinate, in patch rows, at which each of ``views`` begins. Raises: ConfigError for an unknown or repeated view."""
     if not views or len(set(views)) != len(views) or any(view not in config.views for view in views):
         raise ConfigError("Unknown or repeated view", expected=f"a choice of {list(config.views)}", got=list(views))
     scale = 1.0
@@ -67,9 +54,6 @@ def video_positions(
         temporal_offset: added to the temporal axis (text length plus margin when there is text).
         fps: frames per second of each clip, as it is shown (a stride lowers the rate): latent frame ``j`` is at
             ``j base_fps / fps``. None takes the config's; a model whose config has none counts latent frames.
-
-    Returns:
-        the coordinates of all clips, or with ``fps`` those of each clip, ``(3 b n)``.
     """
     rows, columns = grid
     device = frames.device
@@ -127,10 +111,7 @@ def rotate(values: Float[Tensor, "*batch heads n d"], by: Rotation) -> Float[Ten
 
 
 class GenerationAttention(Protocol):
-    """Attention among video tokens: everything at once, block by block, or through a cache.
-
-    Called with normalised, not yet rotated queries and keys, ``(b heads n d)``.
-    """
+    """Attention among video tokens, of normalised, not yet rotated queries and keys, ``(b heads n d)``."""
 
     def __call__(
         self, layer: int, queries: Tensor, keys: Tensor, values: Tensor, text: tuple[Tensor, Tensor] | None
@@ -178,32 +159,6 @@ class TextContext:
     mask: Bool[Tensor, "b m"] | None
     size: int
     ignored: bool = False
-
-
-_ATTENTION = (
-    torch.ops.aten._scaled_dot_product_flash_attention.default,
-    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu.default,
-    torch.ops.aten._scaled_dot_product_efficient_attention.default,
-    torch.ops.aten._scaled_dot_product_cudnn_attention.default,
-)
-
-
-def _keep_attention() -> tuple[AbstractContextManager[object], AbstractContextManager[object]]:
-    """Contexts for `torch.utils.checkpoint` that keep what the fused attention kernels return, and nothing else."""
-
-    def policy(_context: SelectiveCheckpointContext, operation: object, *_: object, **__: object) -> CheckpointPolicy:
-        return CheckpointPolicy.MUST_SAVE if operation in _ATTENTION else CheckpointPolicy.PREFER_RECOMPUTE
-
-    first, again = create_selective_checkpoint_contexts(policy)
-    return first, again
-
-
-def call_layer(layer: nn.Module, checkpointing: Literal["none", "block", "selective"], *arguments: object) -> Tensor:
-    """Calls ``layer``; in training, what ``checkpointing`` does not keep is computed again on the way back."""
-    if checkpointing == "none" or not torch.is_grad_enabled():
-        return cast("Tensor", layer(*arguments))
-    kept = _keep_attention if checkpointing == "selective" else noop_context_fn
-    return cast("Tensor", checkpoint(layer, *arguments, use_reentrant=False, context_fn=kept))
 
 
 class RMSNorm(nn.Module):
@@ -295,17 +250,12 @@ class MixtureLayer(nn.Module):
         layer: int,
         text: tuple[Tensor, Tensor] | None = None,
     ) -> Float[Tensor, "b n d"]:
-        """Advance the video tokens.
-
-        Args:
-            attend: how they look at each other.
-            text: keys and values of the text in this layer, from `understand`.
-        """
+        """Advance the video tokens; ``text``: keys and values of the text in this layer, from `understand`."""
         queries, keys, values = self._before_attention(tokens)
         return self._after_attention(tokens, attend(layer, queries, keys, values, text))
 
     def compile_halves(self) -> None:
-        """Compile what comes before attention and what comes after it; attention itself differs from pass to pass."""
+        """Compile all but attention itself, which differs from pass to pass."""
         self._before_attention = torch.compile(self._before_attention)  # pyright: ignore[reportUnknownMemberType]
         self._after_attention = torch.compile(self._after_attention)  # pyright: ignore[reportUnknownMemberType]
 
@@ -346,12 +296,9 @@ def is_text_parameter(name: str) -> bool:
     return name.startswith(TEXT_PARAMETERS[:2]) or any(part in name for part in TEXT_PARAMETERS[2:])
 
 
-CHANNELS = 256
-
-
 def sinusoids(times: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape 256"]:
-    """Cosines, then sines, of ``times`` at frequencies 1 down to 1e-4 (geometric), float32."""
-    half = CHANNELS // 2
+    """128 cosines, then sines, of ``times`` at frequencies 1 down to 1e-4 (geometric), float32."""
+    half = 128
     exponent = -math.log(10000.0) * torch.arange(half, dtype=torch.float32, device=times.device) / half
     angles = times.to(torch.float32).unsqueeze(-1) * exponent.exp()
     return torch.cat((angles.cos(), angles.sin()), dim=-1)
@@ -362,7 +309,7 @@ class TimeEmbedder(nn.Module):
 
     def __init__(self, hidden_size: int) -> None:
         super().__init__()
-        self.linear_1 = nn.Linear(CHANNELS, hidden_size)
+        self.linear_1 = nn.Linear(256, hidden_size)
         self.linear_2 = nn.Linear(hidden_size, hidden_size)
 
     def forward(self, times: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape d"]:
@@ -372,11 +319,7 @@ class TimeEmbedder(nn.Module):
 
 
 def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str], action_maps: Tensor | None) -> None:
-    """Refuse latents that are not those of ``views``, and action maps of another grid (vectors: of 1 x 1).
-
-    Raises:
-        DataError: a shape does not fit.
-    """
+    """Raises: DataError for latents that are not those of ``views``, or action maps of another grid (vectors: of 1 x 1)."""
     if (
         latents.ndim != 6
         or latents.shape[1:3] != (len(views), config.latent_channels)
@@ -407,14 +350,12 @@ def velocity_of(
     """
     if config.prediction == "velocity":
         return emitted
-    emitted, noisy = emitted.float(), noisy.float()
-    if config.prediction == "first_frame_residual":
-        if reference is None:
-            raise ConfigError("The cache holds no first frame", next_step="write the observed frame first")
-        if config.first_frame_std is not None:
-            return preconditioned_velocity(emitted, noisy, sigma, reference.float(), config.first_frame_std)
-        emitted = emitted + reference.float()
-    return (noisy - emitted) / sigma.clamp_min(config.minimum_sigma)
+    if reference is None:
+        raise ConfigError("The cache holds no first frame", next_step="write the observed frame first")
+    emitted, noisy, reference = emitted.float(), noisy.float(), reference.float()
+    if config.first_frame_std is not None:
+        return preconditioned_velocity(emitted, noisy, sigma, reference, config.first_frame_std)
+    return (noisy - (emitted + reference)) / sigma.clamp_min(config.minimum_sigma)
 
 
 def preconditioned_velocity(emitted: Tensor, noisy: Tensor, sigma: Tensor, reference: Tensor, std: float) -> Tensor:
@@ -459,10 +400,6 @@ class ActionEncoder(nn.Module):
         return self.proj(patches)
 
 
-FEATURES = 256
-"""Width of the features from which every layer takes its scale and shift."""
-
-
 class NativeActionFilm(nn.Module):
     """``tokens (1 + scale) + shift`` before every layer, both linear in ``SiLU(linear(vector of the latent frame))``.
 
@@ -471,8 +408,8 @@ class NativeActionFilm(nn.Module):
 
     def __init__(self, size: int, hidden_size: int, num_layers: int) -> None:
         super().__init__()
-        self.hidden = nn.Linear(size, FEATURES)
-        self.proj = nn.ModuleList([nn.Linear(FEATURES, 2 * hidden_size) for _ in range(num_layers)])
+        self.hidden = nn.Linear(size, 256)
+        self.proj = nn.ModuleList([nn.Linear(256, 2 * hidden_size) for _ in range(num_layers)])
         for parameter in self.proj.parameters():
             nn.init.zeros_(parameter)
 

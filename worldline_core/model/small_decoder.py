@@ -51,11 +51,7 @@ class SmallDecoderConfig(StrictModel):
 
     @classmethod
     def of(cls, tokenizer: VideoTokenizer, fingerprint: str, **size: int) -> SmallDecoderConfig:
-        """For the latents of this tokenizer.
-
-        Raises:
-            ConfigError: it compresses pictures by a factor that this decoder does not know.
-        """
+        """For the latents of this tokenizer. Raises: ConfigError when it compresses pictures by another factor."""
         layout = {name: getattr(tokenizer, name) for name in _LAYOUT}
         try:
             return cls.model_validate({"tokenizer": fingerprint, **layout, **size})
@@ -71,11 +67,11 @@ _LAYOUT = ("latent_channels", "spatial_compression", "temporal_compression")
 class SmallDecoder(nn.Module):
     """A linear decode of each latent cell, refined by residual convolutions from the latent grid up to half the pictures' size.
 
-    Where the observed first picture is given, each frame is ``mask * observed + (1 - mask) * made``, else ``made``. With
-    `tokenizer`, whose encoder it then offers too, it is a `VideoTokenizer`.
+    Where the observed first picture is given, each frame is ``mask * observed + (1 - mask) * made``, else ``made``. With the
+    encoder of ``tokenizer`` it is a `VideoTokenizer`.
     """
 
-    def __init__(self, config: SmallDecoderConfig, tokenizer: VideoTokenizer | None = None) -> None:
+    def __init__(self, config: SmallDecoderConfig, tokenizer: VideoTokenizer) -> None:
         super().__init__()
         self.config = config
         self.latent_channels = config.latent_channels
@@ -126,11 +122,7 @@ class SmallDecoder(nn.Module):
 
     @torch.no_grad()
     def fit(self, clips: Iterable[Float[Tensor, "b 3 t h w"]]) -> None:
-        """Begin at the linear decode with the least squared error on these clips.
-
-        Raises:
-            DataError: there are none.
-        """
+        """Begin at the linear decode with the least squared error on these clips. Raises: DataError when there are none."""
         gram = cross = torch.zeros(())
         for clip in clips:
             video = clip.to(self.linear.weight.device)
@@ -151,15 +143,7 @@ class SmallDecoder(nn.Module):
         self.linear.load_state_dict({"weight": weight, "bias": solution[-1]})
 
     def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]:
-        """Latents, as the tokenizer makes them.
-
-        Raises:
-            ConfigError: this decoder has no tokenizer.
-        """
-        if self._tokenizer[0] is None:
-            raise ConfigError(
-                "A decoder does not encode", expected="SmallDecoder(config, tokenizer)", got="no tokenizer"
-            )
+        """Latents, as the tokenizer makes them."""
         return self._tokenizer[0].encode(video)
 
     def decode(
@@ -183,10 +167,7 @@ class SmallDecoder(nn.Module):
 
     @classmethod
     def load(cls, folder: Path, tokenizer: VideoTokenizer, fingerprint: str, device: str = "cpu") -> SmallDecoder:
-        """The decoder that ``train_tokenizer`` wrote for this tokenizer, in float32.
-
-        Args:
-            fingerprint: of the tokenizer.
+        """The decoder that ``train_tokenizer`` wrote for the tokenizer of this fingerprint, in float32.
 
         Raises:
             CheckpointError: the folder holds none, or a damaged one, or one for latents of another tokenizer.
@@ -207,11 +188,7 @@ class SmallDecoder(nn.Module):
 
     @classmethod
     def outline(cls, folder: Path, tokenizer: VideoTokenizer) -> SmallDecoder:
-        """Without trained weights, to count with: of the size that the folder describes, where it is there.
-
-        Raises:
-            CheckpointError: the description is damaged.
-        """
+        """Without trained weights, to count with: of the size that the folder describes, where it is there."""
         size, path = dict[str, int](), folder / DESCRIPTION
         if path.is_file():
             content = read_description(path, FORMAT, "decoder", VERSION)
@@ -248,11 +225,7 @@ class SmallDecoding:
         self._before: Tensor | None = None
 
     def __call__(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
-        """Frames of the next latents.
-
-        Raises:
-            DataError: they are not latents of this tokenizer, or the observed picture is not of their size.
-        """
+        """Frames of the next latents. Raises: DataError when they, or the observed picture, have another layout."""
         check_latents(self._network, latents)
         batch, space = len(latents), self._network.spatial_compression
         size = (batch, 3, latents.shape[3] * space, latents.shape[4] * space)

@@ -1,7 +1,7 @@
 """Video tokenizers: RGB in [-1, 1] to normalised latents and back, causal in time.
 
-The protocol, the patch tokenizer of the small models, the Wan 2.2 autoencoder through diffusers, and the conversion between
-stored frames (uint8) and tensors; one place decides how frames are resized.
+The patch tokenizer of the small models, the Wan 2.2 autoencoder through diffusers, and the conversion between stored frames
+(uint8) and tensors; one place decides how frames are resized.
 
 Axis legend: b batch, c channel, t frame, h w pixels; ``_l`` marks the latent grid.
 """
@@ -89,11 +89,7 @@ class GroupDecoder:
 
 
 def check_video(tokenizer: VideoTokenizer, video: Tensor) -> None:
-    """Refuse a video whose length or size the tokenizer cannot code.
-
-    Raises:
-        DataError: it is not ``(b, 3, 1 + k * temporal, multiple of spatial, multiple of spatial)``.
-    """
+    """Raises: DataError for a video whose length or size the tokenizer cannot code."""
     space, time = tokenizer.spatial_compression, tokenizer.temporal_compression
     if (
         video.ndim != 5
@@ -110,11 +106,7 @@ def check_video(tokenizer: VideoTokenizer, video: Tensor) -> None:
 
 
 def check_latents(tokenizer: VideoTokenizer, latents: Tensor) -> None:
-    """Refuse latents of another layout.
-
-    Raises:
-        DataError: not five axes, or another number of channels.
-    """
+    """Raises: DataError for other than five axes, or another number of channels."""
     if latents.ndim != 5 or latents.shape[1] != tokenizer.latent_channels:
         expected = f"(b, {tokenizer.latent_channels}, t, h, w)"
         raise DataError("Not latents of this tokenizer", expected=expected, got=tuple(latents.shape))
@@ -235,7 +227,7 @@ class PatchTokenizerConfig(StrictModel):
 
 
 class PatchTokenizer(nn.Module):
-    """Linear codes, orthonormal bases, and a decoder that adds what the codes leave out."""
+    """Linear codes on orthonormal bases, and a decoder that adds what the codes leave out."""
 
     KIND = "patch"
     mean: Tensor
@@ -278,11 +270,7 @@ class PatchTokenizer(nn.Module):
         return rearrange(patches + self.mean, "b t h w (c p q) -> b c t (h p) (w q)", p=size, q=size)
 
     def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]:
-        """Codes of a clip of ``1 + 4 k`` frames in [-1, 1].
-
-        Raises:
-            DataError: the video has another shape.
-        """
+        """Codes of a clip of ``1 + 4 k`` frames in [-1, 1]. Raises: DataError when the video has another shape."""
         check_video(self, video)
         with torch.autocast(device_type=video.device.type, enabled=False):
             patches = self._patches(video.float())
@@ -291,10 +279,7 @@ class PatchTokenizer(nn.Module):
             means = torch.cat((first, groups.mean(dim=2)), dim=1)
             static = means @ self.static_basis.T
             motion = rearrange(groups, "b n g h w d -> b n h w (g d)") @ self.motion_basis.T
-            motion = torch.cat(
-                (torch.zeros_like(static[:, :1, ..., :1]).expand(*static[:, :1].shape[:-1], motion.shape[-1]), motion),
-                dim=1,
-            )
+            motion = torch.cat((motion.new_zeros(*static[:, :1].shape[:-1], motion.shape[-1]), motion), dim=1)
             codes = torch.cat((static, motion), dim=-1) / self.scale
         return rearrange(codes, "b t h w c -> b c t h w")
 
@@ -327,7 +312,7 @@ class PatchTokenizer(nn.Module):
     def refine(
         self, coarse: Float[Tensor, "b 3 t h w"], reference: Float[Tensor, "b 3 h w"] | None = None
     ) -> Float[Tensor, "b 3 t h w"]:
-        """Run the convolutional decoder over a linear decode."""
+        """The convolutional decoder on a linear decode. Raises: DataError when the reference has another size."""
         batch, time = coarse.shape[0], self.temporal_compression
         if reference is not None and reference.shape != coarse[:, :, 0].shape:
             raise DataError(
@@ -373,11 +358,7 @@ class PatchTokenizer(nn.Module):
 
     @classmethod
     def outline(cls, folder: Path) -> PatchTokenizer:
-        """A tokenizer as ``folder`` describes it, without its weights.
-
-        Raises:
-            CheckpointError: the description is damaged, or of another kind.
-        """
+        """A tokenizer as ``folder`` describes it, without its weights. Raises: CheckpointError when it describes none."""
         path = folder / DESCRIPTION
         content = read_description(path, FORMAT, "tokenizer", VERSION)
         if content.get("kind") != cls.KIND:
@@ -388,11 +369,7 @@ class PatchTokenizer(nn.Module):
 
     @classmethod
     def load(cls, folder: Path) -> PatchTokenizer:
-        """Read a tokenizer written by :meth:`save`, strictly.
-
-        Raises:
-            CheckpointError: the folder is incomplete, damaged, or of another kind.
-        """
+        """Read a tokenizer written by :meth:`save`. Raises: CheckpointError when it is incomplete, damaged, or of another kind."""
         tokenizer, weights = cls.outline(folder), folder / WEIGHTS
         fill(tokenizer, read_weights(weights, tokenizer.weights_sha256), where=weights, dtype=torch.float32)
         return tokenizer
@@ -520,11 +497,7 @@ class WanTokenizer(nn.Module):
         self.register_buffer("std", torch.tensor(std, dtype=torch.float32).view(1, -1, 1, 1, 1), persistent=False)
 
     def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]:
-        """Normalised latents of a clip of ``1 + 4 k`` frames in [-1, 1].
-
-        Raises:
-            DataError: the video has another shape.
-        """
+        """Normalised latents of a clip of ``1 + 4 k`` frames in [-1, 1]. Raises: DataError when the video has another shape."""
         check_video(self, video)
         # The autoencoder was trained without mixed precision; it runs in the dtype of its weights.
         with torch.autocast(device_type=video.device.type, enabled=False):
@@ -616,11 +589,7 @@ WAN22_SHAPE = {
 
 
 def _wan_shape(root: Path) -> dict[str, Any]:
-    """Content of an autoencoder's ``config.json``.
-
-    Raises:
-        CheckpointError: it is damaged, or of another autoencoder.
-    """
+    """``config.json`` of an autoencoder. Raises: CheckpointError when it is damaged, or of another one."""
     try:
         shape = json.loads((root / "config.json").read_text(encoding="utf-8"))
         name = shape.get("_class_name")

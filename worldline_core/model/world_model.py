@@ -18,6 +18,7 @@ import torch
 from einops import rearrange, repeat
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint  # pyright: ignore[reportUnknownVariableType]
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import (
@@ -37,7 +38,6 @@ from worldline_core.model.layers import (
     Rotation,
     TextContext,
     TimeEmbedder,
-    call_layer,
     check_shapes,
     is_text_parameter,
     new_action_branch,
@@ -75,8 +75,8 @@ class WorldModel(nn.Module):
         self.view_embedding = (
             nn.Parameter(torch.zeros(len(config.views), config.hidden_size)) if config.view_embedding else None
         )
-        self.checkpointing: Literal["none", "block", "selective"] = "none"
-        """Activations that the backward pass recomputes instead of keeping: see ``ShardingConfig``."""
+        self.checkpointing: Literal["none", "block"] = "none"
+        """``block``: the backward pass computes every block again from its input."""
 
     def compile_blocks(self) -> None:
         """Compile what every block computes around its attention; weights and their names stay as they are."""
@@ -340,7 +340,10 @@ class WorldModel(nn.Module):
             context = None if text is None else text.layers[index]
             if action_maps is not None and isinstance(self.action_encoder, NativeActionFilm):
                 tokens = self.action_encoder(tokens, action_maps, index)
-            tokens = call_layer(layer, self.checkpointing, tokens, attend, index, context)
+            if self.checkpointing == "block" and torch.is_grad_enabled():
+                tokens = cast("Tensor", checkpoint(layer, tokens, attend, index, context, use_reentrant=False))
+            else:
+                tokens = layer(tokens, attend, index, context)
             if features_at == index + 1:
                 features = tokens
         return self.norm_moe_gen(tokens), features

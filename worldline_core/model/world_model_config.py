@@ -72,10 +72,9 @@ class WorldModelConfig(StrictModel):
     """Control frames whose maps a latent frame takes: its own (the paper), or all four of its interval."""
     action_conditioning: ActionConditioning = "maps"
     """``maps``: added to the tokens (the method). ``native_film``: control vectors by FiLM (the paper's ablation)."""
-    prediction: Literal["velocity", "sample", "first_frame_residual"] = "velocity"
-    """Output of the head. ``sample``: the clean latents; the velocity follows as ``(x - x0) / sigma``.
-    ``first_frame_residual``: the clean latents less those of the clean first frame, so that still parts are free
-    (for tokenizers that code a still group like its first frame)."""
+    prediction: Literal["velocity", "first_frame_residual"] = "velocity"
+    """Output of the head. ``first_frame_residual``: the clean latents less those of the clean first frame, so that still parts are
+    free (for tokenizers that code a still group like its first frame)."""
     first_frame_std: float | None = Field(default=None, gt=0)
     """With ``first_frame_residual``: the expected deviation s of later latents from the first frame. The head then
     corrects, in units of the remaining uncertainty, the best guess that the noisy latents and the first frame allow

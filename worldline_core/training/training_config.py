@@ -52,15 +52,14 @@ class ShardingConfig(StrictModel):
         shards: parts of every weight; None: as many as there are processes. With fewer, groups of this many processes
             hold one copy each, and gradients are summed over the copies: 8 on nodes of 8 GPUs keeps gathering within a
             node.
-        checkpointing: "block" keeps the input of every transformer block and computes the block again on the way back;
-            "selective" also keeps what attention returned, which costs most to compute again.
+        checkpointing: "block" keeps the input of every transformer block and computes the block again on the way back.
         compile: torch.compile for the projections and the feed-forward half of each block.
         reduce_every_micro_step: sum gradients over processes after every micro-step, not once a step: with accumulation
             this saves a whole copy of the gradients on every device, and costs communication.
     """
 
     shards: int | None = Field(default=None, ge=1)
-    checkpointing: Literal["none", "block", "selective"] = "none"
+    checkpointing: Literal["none", "block"] = "none"
     compile: bool = False
     reduce_every_micro_step: bool = False
 
