@@ -1,7 +1,7 @@
 """Push a finished EpisodeSet to a folder, an object store or the Hugging Face hub, and pull it back.
 
 A published set has a list of its files with sizes and digests, by which every pulled file is checked. A push to the hub is
-one commit; elsewhere the list says until the end that the set is incomplete. Credentials come from the environment alone.
+one commit; elsewhere the list is written last. Credentials come from the environment alone.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from itertools import batched
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, cast
 
+import httpx
 from pydantic import Field, ValidationError
 from upath import UPath
 
@@ -38,7 +39,6 @@ from worldline_core.store.store import folder_lock
 FILE_LIST = "worldline_files.json"
 _BATCH_FILES = 32
 _HUB_LOCATION = re.compile(r"hf://datasets/(?P<id>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?/?")
-_CLIENTS = ("aiohttp", "botocore", "httpx", "huggingface_hub")
 
 
 class PublishedFile(StrictModel):
@@ -52,7 +52,6 @@ class FileList(StrictModel):
     """The files of a published set by path; neither the list itself nor the dataset card is among them."""
 
     version: Literal[3] = 3
-    complete: bool = True
     files: dict[str, PublishedFile]
 
     @property
@@ -78,25 +77,24 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
     sources = set_files(folder)
     _check_may_publish(folder, public=public, allow_restricted=allow_restricted)
     files = {name: PublishedFile(size=p.stat().st_size, sha256=digest_file(p)) for name, p in sorted(sources.items())}
-    contents = FileList(files=files)
     _check_names(files, folder)
+    contents = FileList(files=files)
+    sending = sources | _card_files(folder, files)
     place = _place(where, writing=True)
-    with place.errors("push"):
+    with _client_errors(where, "push"):
         place.prepare(public=public)
         present = place.sizes()
-        if FILE_LIST not in present and present.keys() - {".gitattributes"}:
+        foreign = sorted(present.keys() - sending.keys() - {".gitattributes"})
+        if FILE_LIST not in present and foreign:
             raise ArtifactError(
                 "The location holds files that are not of this set",
                 where=where,
                 expected="an empty location, or an earlier push",
-                got=_shortened(sorted(present)),
+                got=_shortened(foreign),
                 next_step="push to a location of its own",
             )
-        earlier = place.file_list() if FILE_LIST in present else FileList(files={})
-        trusted = earlier.files if earlier.complete else {}
-        kept = {n for n, file in files.items() if trusted.get(n) == file and present.get(n) == file.size}
-        gone = sorted((earlier.files.keys() - files.keys()) & present.keys())
-        place.change(sources | _card_files(folder, files), kept, gone, contents, earlier)
+        earlier = place.file_list().files if FILE_LIST in present else {}
+        place.change(sending, sorted((earlier.keys() - files.keys()) & present.keys()), contents)
     return contents
 
 
@@ -109,29 +107,24 @@ def pull(where: str, folder: Path) -> FileList:
     if folder.exists():
         raise ArtifactError("Folder exists already", where=folder, next_step="pull into a new folder")
     unfinished, place = folder.with_name(f"{folder.name}.partial"), _place(where, writing=False)
-    with folder_lock(unfinished), place.errors("pull"):
+    with folder_lock(unfinished), _client_errors(where, "pull"):
         if folder.exists():
             raise ArtifactError("Another command has pulled into this folder", where=folder)
         place.pin()
         present = place.sizes()
-        contents = place.file_list() if FILE_LIST in present else None
-        if contents is None or not contents.complete:
-            raise ArtifactError(
-                "No finished EpisodeSet is published here",
-                where=where,
-                expected=FILE_LIST,
-                next_step="push it again",
-            )
+        if FILE_LIST not in present:
+            raise ArtifactError("No finished EpisodeSet is published here", where=where, expected=FILE_LIST)
+        contents = place.file_list()
         _check_names({*contents.files, *(present.keys() - {FILE_LIST})}, where)
         _raise_mismatch([name for name, file in contents.files.items() if present.get(name) != file.size], where)
         targets = {name: unfinished / name for name in contents.files}
-        there = {name for name, file in contents.files.items() if _is_at(file, targets[name])}
-        place.fetch({name: target for name, target in targets.items() if name not in there}, unfinished)
+        missing = {name: targets[name] for name, file in contents.files.items() if not _is_at(file, targets[name])}
+        place.fetch(missing, unfinished)
         for path in folder_files(unfinished, everything=True):  # the card, or files of an earlier, interrupted pull
             name = path.relative_to(unfinished)
             if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
                 path.unlink()
-        _raise_mismatch([name for name, file in contents.files.items() if not _is_at(file, targets[name])], where)
+        _raise_mismatch([name for name in missing if not _is_at(contents.files[name], targets[name])], where)
         set_files(unfinished)  # a set that refers to folders beside it would read what others put there
         verify_artifact(unfinished)
         unfinished.rename(folder)
@@ -234,27 +227,25 @@ def _is_at(file: PublishedFile, path: Path) -> bool:
     return path.is_file() and path.stat().st_size == file.size and digest_file(path) == file.sha256
 
 
+@contextmanager
+def _client_errors(where: str, verb: str) -> Iterator[None]:
+    """Turn errors of a store's client into one that names the next step."""
+    try:
+        yield
+    except (OSError, RuntimeError, httpx.HTTPError) as error:
+        raise ArtifactError(
+            f"The store did not finish the {verb}",
+            where=where,
+            got=first_line(error)[:300],
+            next_step="check the name, the room and the rights (of HF_TOKEN), then run the same command again",
+        ) from error
+
+
 class _Place:
     """A folder or an object store that sets are published to."""
 
-    def __init__(self, where: str, location: AnyPath) -> None:
-        self.where = where
+    def __init__(self, location: AnyPath) -> None:
         self.location = location
-
-    @contextmanager
-    def errors(self, verb: str) -> Iterator[None]:
-        """Turn errors of the store's client into one that names the next step."""
-        try:
-            yield
-        except Exception as error:
-            if not isinstance(error, OSError | RuntimeError) and type(error).__module__.split(".")[0] not in _CLIENTS:
-                raise
-            raise ArtifactError(
-                f"The store did not finish the {verb}",
-                where=self.where,
-                got=first_line(error)[:300],
-                next_step="check the name, the room and the rights (of HF_TOKEN), then run the same command again",
-            ) from error
 
     def prepare(self, *, public: bool) -> None:
         """Make the place where it has to be made before files are sent."""
@@ -279,30 +270,23 @@ class _Place:
 
     def fetch(self, targets: Mapping[str, Path], folder: Path) -> None:
         """Copy files to this machine, to their targets below the folder."""
+        del folder
+        for target in targets.values():
+            target.parent.mkdir(parents=True, exist_ok=True)
+        self._copy(file_system(self.location).get, {str(self.location / n): str(path) for n, path in targets.items()})
+
+    def change(self, sources: Mapping[str, Path], gone: Iterable[str], contents: FileList) -> None:
+        """Send files, remove those that are gone, and write the list of what is there."""
         fs = file_system(self.location)
-        for batch in batched(targets.items(), _BATCH_FILES):
-            for _, target in batch:
-                target.parent.mkdir(parents=True, exist_ok=True)
-            sources, copies = [str(self.location / name) for name, _ in batch], [str(target) for _, target in batch]
-            with_retries(lambda sources=sources, copies=copies: fs.get(sources, copies), self.where)
-
-    def change(
-        self, sources: Mapping[str, Path], kept: set[str], gone: Iterable[str], contents: FileList, earlier: FileList
-    ) -> None:
-        """Remove the files that are gone, send all but those kept, and write the list of what is there afterwards."""
-        fs = file_system(self.location)
-
-        def write(listed: FileList) -> None:
-            content = listed.model_dump_json(indent=1).encode()
-            with_retries(lambda: fs.pipe_file(str(self.location / FILE_LIST), content), self.where)
-
-        write(FileList(complete=False, files={**earlier.files, **contents.files}))
+        self._copy(fs.put, {str(path): str(self.location / name) for name, path in sources.items()})
         for name in gone:
-            with_retries(lambda name=name: fs.rm_file(str(self.location / name)), self.where)
-        for batch in batched([name for name in sources if name not in kept], _BATCH_FILES):
-            here, there = [str(sources[name]) for name in batch], [str(self.location / name) for name in batch]
-            with_retries(lambda here=here, there=there: fs.put(here, there), self.where)
-        write(contents)
+            with_retries(lambda name=name: fs.rm_file(str(self.location / name)), str(self.location))
+        content = contents.model_dump_json(indent=1).encode()
+        with_retries(lambda: fs.pipe_file(str(self.location / FILE_LIST), content), str(self.location))
+
+    def _copy(self, copy: Any, pairs: Mapping[str, str]) -> None:
+        for batch in batched(pairs.items(), _BATCH_FILES):
+            with_retries(lambda batch=batch: copy([a for a, _ in batch], [b for _, b in batch]), str(self.location))
 
 
 class _Hub(_Place):
@@ -323,7 +307,7 @@ class _Hub(_Place):
         self._api = HfApi(**self._client)
         self._repo: dict[str, Any] = {"repo_id": repo_id, "repo_type": "dataset"}
         self._revision = revision
-        self.where = where
+        self._where = where
 
     def prepare(self, *, public: bool) -> None:
         """Raises: ArtifactError when the repository exists with another visibility: private data must not become public."""
@@ -332,7 +316,7 @@ class _Hub(_Place):
         if private == public:
             raise ArtifactError(
                 "Repository has another visibility than asked for",
-                where=self.where,
+                where=self._where,
                 expected="public" if public else "private",
                 got="private" if private else "public",
                 next_step="push to another repository, or " + ("leave out --public" if public else "add --public"),
@@ -351,18 +335,17 @@ class _Hub(_Place):
         self._api.snapshot_download(**self._repo, revision=self._commit, local_dir=folder, ignore_patterns=ignored)
         shutil.rmtree(folder / ".cache", ignore_errors=True)
 
-    def change(
-        self, sources: Mapping[str, Path], kept: set[str], gone: Iterable[str], contents: FileList, earlier: FileList
-    ) -> None:
+    def change(self, sources: Mapping[str, Path], gone: Iterable[str], contents: FileList) -> None:
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
+        listed = contents.model_dump_json(indent=1).encode()
         self._api.create_commit(
             **self._repo,
             revision=self._revision,
             operations=[
                 *(CommitOperationDelete(name) for name in gone),
                 *(CommitOperationAdd(name, path) for name, path in sources.items()),  # the client sends what differs
-                CommitOperationAdd(FILE_LIST, contents.model_dump_json(indent=1).encode()),
+                CommitOperationAdd(FILE_LIST, listed),
             ],
             commit_message="Upload EpisodeSet",
         )
@@ -377,4 +360,4 @@ def _place(where: str, *, writing: bool) -> _Place:
     location = parse_location(where)
     if isinstance(location, Path):
         location = cast("AnyPath", UPath(location.absolute(), protocol="file", auto_mkdir=True))
-    return _Place(where, location)
+    return _Place(location)

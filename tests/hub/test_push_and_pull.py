@@ -104,7 +104,7 @@ def test_an_interrupted_push_leaves_what_was_published_and_continues(hub: Any, f
     with pytest.raises(ArtifactError, match="did not finish the push"):
         push(folder, PLACE)
     hub.refuse = lambda method, path: None
-    with pytest.raises(ArtifactError, match=r"(?s)No finished EpisodeSet is published.*push it again"):
+    with pytest.raises(ArtifactError, match="No finished EpisodeSet is published"):
         pull(PLACE, tmp_path / "early")
     assert not (tmp_path / "early").exists()
     hub.requests.clear()

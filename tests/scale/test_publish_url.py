@@ -36,9 +36,6 @@ def test_there_and_back(tmp_path: Path, finished: Path, store: ObjectStore, kind
     assert [row.episode_id for row in EpisodeSet.open(tmp_path / "back").rows] == ["episode-000", "episode-001"]
     with pytest.raises(ArtifactError, match="Folder exists already"):
         pull(where, tmp_path / "back")
-    sent = len(store.requests)
-    push(finished, where)
-    assert not [path for method, path in store.requests[sent:] if method == "PUT" and "/datasets/" in path]
 
 
 @pytest.mark.parametrize("refused", [".json", ".txt"])
@@ -56,9 +53,6 @@ def test_an_interrupted_second_push_goes_on(tmp_path: Path, finished: Path, stor
     with pytest.raises(UnreachableInputError, match="A store could not be reached"):
         push(finished, where)
     store.misbehave = lambda method, path: None
-    if refused == ".txt":
-        with pytest.raises(ArtifactError, match="No finished EpisodeSet"):
-            pull(where, tmp_path / "back")
     push(finished, where)
     pull(where, tmp_path / "back")
     assert digest_folder(tmp_path / "back") == digest_folder(finished)

@@ -258,8 +258,7 @@ class RemoteCache:
                 self._sizes[copy] = with_retries(lambda: _download(path, copy), str(path))
             self._sizes.move_to_end(copy)
             while sum(self._sizes.values()) > self.max_bytes and len(self._sizes) > 1:
-                oldest, _ = self._sizes.popitem(last=False)
-                oldest.unlink(missing_ok=True)
+                self._sizes.popitem(last=False)[0].unlink(missing_ok=True)
             return copy
 
 
@@ -296,11 +295,10 @@ def _remove_leftovers() -> None:
     for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
         with suppress(OSError):
             facts = folder.lstat()
-            if facts.st_uid != os.getuid() or time.time() - facts.st_mtime < 60:  # the lock is taken after the folder
-                continue
-            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(folder, ignore_errors=True)
-            finally:
-                os.close(descriptor)
+            if facts.st_uid == os.getuid() and time.time() - facts.st_mtime > 60:  # the lock is taken after the folder
+                descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(folder, ignore_errors=True)
+                finally:
+                    os.close(descriptor)
