@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
-from worldline_core.model.checkpoint import described, fill, read_description, read_weights
+from worldline_core.model.checkpoint import described, fill, read_weights
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.clip_source import LoadedView, load_views
@@ -225,8 +225,10 @@ def teacher_outline(folder: Path | None) -> tuple[nn.Module, Callable[[Tensor], 
 
 
 def _small_shape(path: Path) -> SmallTeacherShape:
-    found = read_description(path, FORMAT, "small teacher").get("shape")
-    return described(SmallTeacherShape, found, "The small teacher's shape", path)
+    content = read_json(path)
+    if content.get("format") != FORMAT:
+        raise CheckpointError("Not a small teacher", where=path, expected=FORMAT, got=content.get("format"))
+    return described(SmallTeacherShape, content.get("shape"), path)
 
 
 def load_teacher(folder: Path, device: str = "cpu") -> VideoTeacher:
