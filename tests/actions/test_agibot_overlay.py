@@ -16,7 +16,7 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import VIEWS
-from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
+from worldline_core.data.sources.agibot import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz

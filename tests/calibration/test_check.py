@@ -130,17 +130,6 @@ def test_a_bad_episode_is_listed_and_the_rest_goes_on(episode: Episode, images: 
     assert [entry["reason"] for entry in stored["episodes"]] == reasons
 
 
-def test_an_empty_source_says_what_it_looked_for_and_what_is_there(tmp_path: Path) -> None:
-    (tmp_path / "videos").mkdir()
-    (tmp_path / "videos" / "notes.txt").write_text("no video")
-    config = tmp_path / "source.yaml"
-    config.write_text(
-        f"curate: {{sources: [{{kind: video_folder, path: {tmp_path / 'videos'}, name: mine, split: train}}]}}"
-    )
-    with pytest.raises(DataError, match=r"no episodes to check[\s\S]*mp4[\s\S]*notes\.txt"):
-        check_module.check_command(config, None, output=tmp_path / "out")
-
-
 # --- the report
 
 

@@ -197,7 +197,7 @@ def test_mistakes_named_over_the_test_splits(held_out: list) -> None:
 
 
 def agibot(shared_data: Path, layout: str) -> list[tuple[Episode, dict[str, np.ndarray]]]:
-    from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
+    from worldline_core.data.sources.agibot import AgibotGesimSource, AgibotGesimSourceConfig
 
     root = shared_data / layout
     source = AgibotGesimSource(AgibotGesimSourceConfig(path=root, fps=30), root)

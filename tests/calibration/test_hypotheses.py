@@ -17,10 +17,10 @@ from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.check import ListedEpisode, check_command, repairing_lines
 from worldline_core.calibration.check_report import table_text
 from worldline_core.calibration.diagnosis import Diagnosis, diagnose_source
-from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.conventions import RecordedConventions, along_tool_z
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import LoadedEpisode
-from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
+from worldline_core.data.sources.agibot import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 
@@ -45,9 +45,9 @@ def with_exchanged_extrinsics(episode: Episode) -> Episode:
     return replace(episode, cameras=dict(episode.cameras) | exchanged)
 
 
-def agibot(shared_data: Path, layout: str, **settings: float) -> list[LoadedEpisode]:
+def agibot(shared_data: Path, layout: str) -> list[LoadedEpisode]:
     root = shared_data / layout
-    source = AgibotGesimSource(AgibotGesimSourceConfig.model_validate({"path": root, "fps": 30, **settings}), root)
+    source = AgibotGesimSource(AgibotGesimSourceConfig(path=root, fps=30), root)
     return [source.load(name) for name in source.episode_ids()]
 
 
@@ -82,8 +82,12 @@ def test_a_reading_that_leaves_the_recording_ill_does_not_win(healthy: list, mon
 
 
 def test_flange_poses_do_not_turn_the_wrist_cameras(shared_data: Path) -> None:
-    loaded = agibot(shared_data, "agibot_gesim", tool_offset_v1_m=0.0)
-    diagnoses = [diagnose(item.episode, pictures(item), None) for item in loaded]
+    diagnoses = []
+    for item in agibot(shared_data, "agibot_gesim"):
+        assert item.episode.T_base_ee is not None
+        ends = along_tool_z(item.episode.T_base_ee, -0.23)
+        flange = replace(item.episode, T_base_ee=ends, conventions={**item.episode.conventions, "tool_offset_m": 0.0})
+        diagnoses.append(diagnose(flange, pictures(item), None))
     assert {diagnosis.verdict for diagnosis in diagnoses} == {"unexplained"}
     assert all("camera_axes: opengl" in diagnosis.nearest[0] for diagnosis in diagnoses)
     together = diagnose_source("agibot", diagnoses)

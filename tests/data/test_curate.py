@@ -316,7 +316,7 @@ def test_states_and_videos_of_different_length(tmp_path: Path) -> None:
             "joints": joints.tolist(),
         }
         record_path.write_text(json.dumps(described))
-    source = {"kind": "droid_annotation", "path": str(tmp_path / "droid"), "fps": 5}
+    source = {"kind": "droid_annotation", "path": str(tmp_path / "droid")}
     trimming = CurateConfig.model_validate({"sources": [source], "trim": "common"})
     counts = curate(trimming, {}, tmp_path / "trimmed")
     assert (counts["kept"], counts["trimmed"]) == (2, 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +32,9 @@ def run(tmp_path: Path, *sources: dict[str, Any], **changes: Any) -> tuple[dict[
     return counts, EpisodeSet.open(tmp_path / "out")
 
 
-def test_a_source_that_finds_nothing_says_what_it_looked_for(tmp_path: Path) -> None:
-    good = videos(tmp_path / "good", 0)
-    said = r"(?s)holds no episode.*source good, .*/good.*annotation/<split>/<id>\.json.*got: one\.mp4 \(1 \.mp4\).*kind"
-    with pytest.raises(DataError, match=said):
-        run(tmp_path, {**good, "kind": "droid_annotation"})
-    with pytest.raises(DataError, match=r"(?s)holds no episode.*expected: meta/info\.json.*collection.*got: one\.mp4"):
-        run(tmp_path, {**good, "kind": "lerobot_v21", **KINDS["lerobot_v3"]})
-    with pytest.raises(DataError, match=r"(?s)None of.*is wanted.*include: two\*.*1 episodes: good-one"):
-        run(tmp_path, {**good, "include": ["two*"]})
+def test_patterns_that_include_nothing_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"(?s)None of.*is included.*include: two\*.*1 episodes: good-one"):
+        run(tmp_path, {**videos(tmp_path / "good", 0), "include": ["two*"]})
 
 
 KINDS = {
@@ -64,23 +57,14 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_empty_source_beside_a_good_one_is_a_warning_unless_it_is_required(
-    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_source_without_episodes_is_an_error(tmp_path: Path, kind: str) -> None:
     if kind in ("agibot_world", "robomind", "robotwin", "unitree_h5"):
         pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
     (tmp_path / "empty").mkdir()
     empty = {"kind": kind, "path": str(tmp_path / "empty"), "name": "emptied", **KINDS[kind]}
-    good = videos(tmp_path / "good", 0)
-    with caplog.at_level(logging.WARNING):
-        counts, _ = run(tmp_path, good, empty)
-    assert counts["found"] == 1
-    assert "source emptied" in caplog.text
-    assert "got: an empty folder" in caplog.text
-    with pytest.raises(DataError, match="source emptied"):
-        curate(CurateConfig.model_validate({"sources": [good, {**empty, "require": True}]}), {}, tmp_path / "required")
-    with pytest.raises(DataError, match=r"(?s)No source holds an episode.*source emptied.*source emptied"):
-        curate(CurateConfig.model_validate({"sources": [empty, empty]}), {}, tmp_path / "both")
+    said = "empty/(meta/info.json|index.parquet)" if kind in ("lerobot_v3", "episode_set") else "source emptied"
+    with pytest.raises(DataError, match=said):
+        run(tmp_path, videos(tmp_path / "good", 0), empty)
 
 
 def droid(root: Path) -> dict[str, Any]:

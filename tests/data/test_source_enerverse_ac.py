@@ -18,7 +18,7 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.enerverse_ac import EnerverseAcSourceConfig
+from worldline_core.data.sources.agibot import EnerverseAcSourceConfig
 from worldline_core.data.sources.open import open_source
 from worldline_core.data.video.encoder import encode_video
 

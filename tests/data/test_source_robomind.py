@@ -185,10 +185,6 @@ def smaller(content: np.ndarray) -> np.ndarray:
     return cv2.imencode(".jpg", decoded[::2, ::2])[1].reshape(-1)
 
 
-def uncompressed(file: Any) -> None:
-    file.attrs["compress"] = False
-
-
 def linked(file: Any) -> None:
     del file["puppet/joint_position"]
     file["puppet/joint_position"] = h5py.ExternalLink("/etc/other.hdf5", "x")
@@ -218,7 +214,6 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "an empty image": (image(lambda v: v[:0]), "unreadable"),
     "half an image header": (image(lambda v: v[:30]), "unreadable"),
     "an image of another size": (image(smaller), "unreadable"),
-    "images without compression": (edit(uncompressed), "unreadable"),
     "joints in another file": (edit(linked), "path_traversal"),
     "joints that were never written": (edit(huge_chunk), "unreadable"),
     "joints as texts": (replaced("puppet/joint_position", lambda v: v.astype("S8")), "unreadable"),
@@ -248,7 +243,6 @@ def test_a_dexterous_hand_is_no_gripper(tmp_path: Path) -> None:
     [
         ("h5_franka_3rgb", {"gripper_state": None}, "gripper_state"),
         ("h5_agilex_3rgb", {}, "gripper_command"),
-        ("h5_franka_3rgb", {"action": "master"}, "gripper_command"),
         ("h5_franka_1rgb", {}, "channels"),
         ("v2_ur", {"gripper_command": GRIPPER}, "channels"),
     ],
@@ -263,7 +257,6 @@ def test_what_the_release_does_not_say_must_be_declared(
 def test_every_layout_can_be_asked_for() -> None:
     assert set(get_args(LayoutName)) == set(ROBOMIND_LAYOUTS)
     for layout in ROBOMIND_LAYOUTS.values():
-        assert all(arm.num_joints + (arm.gripper is not None) <= 8 for arm in layout.arms)
         assert "head" in layout.views
 
 

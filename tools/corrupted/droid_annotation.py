@@ -117,7 +117,6 @@ def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> t
         "path": str(root),
         "name": root.name,
         "views": ["head", None, None],
-        "fps": FPS,
         "split": "test",
     }
     return labels, source

@@ -25,7 +25,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.data.sources.open import nothing_found, open_source
+from worldline_core.data.sources.open import open_source
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
@@ -78,22 +78,14 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
     config = validate(CurateConfig, values["curate"], where=f"{path}: curate")
     descriptions = (values.get("render_actions") or {}).get("description_paths") or {}
     listed: list[ListedEpisode] = []
-    empty: list[DataError] = []
     for number, source_config in enumerate(config.sources):
         source = open_source(source_config, source_config.path)
         prefix = f"curate.sources[{number}].conventions"
         declared, robot = source_config.conventions, "embodiment" in type(source_config).model_fields
-        found = [
+        listed += [
             ListedEpisode(episode_id, source_config.label, partial(source.load, episode_id), prefix, declared, robot)
-            for episode_id in filter(source_config.includes, source.episode_ids())
+            for episode_id in source.episode_ids()
         ]
-        if not found:
-            empty.append(nothing_found(source_config, source, source_config.path))
-        listed += found
-    if not listed:
-        raise DataError("There are no episodes to check", got="".join(f"\n{error}" for error in empty))
-    for error in empty:
-        logger.warning("%s", error)
     return listed, {str(name): str(file) for name, file in descriptions.items()}
 
 

@@ -23,9 +23,9 @@ from worldline_core.data.episodes.source import EpisodeSource
 from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.reader_process import read_limited
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import parse_location, portable_text, unchanged_files, watch_run
+from worldline_core.data.guards.source_paths import parse_location, portable_text, unchanged_files
 from worldline_core.data.sources.episode_files import check_id, unique_identity
-from worldline_core.data.sources.open import nothing_found, open_source
+from worldline_core.data.sources.open import open_source
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.scale.account import InputRow, check_account, crash_evidence, portable_message, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, ends_the_run, map_episodes
@@ -50,8 +50,8 @@ def curate(
         {"found", "kept", "quarantined", "reasons", "splits", "videos" (copied and encoded)}; kept + quarantined = found. With
         `trim` also "trimmed": how many of the kept ones were cut.
 
-    Raises: DataError when a source cannot be opened or has no episode (beside others: is required), nothing is kept, or a
-        scene is both in training and in test;
+    Raises: DataError when a source cannot be opened or has no episode, nothing is kept, or a scene is both in training and
+        in test;
         ConfigError when recordings for evaluation only are assigned to training; UnreachableInputError when inputs
         could not be read for a reason that passes (what is done stays, the next call does the rest).
     """
@@ -142,11 +142,10 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
     @cached_property
     def source(self) -> Callable[[int], EpisodeSource]:
         """Opens source `number`; the last few stay open."""
-        run, sources, roots = self.run, self.config.sources, self.roots
+        sources, roots = self.config.sources, self.roots
 
         @lru_cache(maxsize=_OPEN_SOURCES)
         def opened(number: int) -> EpisodeSource:
-            watch_run(run)
             return open_source(sources[number], parse_location(roots[number]))
 
         return opened
@@ -156,33 +155,21 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         return self.config.sources[source].label
 
     def listed_episodes(self) -> list[list[ListedEpisode]]:
-        """What each source lists, in its order, under ids that are unique in the set."""
+        """What each source lists, in its order, under ids that are unique in the set.
+
+        Raises: DataError for a source that lists nothing.
+        """
         listed: list[list[ListedEpisode]] = []
         seen: set[str] = set()
-        for number, source in enumerate(self.config.sources):
+        for number in range(len(self.config.sources)):
             episodes: list[ListedEpisode] = []
-            for listed_id in filter(source.includes, read_limited(self.config.reader, _episode_ids, self, number)):
+            for listed_id in read_limited(self.config.reader, _episode_ids, self, number):
                 repeated = listed_id in seen
                 identity = unique_identity(listed_id, number, seen)
                 seen |= {identity, listed_id}
                 episodes.append(ListedEpisode(number, identity, listed_id, repeated))
             listed.append(episodes)
-        self._check_empty(listed)
         return listed
-
-    def _check_empty(self, listed: Sequence[Sequence[ListedEpisode]]) -> None:
-        """Warn of sources that list nothing.
-
-        Raises: DataError where all do, or one that is required.
-        """
-        empty = [number for number, episodes in enumerate(listed) if not episodes]
-        said = {number: read_limited(self.config.reader, _nothing_found, self, number) for number in empty}
-        for number, error in said.items():
-            if self.config.sources[number].require or len(empty) == 1 == len(listed):
-                raise error
-            logger.warning("%s", error)
-        if len(empty) == len(listed):
-            raise DataError("No source holds an episode", got="".join(f"\n{error}" for error in said.values()))
 
     def remaining(self, number: int, episodes: Sequence[ListedEpisode]) -> list[ListedEpisode]:
         del number
@@ -273,11 +260,6 @@ def _kept_open(work: CurateWork) -> CurateWork:
 
 def _episode_ids(work: CurateWork, source: int) -> list[str]:
     return _kept_open(work).source(source).episode_ids()
-
-
-def _nothing_found(work: CurateWork, source: int) -> DataError:
-    work = _kept_open(work)
-    return nothing_found(work.config.sources[source], work.source(source), parse_location(work.roots[source]))
 
 
 def _process(work: CurateWork, episode: ListedEpisode) -> InputRow:

@@ -114,7 +114,6 @@ class SourceConfigBase(StrictModel):
     include: tuple[str, ...] | None = Field(
         default=None, description="shell patterns of the episode ids to read; null: all"
     )
-    require: bool = Field(default=False, description="an error where the source has no episode; else a warning")
     conventions: RecordedConventions = Field(
         default=RecordedConventions(),
         description="how these recordings depart from the contract; `worldline calibrate check` finds out",

@@ -23,6 +23,7 @@ from worldline_core.data.guards.rejection import (
     MAX_PIXELS,
     RejectedInputError,
     check_image_size,
+    check_shape,
     too_large,
     unreadable,
 )
@@ -113,18 +114,20 @@ def validated[M: BaseModel](model: type[M], content: Any, where: object, what: s
         ) from error
 
 
-def read_npy(path: AnyPath) -> np.ndarray:
-    """Array of a .npy file; never unpickles.
+def read_npy(path: AnyPath, shape: Sequence[int | None]) -> np.ndarray:
+    """float64 array of a .npy file, of a wanted shape (None for any size but 0); never unpickles.
 
-    Raises: RejectedInputError: missing_file, special_file, out_of_memory, unreadable (damaged, of objects, or cut off).
+    Raises: RejectedInputError: missing_file, special_file, out_of_memory, length_mismatch, unreadable (damaged, of objects,
+        not numeric, or cut off).
     """
     file = regular_file(path)
     # Damaged headers: SyntaxError, TokenError (an Exception only), OverflowError, ...
     with unreadable("Array cannot be read", path, (Exception,)), file.open("rb") as stream:
         values = np.load(stream, allow_pickle=False)
-        if not isinstance(values, np.ndarray):
-            raise ValueError("an archive of arrays")
-        return values
+        if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
+            raise ValueError("no numeric array")
+    check_shape("Array", path, values.shape, shape)
+    return values.astype(np.float64)
 
 
 _PARQUET_FAULTS = (pa.ArrowException, OSError, ValueError, TypeError, OverflowError)

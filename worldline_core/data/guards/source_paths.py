@@ -3,8 +3,7 @@ trusted.
 
 Readers keep the paths they are given (messages name those) and open `local_file(path)`, at the moment of reading: the copy
 of a remote file stays only while there is room. A recording that is written, replaced or cut while it is read would come
-out half old and half new. So each file that is opened is noted, and when the episode is done its size, time of change and
-identity are compared with what they were when this process first opened it (`unchanged_files`).
+out half old and half new: size, time of change and identity of each file that an episode opens are compared at its end.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import re
 import stat
-from collections import Counter, OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -27,49 +25,21 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.remote import AnyPath, list_files, parse_location, process_cache, remote_kind
 
-type FileState = tuple[int, int, int, int]
-_REMEMBERED = 100_000
-"""How many files are remembered. Many episodes may share one (joined videos, tables): its state before the first counts."""
+type FileState = tuple[int, int, int, int] | None
 
 _LONGEST_STEM = 200
 
-_run = ""
-_first_seen: OrderedDict[Path, FileState] = OrderedDict()
-_opened: ContextVar[set[Path] | None] = ContextVar("opened", default=None)
-
-
-def watch_run(run: str) -> None:
-    """Begin anew for another run: between two runs files may change as they like."""
-    global _run
-    if run != _run:
-        _first_seen.clear()
-        _run = run
-
-
-def note_file(path: object) -> None:
-    """Remember a file that is about to be read, or whose content read earlier is about to be used.
-
-    Only files of this machine: an object store replaces a file as a whole.
-    """
-    opened = _opened.get()
-    if not isinstance(path, Path) or path in (opened or ()):
-        return
-    if opened is not None:
-        opened.add(path)
-    state = _state(path)
-    if state is not None and path not in _first_seen:
-        _first_seen[path] = state
-        if len(_first_seen) > _REMEMBERED:
-            _first_seen.popitem(last=False)
+_opened: ContextVar[dict[Path, FileState] | None] = ContextVar("opened", default=None)
+"""State of every local file of the present episode, as it was when it was first opened."""
 
 
 @contextmanager
 def unchanged_files(episode_id: str) -> Iterator[None]:
-    """Around everything that reads one episode; the block's own errors are replaced where a file changed meanwhile.
+    """Around everything that reads one episode; the block's own errors are replaced where a local file changed meanwhile.
 
     Raises: RejectedInputError (changed_while_reading) naming the files.
     """
-    opened: set[Path] = set()
+    opened: dict[Path, FileState] = {}
     token = _opened.set(opened)
     finding: Exception | None = None
     try:
@@ -78,16 +48,14 @@ def unchanged_files(episode_id: str) -> Iterator[None]:
         finding = error
     finally:
         _opened.reset(token)
-    changed = [path for path in sorted(opened) if _state(path) != _first_seen.get(path, _state(path))]
+    changed = [str(path) for path in sorted(opened) if _state(path) != opened[path]]
     if changed:
         raise RejectedInputError(
             "changed_while_reading",
             "Files changed while the recording was read",
             where=f"episode {episode_id}",
-            expected="files that do not change",
-            got=", ".join(str(path) for path in changed[:5]) + (" ..." if len(changed) > 5 else ""),
+            got=", ".join(changed),
             next_step="wait until the recording is complete, then curate again",
-            evidence={"files": len(changed), "other_finding": getattr(finding, "reason", None)},
         ) from finding
     if finding is not None:
         raise finding
@@ -170,7 +138,9 @@ def local_file(path: AnyPath) -> Path:
     """
     still_reading()
     if isinstance(path, Path):
-        note_file(path)
+        opened = _opened.get()
+        if opened is not None and path not in opened:
+            opened[path] = _state(path)
         return path
     try:
         return process_cache().fetch(path)
@@ -246,29 +216,6 @@ def find_files[P: AnyPath](root: P, pattern: str) -> list[P]:
     if isinstance(root, UPath) and not isinstance(root, Path):
         return [root / name for name in list_files(root) if PurePosixPath(name).match(pattern)]
     return sorted(root.rglob(pattern))  # pyright: ignore[reportReturnType]
-
-
-def find_folders[P: AnyPath](root: P, depth: int) -> list[P]:
-    """Folders that lie `depth` levels below `root`, sorted; those of an object store exist by the files in them.
-
-    Raises: UnreachableInputError when the store does not answer.
-    """
-    if isinstance(root, UPath) and not isinstance(root, Path):
-        parts = (PurePosixPath(name).parts for name in list_files(root))
-        return [root / "/".join(names) for names in sorted({p[:depth] for p in parts if len(p) > depth})]
-    return sorted(path for path in root.glob("/".join(["*"] * depth)) if path.is_dir())  # pyright: ignore[reportReturnType]
-
-
-def content_of(folder: AnyPath) -> str:
-    """Content of a folder in a line: the first names, and how many files of each kind there are below it."""
-    if is_file(folder):
-        return "a file"
-    names = [relative_name(path, folder) for path in find_files(folder, "*")]
-    first = sorted({name.parts[0] for name in names})
-    kinds = Counter(name.suffix for name in names if name.suffix)
-    counted = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(6))
-    shown = ", ".join(first[:6]) + (", ..." if len(first) > 6 else "")
-    return (f"{shown} ({counted})" if counted else shown) or "an empty folder"
 
 
 def relative_name(path: AnyPath, root: AnyPath) -> PurePosixPath:

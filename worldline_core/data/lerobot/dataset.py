@@ -21,8 +21,8 @@ import pyarrow.json
 from pydantic import BaseModel, ConfigDict, Field
 
 from worldline_core.data.guards.plain_files import column_names, read_json, read_json_lines, read_table, validated
-from worldline_core.data.guards.rejection import RejectedInputError, check_length
-from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, note_file, regular_file
+from worldline_core.data.guards.rejection import RejectedInputError, check_length, unreadable
+from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, regular_file
 from worldline_core.data.video.clip import VideoClip, decode_frames, video_size
 from worldline_core.errors import DataError
 
@@ -53,13 +53,12 @@ def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> DatasetI
     Raises: DataError when it is unreadable, of another version, lacks a key, or holds something senseless.
     """
     where = f"{root}, meta/info.json"
-    content = read_json(root / "meta" / "info.json")
-    info = validated(DatasetInfo, content, where, "meta/info.json")
+    info = validated(DatasetInfo, read_json(root / "meta" / "info.json"), where, "meta/info.json")
     if info.codebase_version != version:
         raise DataError("Dataset has another version", where=str(root), expected=version, got=info.codebase_version)
     missing = sorted(set(keys) - info.model_fields_set)
     if missing:
-        raise DataError("meta/info.json lacks a key", where=where, expected=", ".join(missing), got=", ".join(content))
+        raise DataError("meta/info.json lacks a key", where=where, expected=", ".join(missing))
     return info
 
 
@@ -73,36 +72,23 @@ class EpisodeTable:
 
     Args:
         table: with a column `episode_index`; order and gaps do not matter.
-        where: named in messages. files: that the table was read from; every row is noted as read from them.
+        where: named in messages.
 
     Raises: DataError when `episode_index` is not a column of whole numbers.
     """
 
-    def __init__(self, table: pa.Table, where: object, files: Sequence[AnyPath] = ()) -> None:
+    def __init__(self, table: pa.Table, where: object) -> None:
         self._where = str(where)
-        self._files = tuple(files)
-        if INDEX not in table.column_names:
+        column = table[INDEX] if INDEX in table.column_names else None
+        numbers = np.zeros(0)
+        if column is not None and pa.types.is_integer(column.type) and not column.null_count:
+            numbers = column.to_numpy()
+        if column is None or len(numbers) != len(column) or ((numbers < 0) | (numbers > MAX_INDEX)).any():
             raise DataError(
-                "Episode list lacks a column",
+                "Episode list numbers no episodes",
                 where=self._where,
-                expected=INDEX,
-                got=", ".join(table.column_names) or "none",
-            )
-        column = table[INDEX]
-        if not pa.types.is_integer(column.type) or column.null_count:
-            raise DataError(
-                "Episode list has rows without a number",
-                where=self._where,
-                expected=f"{INDEX}: a whole number in each row",
-                got=f"{column.type} with {column.null_count} empty rows",
-            )
-        numbers = column.to_numpy()
-        if len(numbers) and (numbers.min() < 0 or numbers.max() > MAX_INDEX):
-            raise DataError(
-                "Episode list numbers episodes out of range",
-                where=self._where,
-                expected=f"0..{MAX_INDEX}",
-                got=f"{numbers.min()}..{numbers.max()}",
+                expected=f"{INDEX}: a whole number 0..{MAX_INDEX} in each row",
+                got=", ".join(table.column_names) if column is None else column.type,
             )
         order = np.argsort(numbers, kind="stable")
         self.indices: np.ndarray = numbers[order].astype(np.int64)
@@ -110,70 +96,20 @@ class EpisodeTable:
         # One chunk per column: looking up a row among a hundred chunks takes a millisecond.
         self._table = (table if in_order else table.take(pa.array(order))).combine_chunks()
 
-    @classmethod
-    def from_parquet(cls, files: Sequence[AnyPath], where: object) -> EpisodeTable:
-        """From LeRobot v3's meta/episodes; the statistics (`stats/*`) are left out.
-
-        Raises: DataError when a file is unreadable or the files differ in their columns.
-        """
-        tables = []
-        for file in files:
-            wanted = [name for name in column_names(file) if not name.startswith("stats/")]
-            tables.append(read_table(file, wanted))
-        try:
-            return cls(pa.concat_tables(tables, promote_options="default"), where, files)
-        except pa.ArrowException as error:
-            raise DataError("Files of the episode list differ", where=str(where), got=str(error)) from error
-
-    @classmethod
-    def from_json_lines(cls, path: AnyPath) -> EpisodeTable:
-        """From LeRobot v2.1's meta/episodes.jsonl; of each line `episode_index` and `length`.
-
-        Raises: RejectedInputError: missing_file, special_file, unreadable.
-        """
-        file = regular_file(path, "Episode list")
-        schema = pa.schema([(INDEX, pa.int64()), ("length", pa.int64())])
-        try:
-            table = pyarrow.json.read_json(
-                str(file),
-                read_options=pyarrow.json.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES),
-                parse_options=pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
-            )
-        except (pa.ArrowException, OSError, ValueError) as error:
-            raise RejectedInputError("unreadable", "File is not JSON lines", where=str(path), got=str(error)) from error
-        return cls(table, path, [path])
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
     def row(self, episode_index: int) -> dict[str, Any]:
         """One episode's row.
 
-        Raises: DataError when it is not listed; RejectedInputError (duplicate_id) when it is listed twice, since which row
-            is meant cannot be told.
+        Raises: DataError when it is not listed; RejectedInputError (duplicate_id) when it is listed twice, since then
+            neither row can be trusted.
         """
-        for file in self._files:
-            note_file(file)
         first, last = (int(np.searchsorted(self.indices, episode_index, side)) for side in ("left", "right"))
         if first == last:
-            raise DataError(
-                "No such episode",
-                where=self._where,
-                expected=f"one of {len(self)} episodes, {self._range()}",
-                got=str(episode_index),
-            )
+            raise DataError("No such episode", where=self._where, got=episode_index)
         if last - first > 1:
             raise RejectedInputError(
-                "duplicate_id",
-                "Episode is listed more than once",
-                where=self._where,
-                expected="one row per episode",
-                got=f"{last - first} rows of {INDEX} {episode_index}",
+                "duplicate_id", "Episode is listed more than once", where=self._where, got=f"{INDEX} {episode_index}"
             )
         return self._table.slice(first, 1).to_pylist()[0]
-
-    def _range(self) -> str:
-        return f"{self.indices[0]}..{self.indices[-1]}" if len(self) else "none"
 
 
 def whole_number(row: dict[str, Any], key: str, where: object) -> int:
@@ -181,14 +117,10 @@ def whole_number(row: dict[str, Any], key: str, where: object) -> int:
 
     Raises: RejectedInputError: missing_column, or unreadable for what is no whole number from 0 on.
     """
-    if key not in row:
-        raise RejectedInputError(
-            "missing_column", "Episode list lacks a column", where=str(where), expected=key, got=", ".join(row)
-        )
-    value = row[key]
+    value = row.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_INDEX:
         raise RejectedInputError(
-            "unreadable",
+            "unreadable" if key in row else "missing_column",
             "Episode list holds no usable number",
             where=f"{where}, {key}",
             expected="a whole number from 0 on",
@@ -212,14 +144,8 @@ class LeRobotDataset(ABC):
     def __init__(self, root: AnyPath) -> None:
         self.root = root
         self.info = read_info(root, self.version, self.needed_keys)
-
-    @property
-    def fps(self) -> float:
-        return self.info.fps
-
-    @property
-    def features(self) -> dict[str, dict[str, Any]]:
-        return self.info.features
+        self.fps = self.info.fps
+        self.features = self.info.features
 
     @property
     def video_keys(self) -> list[str]:
@@ -282,7 +208,12 @@ class LeRobotV3Dataset(LeRobotDataset):
         files = find_files(folder, "*/*.parquet")
         if not files:
             raise DataError("Dataset lists no episodes", where=str(folder), expected="chunk-*/file-*.parquet")
-        return EpisodeTable.from_parquet(files, folder)
+        wanted = [[name for name in column_names(file) if not name.startswith("stats/")] for file in files]
+        tables = [read_table(file, names) for file, names in zip(files, wanted, strict=True)]
+        try:
+            return EpisodeTable(pa.concat_tables(tables, promote_options="default"), folder)
+        except pa.ArrowException as error:
+            raise DataError("Files of the episode list differ", where=str(folder), got=str(error)) from error
 
     @cached_property
     def tasks(self) -> dict[int, str]:
@@ -304,17 +235,10 @@ class LeRobotV3Dataset(LeRobotDataset):
         )
         if path not in self._data:
             self._data = {path: read_table(path)}  # one file at a time: episodes are read in the order of files
-        note_file(path)
         table = self._data[path]
         for needed in (name, "index"):
             if needed not in table.column_names:
-                raise RejectedInputError(
-                    "missing_column",
-                    "Data file lacks a column",
-                    where=str(path),
-                    expected=needed,
-                    got=", ".join(table.column_names),
-                )
+                raise RejectedInputError("missing_column", "Data file lacks a column", where=path, expected=needed)
         begin = self._number(row, "dataset_from_index")
         length = self._number(row, "dataset_to_index") - begin
         first = table["index"][0].as_py() if len(table) else begin
@@ -326,13 +250,7 @@ class LeRobotV3Dataset(LeRobotDataset):
         row = self.row(episode_index)
         chunk, file, start = (f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))
         if any(row.get(name) is None for name in (chunk, file, start)):
-            raise RejectedInputError(
-                "missing_view",
-                "Episode has no such video",
-                where=str(self.root),
-                expected=key,
-                got=", ".join(self.video_keys),
-            )
+            raise RejectedInputError("missing_view", "Episode has no such video", where=self.root, expected=key)
         path = self._path(
             self.info.video_path or VIDEO_PATH,
             video_key=key,
@@ -341,16 +259,11 @@ class LeRobotV3Dataset(LeRobotDataset):
         )
         from_time = row[start]
         if not isinstance(from_time, int | float) or not 0 <= from_time < math.inf:
-            raise RejectedInputError(
-                "unreadable",
-                "Video has no usable start time",
-                where=f"{self.root}, episode {episode_index}, {start}",
-                expected="seconds",
-                got=repr(from_time),
-            )
+            where = f"{self.root}, episode {episode_index}, {start}"
+            raise RejectedInputError("unreadable", "Video has no usable start time", where=where, got=repr(from_time))
         return VideoClip(path, self._number(row, "length"), self.fps, from_time=float(from_time))
 
-    def frames(self, episode_index: int, key: str, indices: Sequence[int] | None = None) -> np.ndarray:
+    def frames(self, episode_index: int, key: str, indices: Sequence[int]) -> np.ndarray:
         """uint8 (len, H, W, 3) frames of one episode.
 
         Raises: DataError when the video is missing, truncated or too short.
@@ -371,7 +284,15 @@ class LeRobotV21Dataset(LeRobotDataset):
 
     @cached_property
     def episodes(self) -> EpisodeTable:
-        return EpisodeTable.from_json_lines(self.root / "meta" / "episodes.jsonl")
+        path = self.root / "meta" / "episodes.jsonl"
+        schema = pa.schema([(INDEX, pa.int64()), ("length", pa.int64())])
+        with unreadable("File is not JSON lines", path, (pa.ArrowException, OSError, ValueError)):
+            table = pyarrow.json.read_json(
+                regular_file(path, "Episode list"),
+                read_options=pyarrow.json.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES),
+                parse_options=pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
+            )
+        return EpisodeTable(table, path)
 
     @cached_property
     def tasks(self) -> dict[int, str]:
@@ -411,28 +332,14 @@ def _numeric_column(column: pa.ChunkedArray, length: int, where: str) -> np.ndar
     if not any(is_kind(values.type) for is_kind in nested):
         return _numeric(values, where)
     if values.null_count:
-        raise RejectedInputError(
-            "nan_state",
-            "Data column holds empty rows",
-            where=where,
-            expected="a value in each row",
-            got=f"{values.null_count} nulls",
-        )
-    lengths = pc.min_max(pc.list_value_length(values)).as_py()  # pyright: ignore[reportAttributeAccessIssue]
-    if len(values) == 0 or lengths["min"] != lengths["max"]:
-        raise RejectedInputError(
-            "length_mismatch",
-            "Rows of a data column differ in length",
-            where=where,
-            expected="rows of one length",
-            got=f"{lengths['min']} to {lengths['max']} values",
-        )
+        raise RejectedInputError("nan_state", "Data column holds empty rows", where=where, got=values.null_count)
+    widths = pc.min_max(pc.list_value_length(values)).as_py()  # pyright: ignore[reportAttributeAccessIssue]
+    if len(values) == 0 or widths["min"] != widths["max"]:
+        raise RejectedInputError("length_mismatch", "Rows of a data column differ in length", where=where, got=widths)
     return _numeric(values.flatten(), where).reshape(len(values), -1)
 
 
 def _numeric(values: pa.Array, where: str) -> np.ndarray:
     if not any(is_kind(values.type) for is_kind in (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)):
-        raise RejectedInputError(
-            "unreadable", "Data column is not numeric", where=where, expected="numbers", got=str(values.type)
-        )
+        raise RejectedInputError("unreadable", "Data column is not numeric", where=where, got=values.type)
     return values.to_numpy(zero_copy_only=False)

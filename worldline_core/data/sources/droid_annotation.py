@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.instructions import one_annotation
@@ -30,6 +29,8 @@ from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 _GRIPPER = GripperRange(closed=1.0, open=0.0)
+_TOOL_OFFSET_M = 0.155
+"""Flange to fingertips along the flange's +z."""
 
 
 class DroidAnnotationSourceConfig(EvaluationSourceConfig):
@@ -38,10 +39,6 @@ class DroidAnnotationSourceConfig(EvaluationSourceConfig):
     kind: Literal["droid_annotation"] = "droid_annotation"
     embodiment: EmbodimentName = "droid_franka"
     views: tuple[str | None, ...] = ("head", "exterior_2", "right_wrist")
-    tool_offset_m: float = Field(default=0.155, description="flange to fingertips along the flange's +z")
-    fps: float | None = Field(
-        default=None, gt=0, description="rate that the videos must have; default: what they state"
-    )
 
 
 class DroidAnnotationSource(EpisodeFiles[DroidAnnotationSourceConfig]):
@@ -74,13 +71,17 @@ class DroidAnnotationSource(EpisodeFiles[DroidAnnotationSourceConfig]):
         rates, absent = sorted_views(videos, lambda view: video_size(videos[view])[2], faults)
         if faults or not rates:
             raise all_of([*faults, *absent.values()], file)
-        fps = config.fps or next(iter(rates.values()))
+        fps = next(iter(rates.values()))
         for view, rate in rates.items():
             check_rate(rate, fps, videos[view], tolerance=1e-3)
-        joints = self._joints(record, len(states), file)
+        if "joints" in record:
+            joints = _rows(record, "joints", 8, file)[:, :7]
+        else:
+            joints = _rows(record, "observation.state.joint_position", 7, file)[::3]
+        check_length("Joints", file, states=len(states), unit="rows", found=len(joints))
         opening, overshoot = _GRIPPER.opening(states[:, 6:7])
         state = np.concatenate([joints, opening], axis=1)
-        command = self._command(record, len(states))
+        command = _command(record, len(states))
         pose = pose_from_euler_fixed_xyz(states[:, :3], states[:, 3:6])[:, None]
         success = record.get("success")
         texts = [str(text) for text in record.get("texts", []) if text]
@@ -94,41 +95,31 @@ class DroidAnnotationSource(EpisodeFiles[DroidAnnotationSourceConfig]):
             instruction=one_annotation(texts),
             outcome=config.outcome if success is None else "success" if success else "failure",
             fps=fps,
-            T_base_ee=along_tool_z(pose, config.tool_offset_m),
+            T_base_ee=along_tool_z(pose, _TOOL_OFFSET_M),
             gripper=opening,
             state_names=joint_names({"right": 7}),
-            conventions={"tool_offset_m": config.tool_offset_m},
+            conventions={"tool_offset_m": _TOOL_OFFSET_M},
         )
         counts = {view: len(frame_times(videos[view])) for view in rates}
         clips = {view: VideoClip.whole_file(videos[view], count, fps) for view, count in counts.items()}
         return LoadedEpisode(episode, tuple(clips), clips=clips, absent=absent)
 
-    def _joints(self, record: dict[str, Any], length: int, file: AnyPath) -> np.ndarray:
-        if "joints" in record:
-            joints = _rows(record, "joints", 8, file)[:, :7]
-        else:
-            joints = _rows(record, "observation.state.joint_position", 7, file)[::3]
-        check_length("Joints", file, states=length, unit="rows", found=len(joints))
-        return joints
 
-    def _command(self, record: dict[str, Any], length: int) -> np.ndarray | None:
-        joints, gripper = record.get("action.joint_position"), record.get("action.gripper_position")
-        if joints is None or gripper is None:
-            return None
-        command = np.concatenate([np.asarray(joints)[::3], 1.0 - np.asarray(gripper)[::3, None]], axis=1)
-        return command if command.shape == (length, 8) else None
+def _command(record: dict[str, Any], length: int) -> np.ndarray | None:
+    joints, gripper = record.get("action.joint_position"), record.get("action.gripper_position")
+    if joints is None or gripper is None:
+        return None
+    command = np.concatenate([np.asarray(joints)[::3], 1.0 - np.asarray(gripper)[::3, None]], axis=1)
+    return command if command.shape == (length, 8) else None
 
 
 def _rows(record: dict[str, Any], key: str, width: int, file: AnyPath) -> np.ndarray:
     if key not in record:
-        raise RejectedInputError(
-            "missing_column", "Annotation lacks a key", where=file, expected=key, got=", ".join(record)
-        )
+        raise RejectedInputError("missing_column", "Annotation lacks a key", where=file, expected=key)
     try:
         values = np.asarray(record[key], dtype=np.float64)
     except ValueError as error:
-        raise RejectedInputError(
-            "length_mismatch", "Rows differ in length", where=f"{file}, {key}", got=str(error)
-        ) from error
+        where = f"{file}, {key}"
+        raise RejectedInputError("length_mismatch", "Rows differ in length", where=where, got=str(error)) from error
     check_shape("Rows", f"{file}, {key}", values.shape, (None, width))
     return values

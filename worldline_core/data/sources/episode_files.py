@@ -14,8 +14,9 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import REPEATS_STATE, Episode
 from worldline_core.data.episodes.source import ForeignSourceConfig
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_rate
 from worldline_core.data.guards.source_paths import AnyPath, inside, relative_name
+from worldline_core.data.video.clip import video_size
 
 MAX_LENGTH = 512
 _DIGITS = re.compile(r"(\d+)")
@@ -23,6 +24,9 @@ _DIGITS = re.compile(r"(\d+)")
 
 class EpisodeFiles[C: ForeignSourceConfig]:
     """A source whose episodes are files or folders below its own.
+
+    An id is the label and the parts of the path that name the episode, joined by "-". Files that would share one (a-b/c and
+    a/b-c both give a-b-c) get a digest of their path behind it.
 
     Args:
         parts_of: the parts of a path that name the episode; by default all, without the suffix.
@@ -37,7 +41,15 @@ class EpisodeFiles[C: ForeignSourceConfig]:
     ) -> None:
         self.config = config
         self.root = root
-        self.files = file_ids(config.label, root, found, parts_of)
+        names = [relative_name(file, root) for file in found]
+        wanted = {file: "-".join([config.label, *map(printable, parts_of(file))]) for file in names}
+        count = Counter(wanted.values())
+        self.files = {
+            name
+            if count[name] == 1
+            else f"{name}-{hashlib.sha256(printable(str(file)).encode()).hexdigest()[:8]}": file
+            for file, name in wanted.items()
+        }
 
     def episode_ids(self) -> list[str]:
         return sorted(self.files, key=by_number)
@@ -68,12 +80,13 @@ class EpisodeFiles[C: ForeignSourceConfig]:
             action: None: no commands are recorded, the action repeats the state.
             overshoot: how many gripper readings were clipped.
         """
-        config: Any = self.config
-        declared = {name: getattr(config, name) for name in ("embodiment", "fps", "outcome") if name not in fields}
         notes: dict[str, Any] = {"layout": layout, "gripper_overshoot": overshoot}
         if action is None:
             action, notes["action"] = state, REPEATS_STATE
-        fields = {"instruction": "", **config.declared(scene), **declared, **fields}
+        for name in ("embodiment", "fps", "outcome"):
+            if name not in fields:
+                fields[name] = getattr(self.config, name)
+        fields = {"instruction": "", **self.config.declared(scene), **fields}
         fields.setdefault("timestamps", np.arange(len(state)) / fields["fps"])
         with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
             state, action = state.astype(np.float32), action.astype(np.float32)
@@ -82,21 +95,14 @@ class EpisodeFiles[C: ForeignSourceConfig]:
         )
 
 
-def file_ids(
-    label: str, root: AnyPath, files: Iterable[AnyPath], parts_of: Callable[[PurePosixPath], Sequence[str]]
-) -> dict[str, PurePosixPath]:
-    """Id -> path below the root, of files found there.
+def timed_video_size(path: AnyPath, fps: float) -> tuple[int, int]:
+    """(height, width) of a video.
 
-    An id is the label and the parts of the path that name the episode, joined by "-". Files that would share one (a-b/c and
-    a/b-c both give a-b-c) get a digest of their path behind it.
+    Raises: RejectedInputError: wrong_fps, and as `video_size`.
     """
-    found = [relative_name(file, root) for file in files]
-    wanted = {file: "-".join([label, *map(printable, parts_of(file))]) for file in found}
-    count = Counter(wanted.values())
-    return {
-        name if count[name] == 1 else f"{name}-{hashlib.sha256(printable(str(file)).encode()).hexdigest()[:8]}": file
-        for file, name in wanted.items()
-    }
+    height, width, rate = video_size(path)
+    check_rate(rate, fps, path, tolerance=0.02)
+    return height, width
 
 
 def printable(name: str) -> str:
@@ -132,11 +138,7 @@ def unique_identity(episode_id: str, source: int, taken: set[str]) -> str:
 def check_id(episode_id: str, source: str) -> None:
     """Raises: RejectedInputError (invalid_id) for an id that cannot be stored as it is."""
     if storable(episode_id) != episode_id or not episode_id:
+        expected = f"1 to {MAX_LENGTH} printable characters of valid UTF-8"
         raise RejectedInputError(
-            "invalid_id",
-            "Episode id cannot be stored",
-            where=source,
-            expected=f"1 to {MAX_LENGTH} printable characters of valid UTF-8",
-            got=ascii(episode_id[:200]),
-            next_step="rename the file or folder, or correct the metadata",
+            "invalid_id", "Episode id cannot be stored", where=source, expected=expected, got=ascii(episode_id[:200])
         )

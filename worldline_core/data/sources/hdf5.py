@@ -1,4 +1,4 @@
-"""Arrays and images of HDF5 files that others wrote: every fault is the rejection of an episode.
+"""Arrays, arms and images of HDF5 files that others wrote: every fault is the rejection of an episode.
 
 A file may point outside of itself (links, external storage, virtual datasets), which is refused. Views of such a recording
 are stored as one encoded image per frame, or as pixels.
@@ -7,14 +7,15 @@ are stored as one encoded image per frame, or as pixels.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from worldline_core.data.episodes.source import GripperRange, joint_names
 from worldline_core.data.guards.plain_files import decode_image
 from worldline_core.data.guards.rejection import (
     Reason,
@@ -38,13 +39,41 @@ def require_h5py() -> Any:
 
     Raises: UnavailableError where it is not installed.
     """
-    if importlib.util.find_spec("h5py") is None:
+    try:
+        return importlib.import_module("h5py")
+    except ImportError as error:
         raise UnavailableError(
             "Sources of HDF5 files need h5py, which is not installed",
             expected="the extra `hdf5`",
             next_step=installing("hdf5"),
-        )
-    return importlib.import_module("h5py")
+        ) from error
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Some columns of a dataset, whose name may hold `{track}`; `widths` are the numbers of columns that it may have."""
+
+    dataset: str
+    chosen: slice = slice(None)
+    widths: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class ArmPlace:
+    """Columns of one arm's joints and of its gripper; None for a robot without one, or with a hand of several joints."""
+
+    name: Literal["left", "right"]
+    joints: Columns
+    gripper: Columns | None
+
+
+class Arms(NamedTuple):
+    """Arms in the contract's layout: values (N, J) and their names, openings (N, A), and how many readings were clipped."""
+
+    values: np.ndarray
+    names: tuple[str, ...]
+    openings: np.ndarray
+    overshoot: int
 
 
 class Hdf5File:
@@ -69,16 +98,10 @@ class Hdf5File:
     def require_cameras(self, group: str, cameras: Mapping[str, str]) -> None:
         """Raises: RejectedInputError (missing_view) where a group lacks the camera of a view."""
         found = self.names(group)
-        missing = [view for view, camera in cameras.items() if camera not in found]
+        missing = [camera for camera in cameras.values() if camera not in found]
         if missing:
-            raise RejectedInputError(
-                "missing_view",
-                "File lacks a camera",
-                where=f"{self._path}, {group}",
-                expected=", ".join(cameras[view] for view in missing),
-                got=", ".join(found) or "none",
-                evidence={"missing": missing, "found": found},
-            )
+            expected, got = ", ".join(missing), ", ".join(found) or "none"
+            raise self._rejected("missing_view", "File lacks a camera", group, expected, got)
 
     def has(self, key: str) -> bool:
         """True if `key` is a dataset that holds something: recorders write unused fields as empty ones."""
@@ -106,16 +129,48 @@ class Hdf5File:
 
         The difference is taken before the conversion: float64 rounds nanoseconds since 1970 to 256.
         """
-        seconds = 1e-9 * self.array(key, (length,))
-        raw = self._dataset(key)[()]
-        exact = raw.dtype.kind != "f"
-        return 1e-9 * (raw.astype(np.int64) - np.int64(raw[0])) if exact else seconds - seconds[0]
+        self.array(key, (length,))
+        raw = self._dataset(key)[()].astype(np.int64)
+        return 1e-9 * (raw - raw[0])
 
-    def columns(self, key: str, length: int | None) -> np.ndarray:
-        """A numeric dataset (length, D), or (length,) with D = 1, as float64 (length, D)."""
-        flat = self._dataset(key).ndim == 1
-        values = self.array(key, (length,) if flat else (length, None))
-        return values.reshape(len(values), -1)
+    def arms(
+        self, places: Sequence[ArmPlace], gripper: GripperRange | None, *, track: str = "", length: int | None = None
+    ) -> Arms:
+        """The arms in one track, each with its gripper behind its joints.
+
+        Args:
+            length: number of frames; None: as many as there are.
+
+        Raises: RejectedInputError: length_mismatch or invalid_gripper for a dataset of another width.
+        """
+        blocks: list[np.ndarray] = []
+        openings: list[np.ndarray] = []
+        names: list[str] = []
+        overshoot = 0
+        for arm in places:
+            joints = self.columns(arm.joints, length, "length_mismatch", track)
+            length = len(joints)
+            blocks.append(joints)
+            names += joint_names({arm.name: joints.shape[1]}, gripper=arm.gripper is not None)
+            if arm.gripper is not None and gripper is not None:
+                opening, outside = gripper.opening(self.columns(arm.gripper, length, "invalid_gripper", track))
+                overshoot += outside
+                blocks.append(opening)
+                openings.append(opening)
+        return Arms(np.hstack(blocks), tuple(names), np.hstack(openings or [blocks[0][:, :0]]), overshoot)
+
+    def columns(self, columns: Columns, length: int | None, reason: Reason, track: str = "") -> np.ndarray:
+        """Columns of a numeric dataset (length, D), or (length,) with D = 1, as float64 (length, len(chosen)).
+
+        Raises: RejectedInputError with `reason` for a dataset of another width than declared.
+        """
+        key = columns.dataset.format(track=track)
+        values = self.array(key, (length,) if self._dataset(key).ndim == 1 else (length, None))
+        values = values.reshape(len(values), -1)
+        if columns.widths and values.shape[1] not in columns.widths:
+            expected = f"{' or '.join(map(str, columns.widths))} columns; hands of several joints are not read"
+            raise self._rejected(reason, "Dataset is not of this robot", key, expected, values.shape[1])
+        return values[:, columns.chosen]
 
     def text(self, key: str) -> str | None:
         """A text stored as a dataset of one entry; None where there is none."""
@@ -250,7 +305,6 @@ def hdf5_images(path: AnyPath, key: str, length: int, channels: Channels) -> Ite
                     where=where,
                     expected=f"{first[1]}x{first[0]}",
                     got=f"{image.shape[1]}x{image.shape[0]}",
-                    evidence={"frame": number, "first": list(first[:2]), "found": list(image.shape[:2])},
                 )
             yield image
 

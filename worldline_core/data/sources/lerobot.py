@@ -7,7 +7,7 @@ one dataset per task, hundreds of them: a collection reads every dataset below a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache, lru_cache
@@ -26,6 +26,7 @@ from worldline_core.data.episodes.source import (
     ForeignSourceConfig,
     GripperRange,
     LoadedEpisode,
+    joint_names,
     says_droid,
     sorted_views,
 )
@@ -61,10 +62,6 @@ class GripperColumn(ColumnChoice):
 
     closed: float
     open: float
-
-    @property
-    def range(self) -> GripperRange:
-        return GripperRange(closed=self.closed, open=self.open)
 
 
 class ArmTrack(StrictModel):
@@ -129,7 +126,7 @@ class LeRobotSourceConfig(ForeignSourceConfig):
 
 
 def flat_names(feature: Mapping[str, Any]) -> list[str]:
-    """Column names of a feature: LeRobot writes them as a list, a list of one list, or a dict of a list; or not at all."""
+    """Column names of a feature, as far as it has some: a list, a list of one list, or a dict of a list."""
     names = feature.get("names") or []
     if isinstance(names, dict):
         names = next(iter(names.values()), [])
@@ -175,68 +172,54 @@ def places(choice: ColumnChoice, features: Features, where: str) -> list[int]:
 
 @dataclass(frozen=True)
 class _Block:
-    """Columns of one feature, in the order of the state.
-
-    Attributes:
-        indices: places in the feature; None: all of its columns.
-        grippers: place in the block -> readings, of the columns that are no joints.
-    """
+    """Columns of one feature, in the order of the state; all of them where `indices` is None."""
 
     feature: str
-    indices: tuple[int, ...] | None
-    grippers: Mapping[int, GripperRange]
-
-    def read(self, read_feature: ReadFeature, *, degrees: bool) -> tuple[np.ndarray, int]:
-        """(N, D) float64, and how many gripper readings were clipped."""
-        values = read_feature(self.feature).astype(np.float64)
-        values = values[:, None] if values.ndim == 1 else values
-        last = max(self.grippers if self.indices is None else self.indices, default=0)
-        if values.shape[1] <= last:
-            raise RejectedInputError(
-                "length_mismatch",
-                "Feature has fewer columns than the dataset says",
-                where=self.feature,
-                expected=f"more than {last}",
-                got=values.shape[1],
-            )
-        chosen = values if self.indices is None else values[:, list(self.indices)]
-        block, overshoot = np.deg2rad(chosen) if degrees else chosen.copy(), 0
-        for place, span in self.grippers.items():
-            block[:, place], outside = span.opening(chosen[:, place])
-            overshoot += outside
-        return block, overshoot
+    indices: Sequence[int] | None = None
+    gripper: GripperRange | None = None
 
 
 @dataclass(frozen=True)
 class StateColumns:
-    """Where a dataset keeps what the contract calls state and action.
-
-    Attributes:
-        names: of the state's columns, where they have names.
-        action: empty: the action repeats the state.
-    """
+    """Where a dataset keeps what the contract calls state and action; without `action` the action repeats the state."""
 
     names: tuple[str, ...] | None
-    state: tuple[_Block, ...]
-    action: tuple[_Block, ...]
+    state: Sequence[_Block]
+    action: Sequence[_Block]
 
     def read(self, read_feature: ReadFeature, *, degrees: bool) -> tuple[np.ndarray, np.ndarray, int]:
         """State and action (N, J) float32, and how many gripper readings were clipped.
 
-        Raises: RejectedInputError (length_mismatch) where a feature has another width than the dataset says.
+        Raises: RejectedInputError (length_mismatch) where a feature has fewer columns than the dataset says.
         """
         read_feature = cache(read_feature)
-        state, overshoot = _joined(self.state, read_feature, degrees)
-        if not self.action:
-            return state, state.copy(), overshoot
-        action, more = _joined(self.action, read_feature, degrees)
-        return state, action, overshoot + more
-
-
-def _joined(blocks: tuple[_Block, ...], read_feature: ReadFeature, degrees: bool) -> tuple[np.ndarray, int]:
-    found = [block.read(read_feature, degrees=degrees) for block in blocks]
-    with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
-        return np.concatenate([values for values, _ in found], axis=1).astype(np.float32), sum(n for _, n in found)
+        overshoot = 0
+        tracks: list[np.ndarray] = []
+        for blocks in (self.state, self.action):
+            parts: list[np.ndarray] = []
+            for block in blocks:
+                values = read_feature(block.feature).astype(np.float64)
+                values = values[:, None] if values.ndim == 1 else values
+                if block.indices is not None:
+                    if values.shape[1] <= max(block.indices):
+                        raise RejectedInputError(
+                            "length_mismatch",
+                            "Feature has fewer columns than the dataset says",
+                            where=block.feature,
+                            expected=f"more than {max(block.indices)}",
+                            got=values.shape[1],
+                        )
+                    values = values[:, list(block.indices)]
+                if block.gripper is not None:
+                    values, outside = block.gripper.opening(values)
+                    overshoot += outside
+                elif degrees:
+                    values = np.deg2rad(values)
+                parts.append(values)
+            if parts:
+                with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
+                    tracks.append(np.concatenate(parts, axis=1).astype(np.float32))
+        return tracks[0], tracks[-1].copy(), overshoot
 
 
 def state_columns(config: LeRobotSourceConfig, features: Features, where: str) -> StateColumns:
@@ -247,43 +230,40 @@ def state_columns(config: LeRobotSourceConfig, features: Features, where: str) -
     """
     if config.arms is None:
         names = flat_names(features.get("observation.state", {}))
-        grippers = {names.index(name): span for name, span in config.grippers.items()}
-        state, action = (_Block(feature, None, grippers) for feature in ("observation.state", "action"))
-        return StateColumns(tuple(names) or None, (state,), (action,))
+        state, action = (
+            [_Block(feature, [i], config.grippers.get(name)) for i, name in enumerate(names)]
+            if config.grippers
+            else [_Block(feature)]
+            for feature in ("observation.state", "action")
+        )
+        return StateColumns(tuple(names) or None, state, action)
     order = [arm.name for arm in config.arms]
     if order != sorted(set(order)):
         raise ConfigError("Arms are declared in another order", where=where, expected="left, right", got=order)
     if len({arm.action is None for arm in config.arms}) > 1:
         raise ConfigError("Either all arms have actions or none has", where=where)
-    names, states, actions = [], [], []
+    names: list[str] = []
+    blocks: dict[str, list[_Block]] = {"state": [], "action": []}
     for arm in config.arms:
-        at = f"{where}, {arm.name} arm"
-        state, width = _arm_blocks(arm.state, features, f"{at}, state")
-        states += state
-        names += [f"{arm.name}/joint_{i + 1}" for i in range(width[0])] + [f"{arm.name}/gripper"] * (len(width) - 1)
-        if arm.action is not None:
-            action, commanded = _arm_blocks(arm.action, features, f"{at}, action")
-            actions += action
-            if commanded != width:
-                raise ConfigError(
-                    "State and action of an arm differ in size",
-                    where=at,
-                    expected=f"{width} columns (joints, gripper)",
-                    got=commanded,
-                )
-    return StateColumns(tuple(names), tuple(states), tuple(actions))
-
-
-def _arm_blocks(track: ArmTrack, features: Features, where: str) -> tuple[list[_Block], list[int]]:
-    """Joints and, where there is one, gripper; and how many columns each has."""
-    joints = places(track.joints, features, where)
-    blocks = [_Block(track.joints.feature, tuple(joints), {})]
-    if track.gripper is None:
-        return blocks, [len(joints)]
-    gripper = places(track.gripper, features, f"{where}, gripper")
-    if len(gripper) != 1:
-        raise ConfigError("A gripper is one column", where=f"{where}, gripper", expected=1, got=len(gripper))
-    return [*blocks, _Block(track.gripper.feature, tuple(gripper), {0: track.gripper.range})], [len(joints), 1]
+        widths: dict[str, list[int]] = {}
+        for name, track in (("state", arm.state), ("action", arm.action)):
+            if track is None:
+                continue
+            at = f"{where}, {arm.name} arm, {name}"
+            joints = places(track.joints, features, at)
+            blocks[name].append(_Block(track.joints.feature, joints))
+            widths[name] = [len(joints)]
+            if track.gripper is not None:
+                gripper = places(track.gripper, features, f"{at}, gripper")
+                if len(gripper) != 1:
+                    raise ConfigError("A gripper is one column", where=at, expected=1, got=len(gripper))
+                span = GripperRange(closed=track.gripper.closed, open=track.gripper.open)
+                blocks[name].append(_Block(track.gripper.feature, gripper, span))
+                widths[name].append(1)
+        if len(set(map(tuple, widths.values()))) > 1:
+            raise ConfigError("State and action of an arm differ in size", where=where, got=widths)
+        names += joint_names({arm.name: widths["state"][0]}, gripper=arm.state.gripper is not None)
+    return StateColumns(tuple(names), blocks["state"], blocks["action"])
 
 
 _DROID_VIDEOS = {"observation.images.exterior_1_left", "observation.images.exterior_2_left"}
@@ -313,18 +293,18 @@ class LeRobotSource:
                 got=config.split,
                 next_step="set the source's split, or name datasets that are not DROID otherwise",
             )
-        names = flat_names(features.get("observation.state", {}))
-        known = {"video key": self._dataset.video_keys, "state column": names, "feature": list(features)}
         columns = [name for name in (config.task_column, config.success_column) if name is not None]
-        for what, wanted in (("video key", config.views), ("state column", config.grippers), ("feature", columns)):
-            unknown = sorted(set(wanted) - set(known[what]) - {"task_index"})
+        videos = self._dataset.video_keys
+        names = flat_names(features.get("observation.state", {}))
+        for what, wanted, known in (
+            ("video key", config.views, videos),
+            ("state column", config.grippers, names),
+            ("feature", columns, list(features)),
+        ):
+            unknown = sorted(set(wanted) - set(known) - {"task_index"})
             if unknown:
-                raise ConfigError(
-                    f"The dataset has no {what} of this name",
-                    where=str(root),
-                    expected=", ".join(known[what]),
-                    got=", ".join(unknown),
-                )
+                expected, got = ", ".join(known), ", ".join(unknown)
+                raise ConfigError(f"The dataset has no {what} of this name", where=root, expected=expected, got=got)
         self._columns = state_columns(config, features, str(root))
         self._calibration = lru_cache(maxsize=1)(lambda name: read_calibration(inside(root, name)))
 
@@ -403,14 +383,11 @@ class LeRobotSource:
         name = fill_template(self._config.calibration, episode_index=index)
         entries = self._calibration(name).views
         where = f"{self._root}, {name}"
-        unknown = sorted(set(entries) - set(self._config.views.values()))
-        if unknown:
+        known = self._config.views.values()
+        if not entries.keys() <= set(known):
+            expected, got = ", ".join(known), ", ".join(entries)
             raise RejectedInputError(
-                "missing_view",
-                "Calibration names views that are not read",
-                where=where,
-                expected=", ".join(self._config.views.values()),
-                got=", ".join(unknown),
+                "missing_view", "Calibration names views that are not read", where=where, expected=expected, got=got
             )
         for view in entries.keys() & key_of.keys():
             add_calibrated_view(
@@ -431,14 +408,11 @@ def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: DatasetInfo) -> 
     return says_droid(*names) or set(info.features) >= _DROID_VIDEOS
 
 
-_OPEN_DATASETS = 8
-
-
 class LeRobotCollection:
     """Datasets of one layout; each has its own scene unless the configuration names one.
 
-    A dataset that cannot be opened stands in the list as one input, and is quarantined with what is wrong with it; what
-    the configuration itself gets wrong of any of them stops the listing.
+    A dataset that cannot be opened is listed as one input, and is quarantined; what the configuration itself gets wrong of
+    any of them stops the listing.
 
     Raises: ConfigError as `LeRobotSource`.
     """
@@ -448,16 +422,12 @@ class LeRobotCollection:
     )
 
     def __init__(self, config: LeRobotSourceConfig, root: AnyPath) -> None:
-        self._config = config
         self._roots: dict[str, AnyPath] = {}
         for info in find_files(root, "info.json"):
             place = relative_name(info, root)
             if place.parent.name == "meta":
                 self._roots["-".join([config.label, *place.parts[:-2]])] = info.parent.parent
-        self._open = lru_cache(maxsize=_OPEN_DATASETS)(self._opened)
-
-    def _opened(self, label: str) -> LeRobotSource:
-        return LeRobotSource(self._config, self._roots[label], label)
+        self._open = lru_cache(maxsize=8)(lambda label: LeRobotSource(config, self._roots[label], label))
 
     def episode_ids(self) -> list[str]:
         listed: list[str] = []

@@ -6,31 +6,45 @@ conventions are repaired, and distorting lenses taken out.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, image_frames
-from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as, with_rigid_poses
 from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode, Masks, SourceConfigBase
-from worldline_core.data.guards.rejection import RejectedInputError, check_length
-from worldline_core.data.guards.source_paths import AnyPath, content_of, exists
-from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
-from worldline_core.data.sources.agibot_world import AgibotWorldSource, AgibotWorldSourceConfig
+from worldline_core.data.guards.rejection import RATE_TOLERANCE, RejectedInputError, check_length, check_rate
+from worldline_core.data.guards.source_paths import AnyPath, exists
+from worldline_core.data.sources.agibot import (
+    AgibotGesimSource,
+    AgibotGesimSourceConfig,
+    AgibotWorldSource,
+    AgibotWorldSourceConfig,
+    EnerverseAcSource,
+    EnerverseAcSourceConfig,
+)
 from worldline_core.data.sources.droid_annotation import DroidAnnotationSource, DroidAnnotationSourceConfig
-from worldline_core.data.sources.enerverse_ac import EnerverseAcSource, EnerverseAcSourceConfig
-from worldline_core.data.sources.episode_set import EpisodeSetSource, EpisodeSetSourceConfig
 from worldline_core.data.sources.lerobot import LeRobotSourceConfig, open_lerobot
 from worldline_core.data.sources.mcap import McapSource, McapSourceConfig, McapTopicsSource, McapTopicsSourceConfig
 from worldline_core.data.sources.robomind import RobomindSource, RobomindSourceConfig
 from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
 from worldline_core.data.sources.unitree_h5 import UnitreeH5Source, UnitreeH5SourceConfig
 from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
+from worldline_core.data.video.clip import video_size
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import DataError
+
+
+class EpisodeSetSourceConfig(SourceConfigBase):
+    """This project's own recordings, for example an EpisodeSet that the recorder wrote."""
+
+    kind: Literal["episode_set"] = "episode_set"
+
 
 SourceConfig = Annotated[
     EpisodeSetSourceConfig
@@ -49,6 +63,40 @@ SourceConfig = Annotated[
 ]
 
 
+class EpisodeSetSource:
+    """Reads an EpisodeSet; its datasets must be inside its folder.
+
+    Raises: DataError when the set has no readable index.
+    """
+
+    looked_for = "rows in index.parquet"
+
+    def __init__(self, _: EpisodeSetSourceConfig, root: AnyPath) -> None:
+        self._set = EpisodeSet.open(root, allow_linked=False)
+        self._listed = Counter(row.episode_id for row in self._set.rows)
+
+    def episode_ids(self) -> list[str]:
+        return [row.episode_id for row in self._set.rows]
+
+    def load(self, episode_id: str) -> LoadedEpisode:
+        if self._listed[episode_id] > 1:
+            where = f"{self._set.root}, {episode_id}"
+            raise RejectedInputError("duplicate_id", "Several episodes of the set have this id", where=where)
+        position = self._set.position(episode_id)
+        episode = with_rigid_poses(self._set.episode(position))
+        clips = {view: self._set.clip(position, view) for view in self._set.rows[position].views}
+        for view, clip in clips.items():
+            rate = video_size(clip.path)[2]
+            check_rate(rate, episode.fps, f"{episode_id}, view {view}", tolerance=RATE_TOLERANCE * episode.fps)
+        return LoadedEpisode(
+            episode,
+            tuple(clips),
+            robot_masks=lambda view: self._set.robot_masks(position, view),
+            thing_labels=lambda view: self._set.thing_labels(position, view),
+            clips=clips,
+        )
+
+
 _READERS: dict[type, Callable[[Any, AnyPath], EpisodeSource]] = {
     EpisodeSetSourceConfig: EpisodeSetSource,
     LeRobotSourceConfig: open_lerobot,
@@ -65,27 +113,6 @@ _READERS: dict[type, Callable[[Any, AnyPath], EpisodeSource]] = {
 }
 
 
-class _NoDataset:
-    """A folder without the file that a data set of its kind begins with: it lists nothing."""
-
-    def __init__(self, looked_for: str) -> None:
-        self.looked_for = looked_for
-
-    def episode_ids(self) -> list[str]:
-        return []
-
-    def load(self, episode_id: str) -> LoadedEpisode:
-        raise DataError("Source holds no episode", where=episode_id, expected=self.looked_for)
-
-
-def _reader(config: SourceConfig, root: AnyPath) -> EpisodeSource:
-    if isinstance(config, EpisodeSetSourceConfig) and not exists(root / "index.parquet"):
-        return _NoDataset("index.parquet, which an EpisodeSet begins with")
-    if isinstance(config, LeRobotSourceConfig) and not config.collection and not exists(root / "meta" / "info.json"):
-        return _NoDataset("meta/info.json, which a LeRobotDataset begins with (a folder of several: collection: true)")
-    return _READERS[type(config)](config, root)
-
-
 def open_source(config: SourceConfig, root: AnyPath) -> EpisodeSource:
     """The reader of a configured source. Its episodes keep the contract's conventions, whatever the configuration declares
     as departing from them, and are those of pinhole cameras.
@@ -94,40 +121,32 @@ def open_source(config: SourceConfig, root: AnyPath) -> EpisodeSource:
     """
     if not exists(root):
         raise DataError("Source folder is missing", where=str(root), next_step="check curate.sources[].path")
-    return _RepairedSource(_reader(config, root), config)
-
-
-def nothing_found(config: SourceConfig, source: EpisodeSource, root: AnyPath) -> DataError:
-    """What to say of a source of which there is nothing to read: what was looked for, and what is there instead."""
-    listed, where = source.episode_ids(), f"source {config.label}, {root}"
-    if listed:
-        return DataError(
-            "None of the source's episodes is wanted",
-            where=where,
-            expected=f"include: {', '.join(config.include or ())}",
-            got=f"{len(listed)} episodes: {', '.join(listed[:3])}{', ...' if len(listed) > 3 else ''}",
-            next_step="correct the patterns, or leave `include` out",
-        )
-    return DataError(
-        "Source holds no episode",
-        where=where,
-        expected=source.looked_for,
-        got=content_of(root),
-        next_step="check `path` and `kind` of the source (docs/sources.md)",
-    )
+    return _RepairedSource(_READERS[type(config)](config, root), config, root)
 
 
 class _RepairedSource:
-    def __init__(self, source: EpisodeSource, config: SourceConfigBase) -> None:
+    def __init__(self, source: EpisodeSource, config: SourceConfigBase, root: AnyPath) -> None:
         self._source = source
         self._config = config
-
-    @property
-    def looked_for(self) -> str:
-        return self._source.looked_for
+        self._root = root
+        self.looked_for = source.looked_for
 
     def episode_ids(self) -> list[str]:
-        return self._source.episode_ids()
+        """Ids of the episodes that the configuration includes.
+
+        Raises: DataError when there is none.
+        """
+        listed = self._source.episode_ids()
+        included = [episode_id for episode_id in listed if self._config.includes(episode_id)]
+        if not included:
+            raise DataError(
+                "None of the source's episodes is included" if listed else "Source holds no episode",
+                where=f"source {self._config.label}, {self._root}",
+                expected=f"include: {', '.join(self._config.include or ())}" if listed else self.looked_for,
+                got=f"{len(listed)} episodes: {', '.join(listed[:3])}, ..." if listed else None,
+                next_step="check `path`, `kind` and `include` of the source (docs/sources.md)",
+            )
+        return included
 
     def load(self, episode_id: str) -> LoadedEpisode:
         loaded = undistorted(repair(self._source.load(episode_id), self._config.conventions))
@@ -143,10 +162,13 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
     if not conventions.departures:
         return loaded
     recorded = loaded.episode
-    kept = range(recorded.num_video_frames)[image_frames(recorded.num_frames, conventions)]
-    lagging = bool(conventions.camera_lag_frames or conventions.image_lag_frames)
     declared = {f"declared_{field}": str(getattr(conventions, field)) for field in conventions.departures}
     repaired = apply_conventions(recorded, conventions)
+    loaded = replace(loaded, episode=replace(repaired, conventions={**repaired.conventions, **declared}))
+    if not (conventions.camera_lag_frames or conventions.image_lag_frames):
+        return loaded
+    kept = range(recorded.num_video_frames)[image_frames(recorded.num_frames, conventions)]
+    each_image, robot_masks, thing_labels = loaded.each_image, loaded.robot_masks, loaded.thing_labels
 
     def check_count(found: int, view: str) -> None:
         where = f"episode {recorded.episode_id}, view {view}"
@@ -154,7 +176,7 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
 
     def images(view: str) -> Iterator[np.ndarray]:
         count = 0
-        for count, image in enumerate(loaded.each_image(view), 1):
+        for count, image in enumerate(each_image(view), 1):
             if count - 1 in kept:
                 yield image
         check_count(count, view)
@@ -164,17 +186,12 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
             check_count(len(found), view)
         return None if found is None else found[kept.start : kept.stop]
 
-    clips = {view: clip.cut(kept.start, kept.stop) for view, clip in loaded.clips.items()}
-    episode = replace(repaired, conventions={**repaired.conventions, **declared})
-    if not lagging:
-        return replace(loaded, episode=episode)
     return replace(
         loaded,
-        episode=episode,
         images=images,
-        robot_masks=lambda view: cut(loaded.robot_masks(view), view),
-        thing_labels=lambda view: cut(loaded.thing_labels(view), view),
-        clips=clips,
+        robot_masks=lambda view: cut(robot_masks(view), view),
+        thing_labels=lambda view: cut(thing_labels(view), view),
+        clips={view: clip.cut(kept.start, kept.stop) for view, clip in loaded.clips.items()},
     )
 
 
@@ -197,8 +214,6 @@ def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
                 "invalid_distortion",
                 "A lens is stated for a view without a camera matrix",
                 where=f"{where}, view {view}",
-                expected=", ".join(cameras) or "a calibrated view",
-                got=view,
             )
         camera = cameras[view]
         check_intrinsics(camera, f"{where}, view {view}")

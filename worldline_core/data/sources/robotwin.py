@@ -24,20 +24,25 @@ from worldline_core.data.episodes.source import (
     EvaluationSourceConfig,
     GripperRange,
     LoadedEpisode,
-    joint_names,
 )
 from worldline_core.data.guards.plain_files import image_size, read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.sources.episode_files import EpisodeFiles
-from worldline_core.data.sources.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
+from worldline_core.data.sources.hdf5 import ArmPlace, Columns, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.geometry.transforms import pose_from_quaternion_wxyz
 
-_ARMS = ("left", "right")
+_ARMS = tuple(
+    ArmPlace(arm, Columns(f"joint_action/{arm}_arm"), Columns(f"joint_action/{arm}_gripper", widths=(1,)))
+    for arm in ("left", "right")
+)
 _GRIPPER = GripperRange(closed=0.0, open=1.0)
 _MAX_DISAGREEMENT = 1e-3
-_END_FROM_TOOL = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""The end pose's x (out of the gripper) becomes the tool's z, its y the tool's x."""
+_TOOL_OFFSET_M = 0.12
+_END_FROM_TOOL = np.array(
+    [[0.0, 0.0, 1.0, _TOOL_OFFSET_M], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""The end pose's x (out of the gripper) becomes the tool's z, its y the tool's x; the tool lies between the fingertips."""
 
 
 class RobotwinSourceConfig(EvaluationSourceConfig):
@@ -51,10 +56,6 @@ class RobotwinSourceConfig(EvaluationSourceConfig):
         min_length=1,
         description="view -> camera of the file",
     )
-    tool_offset_m: float = Field(default=0.12, description="end pose to gripper centre along the end pose's +x")
-    channels: Channels = Field(
-        default="as_written", description="standard: for images that were encoded again with the usual channel order"
-    )
 
 
 class RobotwinSource(EpisodeFiles[RobotwinSourceConfig]):
@@ -64,54 +65,46 @@ class RobotwinSource(EpisodeFiles[RobotwinSourceConfig]):
 
     def __init__(self, config: RobotwinSourceConfig, root: AnyPath) -> None:
         require_h5py()
-        super().__init__(config, root, find_files(root, "episode*.hdf5"))
+        super().__init__(config, root, find_files(root, self.looked_for))
 
     def load(self, episode_id: str) -> LoadedEpisode:
         config, path = self.config, self.path(episode_id)
         cameras = RecordedCameras()
         with open_hdf5(path) as file:
-            ends, grippers, blocks = [], [], []
-            length = len(file.array("endpose/left_endpose", (None, 7)))
-            for arm in _ARMS:
-                end = file.array(f"endpose/{arm}_endpose", (length, 7))
-                joints = file.array(f"joint_action/{arm}_arm", (length, None))
-                with rejected_as("nan_state", f"{path}, {arm} end pose"):
-                    ends.append(pose_from_quaternion_wxyz(end[:, :3], end[:, 3:]))
-                grippers.append(file.array(f"endpose/{arm}_gripper", (length,)))
-                blocks.append((joints, file.array(f"joint_action/{arm}_gripper", (length,))))
+            ends = [file.array("endpose/left_endpose", (None, 7))]
+            length = len(ends[0])
+            ends.append(file.array("endpose/right_endpose", (length, 7)))
+            with rejected_as("nan_state", f"{path}, end poses"):
+                T_base_end = [pose_from_quaternion_wxyz(end[:, :3], end[:, 3:]) for end in ends]
+            readings = [file.array(f"endpose/{arm.name}_gripper", (length,)) for arm in _ARMS]
+            opening, overshoot = _GRIPPER.opening(np.stack(readings, axis=1))
+            state = file.arms(_ARMS, _GRIPPER, length=length)
             file.require_cameras("observation", config.views)
             for view, camera in config.views.items():
                 _add_camera(cameras, file, path, view, f"observation/{camera}", length)
-        opening, overshoot = _GRIPPER.opening(np.stack(grippers, axis=1))
-        clipped = [(joints, *_GRIPPER.opening(gripper)) for joints, gripper in blocks]
-        state = np.concatenate([part for joints, grip, _ in clipped for part in (joints, grip[:, None])], axis=1)
-        names = joint_names({arm: joints.shape[1] for arm, (joints, _) in zip(_ARMS, blocks, strict=True)})
-        # From between the fingertips, with +z out of the gripper, to the recorded end pose.
-        T_end_tool = _END_FROM_TOOL.copy()
-        T_end_tool[0, 3] = config.tool_offset_m
         setting = "-".join(relative_name(path, self.root).parts[:-2])
         episode = self.episode(
             episode_id,
             f"{config.label}-{setting}-{path.stem}",
             layout=EVALUATION_LAYOUTS[1],
-            state=state,
-            overshoot=overshoot + sum(count for *_, count in clipped),
+            state=state.values,
+            overshoot=overshoot + state.overshoot,
             instruction=self._instruction(path),
             cameras=cameras.tracks,
-            T_base_ee=np.stack(ends, axis=1) @ T_end_tool,
+            T_base_ee=np.stack(T_base_end, axis=1) @ _END_FROM_TOOL,
             gripper=opening,
             primary_view=next(iter(config.views)),
-            state_names=names,
+            state_names=state.names,
             conventions={
                 "base_frame": "world of the simulation",
-                "tool_offset_m": config.tool_offset_m,
+                "tool_offset_m": _TOOL_OFFSET_M,
                 **cameras.notes(),
             },
         )
         return LoadedEpisode(
             episode,
             tuple(config.views),
-            lambda view: hdf5_images(path, f"observation/{config.views[view]}/rgb", length, config.channels),
+            lambda view: hdf5_images(path, f"observation/{config.views[view]}/rgb", length, "as_written"),
         )
 
     def _instruction(self, path: AnyPath) -> str:
