@@ -18,10 +18,9 @@ import torch
 
 from benchmarks.harness import best_seconds, command_line, print_table
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
-from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.action_tracks import compute_tracks, project_tools
 from worldline_core.actions.episode_tracks import TrackBatch
 from worldline_core.actions.robot_masks import kinematic_robot_masks, robot_capsules
-from worldline_core.actions.tool_projection import project_tools
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.embodiment import Embodiment, load_embodiment
 from worldline_core.geometry.embodiment_report import random_states

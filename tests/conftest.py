@@ -229,7 +229,6 @@ def make_contract() -> Callable[..., ActionContract]:
         values: dict[str, object] = {
             "controls": "action",
             "sigma_px_ref": 40.0,
-            "wrist_projection": "current_camera",
             "fps": 8.0,
             "grid_size": (4, 4),
             "tokenizer": "0123",

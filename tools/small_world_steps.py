@@ -254,7 +254,6 @@ def stage2_step(start: Start, settings: Stage2Settings) -> Step:
     contract = ActionContract(
         controls="action",
         sigma_px_ref=SIGMA_PX_REF,
-        wrist_projection="current_camera",
         fps=8.0,
         grid_size=GRID,
         tokenizer=start.memory.tokenizer.encoder_digest[:16],

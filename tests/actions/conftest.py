@@ -22,7 +22,7 @@ ARM_XML = """
 <body name="{n}/base" pos="0 {y} 0.2">
   <joint name="{n}/pan" axis="0 0 1"/>
   <body name="{n}/upper" pos="0 0 0.1"><joint name="{n}/lift" axis="0 1 0"/>
-    <body name="{n}/hand" pos="0.3 0 0" euler="0 90 0">
+    <body name="{n}/hand" pos="0.3 0 0" quat="0.7071067811865476 0 0.7071067811865476 0">
       <joint name="{n}/roll" axis="0 0 1"/>
       <body name="{n}/finger" pos="0 0.02 0.08"/>
     </body>

@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from worldline_core.actions.action_maps import render_action_maps
-from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.action_tracks import CAUSES, compute_tracks, project_tools
 from worldline_core.actions.episode_tracks import TrackBatch, collate_tracks
-from worldline_core.actions.tool_projection import CAUSES, add_counts, project_tools
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import MIN_DEPTH_M
 
@@ -172,17 +171,6 @@ def test_gripper_overshoot_is_clipped_and_counted(kinematics, episode):
     assert counts["gripper_clipped"] == 3
 
 
-def test_counts_of_episodes_add(kinematics, episode):
-    action = episode.action.copy()
-    action[:, 3] = 3.0
-    first = compute_tracks(episode, kinematics)[1]
-    second = compute_tracks(replace(episode, action=action), kinematics)[1]
-    total = add_counts([first, second])
-    for name in ("samples", "gripper_clipped", "outside_joint_limits", *COUNTED):
-        assert total[name] == first[name] + second[name]
-    assert total["episodes"] == 2
-
-
 def test_masked_samples_of_an_episode_are_counted_by_cause(kinematics, episode):
     """A head camera that looks away, and a wrist camera whose matrix is singular."""
     cameras = dict(episode.cameras)
@@ -200,33 +188,23 @@ def test_masked_samples_of_an_episode_are_counted_by_cause(kinematics, episode):
     assert sum(counts[cause] for cause in COUNTED) == counts["samples"] == 6 * frames
 
 
-@pytest.mark.parametrize(("column", "value"), [(0, math.nan), (3, math.inf)])
-def test_recorded_poses_that_are_no_poses_are_refused(kinematics, episode, column, value):
+@pytest.mark.parametrize(
+    ("pose", "gripper", "fault"),
+    [
+        ((5, 1, 0, 0, math.nan), 1.0, r"not finite, or not rigid[\s\S]*frame 5, arm 1"),
+        ((5, 1, 0, 3, math.inf), 1.0, r"not finite, or not rigid[\s\S]*frame 5, arm 1"),
+        ((0, 0, 0, 0, 1000.0), 1.0, r"not rigid[\s\S]*frame 0, arm 0"),
+        (None, math.nan, r"finite gripper opening[\s\S]*frame 3, arm 0"),
+        (None, None, r"gripper opening[\s\S]*\(9, 2\)"),
+    ],
+)
+def test_recorded_poses_that_are_no_poses_are_refused(kinematics, episode, pose, gripper, fault):
     poses = kinematics.tool_poses(episode.state.astype(np.float64)).numpy().copy()
-    poses[5, 1, 0, column] = value
-    recorded = replace(episode, T_base_ee=poses, gripper=np.ones((len(poses), 2)))
-    with pytest.raises(DataError, match=r"not finite, or not rigid[\s\S]*frame 5, arm 1"):
+    opening = np.ones((len(poses), 2))
+    if pose is not None:
+        poses[pose[:4]] = pose[4]
+    elif gripper is not None:
+        opening[3, 0] = gripper
+    recorded = replace(episode, T_base_ee=poses, gripper=opening if gripper is not None else opening[:, :1])
+    with pytest.raises(DataError, match=fault):
         compute_tracks(recorded, None, controls="state")
-
-
-def test_recorded_poses_that_are_scaled_are_refused(kinematics, episode):
-    poses = kinematics.tool_poses(episode.state.astype(np.float64)).numpy().copy()
-    poses[:, 0, :3, :3] *= 1000.0
-    recorded = replace(episode, T_base_ee=poses, gripper=np.ones((len(poses), 2)))
-    with pytest.raises(DataError, match=r"not rigid[\s\S]*frame 0, arm 0"):
-        compute_tracks(recorded, None, controls="state")
-
-
-def test_recorded_opening_that_is_no_number_is_refused(kinematics, episode):
-    poses = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()
-    gripper = np.ones((len(poses), 2))
-    gripper[3, 0] = math.nan
-    with pytest.raises(DataError, match=r"Gripper openings are not finite[\s\S]*frame 3, arm 0"):
-        compute_tracks(replace(episode, T_base_ee=poses, gripper=gripper), None, controls="state")
-
-
-@pytest.mark.parametrize("gripper", [None, np.ones((9, 1))])
-def test_recorded_poses_need_an_opening_each(kinematics, episode, gripper):
-    poses = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()
-    with pytest.raises(DataError, match=r"without gripper openings[\s\S]*\(9, 2\)"):
-        compute_tracks(replace(episode, T_base_ee=poses, gripper=gripper), None, controls="state")

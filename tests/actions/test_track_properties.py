@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldline_core.actions.action_maps import render_action_maps
+from worldline_core.actions.action_tracks import CAUSES, FRAMES_AT_ONCE, count_samples, project_tools
 from worldline_core.actions.episode_tracks import TrackBatch
-from worldline_core.actions.tool_projection import CAUSES, FRAMES_AT_ONCE, count_samples, project_tools
 
 SEEDS = st.integers(0, 2**32 - 1)
 VALUES = ("uv", "depth", "rot6d", "gripper")

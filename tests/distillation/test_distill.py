@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 import torch
 from pydantic import ValidationError
 
 from tests.distillation.conftest import write_inputs  # pyright: ignore[reportMissingImports]
-from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks, write_index
 from worldline_core.distillation import teacher_trajectories
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill import distill
@@ -296,11 +297,8 @@ def test_only_a_stage2_checkpoint_of_the_same_latents_is_distilled(inputs: dict[
 
 
 def test_tracks_of_another_width_are_refused(inputs: dict[str, Path], tmp_path: Path) -> None:
-    (inputs["tracks"] / "tracks.json").write_text(json.dumps({"sigma_px_ref": 10.0}))
+    write_index(inputs["tracks"], pq.read_table(inputs["tracks"] / "index.parquet").to_pylist(), sigma_px_ref=10.0)
     with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*tracks: sigma_px_ref.*40\.0.*10\.0"):
-        distill(config(), inputs, tmp_path / "out")
-    (inputs["tracks"] / "tracks.json").write_text("{}")
-    with pytest.raises(ArtifactError, match=r"(?s)do not say the width.*run render_actions again"):
         distill(config(), inputs, tmp_path / "out")
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from worldline_core.actions.tool_projection import project_tools
+from worldline_core.actions.action_tracks import project_tools
 from worldline_core.geometry.cameras import inside_image, project_points
 from worldline_core.geometry.tensor_transforms import invert, is_rigid, rot6d_from_rotation, transform_points
 from worldline_core.geometry.transforms import (

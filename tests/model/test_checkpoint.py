@@ -20,7 +20,6 @@ CONTRACT = ActionContract(
     controls="action",
     fps=8.0,
     sigma_px_ref=10.0,
-    wrist_projection="current_camera",
     grid_size=(8, 12),
     tokenizer="0123",
 )

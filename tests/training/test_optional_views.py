@@ -110,7 +110,7 @@ def test_single_views_are_drawn_where_they_are(inputs: dict[str, Path]) -> None:
 
 def test_a_clip_is_trained_in_a_batch_as_it_would_be_alone(inputs: dict[str, Path]) -> None:
     store, tracks = LatentStore.open(inputs["latents"]), ActionTracks.open(inputs["tracks"])
-    loader = ClipLoader(store, views=VIEWS, tracks=tracks, wrist_projection="current_camera")
+    loader = ClipLoader(store, views=VIEWS, tracks=tracks)
     model = load_checkpoint(inputs["stage1"], towers="generation")[0].eval()
     with torch.no_grad():
         for parameter in model.parameters():  # what starts at zero would hide the controls

@@ -2,11 +2,10 @@
 
 Axis legend: n frames, v views, a arms, s capsules. Frames of reference: base, tool (between the fingertips, +z out
 of the gripper), camera (OpenCV axes). Units: metres, pixels of the recorded frame size (centre of the first pixel
-is 0), gripper opening 0 closed .. 1 open. Which samples are valid is decided in `tool_projection`.
+is 0), gripper opening 0 closed .. 1 open.
 
-On disk: shards `tracks-00000.safetensors` ... with entries `<episode_id>/<array>`, `index.parquet` with one row per
-episode, and `tracks.json`: the width of the Gaussian that these tracks are to be drawn with. Bytes depend on the tracks
-alone.
+On disk: shards `tracks-00000.safetensors` ... with entries `<episode_id>/<array>`, and `index.parquet` with one row per
+episode. Bytes depend on the tracks alone.
 """
 
 from __future__ import annotations
@@ -22,37 +21,28 @@ import pyarrow.parquet as pq
 import torch
 from einops import repeat
 from jaxtyping import Bool, Float
-from pydantic import Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from worldline_core.actions.actions_config import WristProjection
-from worldline_core.actions.tool_projection import project_tools
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.artifact_files import how_to_rebuild
-from worldline_core.store.atomic import atomic_path, write_arrays_atomic, write_json_atomic
+from worldline_core.store.atomic import write_arrays_atomic, write_table_atomic
 
 HEAD_VIEW = "head"
-SHARD_FILE = "tracks-{:05d}.safetensors"
-INDEX_FILE, DESCRIPTION_FILE = "index.parquet", "tracks.json"
+SHARD_FILE, INDEX_FILE = "tracks-{:05d}.safetensors", "index.parquet"
 SAMPLES = ("uv", "depth", "rot6d", "gripper", "valid")
 """Arrays with one entry per frame, view and arm: what action maps are rendered from."""
 ARRAYS = (*SAMPLES, "T_base_tool", "T_base_camera", "K", "capsules", "capsule_radii")
 _DTYPES = {"valid": np.bool_, "uv": np.float64}  # of the arrays that are not float32
-_SCHEMA = pa.schema(
+_LABELS = ("episode_id", "embodiment", "views", "arms", "image_size", "controls", "camera_motion")
+_COLUMNS = pa.schema(
     [
-        ("episode_id", pa.string()),
-        ("shard", pa.string()),
-        ("embodiment", pa.string()),
+        *((name, pa.string()) for name in ("episode_id", "shard", "embodiment", "controls")),
+        *((name, pa.list_(pa.string())) for name in ("views", "arms", "camera_motion")),
+        ("image_size", pa.list_(pa.int64())),
         ("num_frames", pa.int64()),
-        ("views", pa.list_(pa.string())),
-        ("arms", pa.list_(pa.string())),
-        ("height", pa.int64()),
-        ("width", pa.int64()),
-        ("controls", pa.string()),
-        ("camera_motion", pa.list_(pa.string())),
+        ("sigma_px_ref", pa.float64()),
     ]
 )
 
@@ -99,50 +89,24 @@ class EpisodeTracks:
     def num_frames(self) -> int:
         return len(self.depth)
 
-    def clip(
-        self,
-        frames: Sequence[int] | np.ndarray,
-        *,
-        wrist_projection: WristProjection = "current_camera",
-        start: int | None = None,
-    ) -> EpisodeTracks:
+    def clip(self, frames: Sequence[int] | np.ndarray) -> EpisodeTracks:
         """Tracks at these frame numbers.
-
-        With `clip_start_camera`, wrist views are projected into the camera's pose at frame `start` (default: the
-        first of `frames`): a wrist camera sees its own gripper at a constant pixel, so only so does that arm's map
-        in that view carry motion. Head tracks and stored camera poses are unchanged. The poses are stored in
-        float32, so these pixels are good to about 1e-4 px in a frame 640 wide.
 
         Raises: DataError for a frame outside of the episode.
         """
         index = np.asarray(frames, dtype=np.int64)
-        first = int(index[0]) if start is None and len(index) else int(start or 0)
-        if len(index) == 0 or min(index.min(), first) < 0 or max(int(index.max()), first) >= self.num_frames:
+        if len(index) == 0 or index.min() < 0 or index.max() >= self.num_frames:
             raise DataError(
                 "Frames outside of the action tracks",
                 where=f"episode {self.episode_id}",
                 expected=f"0..{self.num_frames - 1}",
-                got=f"{index.tolist()[:4]}..., start {first}",
+                got=f"{index.tolist()[:4]}...",
             )
-        cut = replace(
+        return replace(
             self,
             **{name: getattr(self, name)[index] for name in (*SAMPLES, "T_base_tool", "T_base_camera", "capsules")},
             native=None if self.native is None else self.native[index],
         )
-        wrists = [i for i, view in enumerate(self.views) if view != HEAD_VIEW]
-        if wrist_projection == "current_camera" or not wrists:
-            return cut
-        seen = project_tools(
-            torch.from_numpy(cut.T_base_tool),
-            torch.from_numpy(cut.gripper[:, 0]),
-            torch.from_numpy(self.K[wrists]),
-            torch.from_numpy(self.T_base_camera[first, wrists]),
-            self.image_size,
-        )
-        arrays = {name: getattr(cut, name).copy() for name in ("uv", "depth", "rot6d", "valid")}
-        for name, array in arrays.items():
-            array[:, wrists] = getattr(seen, name).numpy().astype(array.dtype)
-        return replace(cut, **arrays)
 
 
 @dataclass(frozen=True)
@@ -196,36 +160,21 @@ def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> lis
         for name in ARRAYS:
             value = getattr(episode, name)
             arrays[f"{episode.episode_id}/{name}"] = np.asarray(value, dtype=_DTYPES.get(name, np.float32))
-        rows.append(
-            {
-                "episode_id": episode.episode_id,
-                "shard": SHARD_FILE.format(number),
-                "embodiment": episode.embodiment,
-                "num_frames": episode.num_frames,
-                "views": list(episode.views),
-                "arms": list(episode.arms),
-                "height": episode.image_size[0],
-                "width": episode.image_size[1],
-                "controls": episode.controls,
-                "camera_motion": list(episode.camera_motion),
-            }
-        )
+        labels = {name: getattr(episode, name) for name in _LABELS}
+        rows.append({**labels, "shard": SHARD_FILE.format(number), "num_frames": episode.num_frames})
     write_arrays_atomic(root / SHARD_FILE.format(number), arrays)
     return rows
 
 
-class TracksDescription(StrictModel):
-    """Contents of `tracks.json`: sigma of the Gaussian, pixels on the 384 x 512 reference canvas."""
-
-    sigma_px_ref: float = Field(gt=0)
-
-
 def write_index(root: Path, rows: Sequence[dict[str, Any]], *, sigma_px_ref: float) -> None:
-    """Write the index, ordered by episode id, and the width that action maps of these tracks have."""
-    write_json_atomic(root / DESCRIPTION_FILE, TracksDescription(sigma_px_ref=sigma_px_ref).model_dump())
+    """Write the index, ordered by episode id.
+
+    Args:
+        sigma_px_ref: width of the Gaussian that these tracks are drawn with, pixels on the 384 x 512 reference canvas.
+    """
     ordered = sorted(rows, key=lambda row: row["episode_id"])
-    with atomic_path(root / INDEX_FILE) as temporary:
-        pq.write_table(pa.Table.from_pylist(ordered, schema=_SCHEMA), temporary)
+    listed = [row | {"sigma_px_ref": sigma_px_ref} for row in ordered]
+    write_table_atomic(root / INDEX_FILE, pa.Table.from_pylist(listed, schema=_COLUMNS))
 
 
 class ActionTracks:
@@ -235,36 +184,26 @@ class ActionTracks:
         episodes: the recordings, for tracks that carry their native control vectors too.
     """
 
-    def __init__(
-        self,
-        root: Path,
-        rows: Sequence[dict[str, Any]],
-        description: TracksDescription,
-        episodes: EpisodeSet | None = None,
-    ) -> None:
+    def __init__(self, root: Path, rows: Sequence[dict[str, Any]], episodes: EpisodeSet | None = None) -> None:
         self.root = root
         self.episodes = episodes
-        self.sigma_px_ref = description.sigma_px_ref
+        self.sigma_px_ref = float(rows[0]["sigma_px_ref"])
         self._rows = {row["episode_id"]: row for row in rows}
 
     @classmethod
     def open(cls, root: Path, episodes: EpisodeSet | None = None) -> ActionTracks:
         """Open an artifact.
 
-        Raises: ArtifactError when the index is missing or lacks a column, or `tracks.json` does not say the width.
+        Raises: ArtifactError when there is no index of tracks.
         """
         path = Path(root) / INDEX_FILE
-        if not path.is_file():
+        try:
+            return cls(Path(root), pq.read_table(path).select(_COLUMNS.names).to_pylist(), episodes)
+        except (OSError, KeyError, pa.ArrowException) as error:
             raise ArtifactError(
-                "Not an ActionTracks artifact", where=root, expected=INDEX_FILE, next_step="run render_actions"
-            )
-        table = pq.read_table(path)
-        missing = [name for name in _SCHEMA.names if name not in table.column_names]
-        if missing:
-            raise ArtifactError(
-                "ActionTracks index lacks columns", where=path, expected=_SCHEMA.names, got=table.column_names
-            )
-        return cls(Path(root), table.to_pylist(), _read_description(Path(root) / DESCRIPTION_FILE), episodes)
+                "Not an ActionTracks artifact", where=path, expected=", ".join(_COLUMNS.names), got=str(error),
+                next_step="run render_actions",
+            ) from error  # fmt: skip
 
     @property
     def episode_ids(self) -> list[str]:
@@ -319,34 +258,12 @@ class ActionTracks:
                 "Action tracks are not finite", where=f"{path}, episode {episode_id}", got=", ".join(unusable),
                 next_step=how_to_rebuild(self.root),
             )  # fmt: skip
-        return EpisodeTracks(
-            episode_id=episode_id,
-            embodiment=row["embodiment"],
-            views=tuple(row["views"]),
-            arms=tuple(row["arms"]),
-            image_size=(row["height"], row["width"]),
-            controls=row["controls"],
-            camera_motion=tuple(row["camera_motion"]),
-            native=None if self.episodes is None else self._native(self.episodes, episode_id, row["controls"]),
-            **arrays,
-        )
-
-    def _native(self, episodes: EpisodeSet, episode_id: str, controls: str) -> np.ndarray:
-        episode = episodes.episode(episodes.position(episode_id))
-        return np.asarray(episode.action if controls == "action" else episode.state, np.float32)
-
-
-def _read_description(path: Path) -> TracksDescription:
-    try:
-        return TracksDescription.model_validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise ArtifactError(
-            "The action tracks do not say the width of their Gaussian",
-            where=path,
-            expected="sigma_px_ref, pixels on the 384 x 512 reference canvas",
-            got=str(error),
-            next_step="run render_actions again",
-        ) from error
+        native = None
+        if self.episodes is not None:
+            episode = self.episodes.episode(self.episodes.position(episode_id))
+            native = np.asarray(episode.action if row["controls"] == "action" else episode.state, np.float32)
+        labels = {name: tuple(row[name]) if isinstance(row[name], list) else row[name] for name in _LABELS}
+        return EpisodeTracks(**labels, **arrays, native=native)
 
 
 def native_vectors(

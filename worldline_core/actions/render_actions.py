@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from itertools import batched
+from itertools import batched, islice
 from pathlib import Path
 from typing import Any, ClassVar
 
-from worldline_core.actions.action_tracks import MissingActionsError, compute_tracks
+from worldline_core.actions.action_tracks import MissingActionsError, add_counts, compute_tracks
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import (
     ARRAYS,
@@ -22,13 +22,11 @@ from worldline_core.actions.episode_tracks import (
     write_index,
     write_shard,
 )
-from worldline_core.actions.overlays import OverlayStyle, overlay_sheet, write_overlay_video
-from worldline_core.actions.tool_projection import add_counts
+from worldline_core.actions.overlays import OverlayStyle, overlay_sheet
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.episode_index import QuarantineRow, nothing_kept, write_quarantine
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
-from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures import evenly_spaced, png_bytes
@@ -37,7 +35,7 @@ from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.remote import is_transient
 
-_LONGEST_NAME = 200
+_PREVIEW_MOMENTS = 4
 _ACCOUNT = ("episode_id", "source", "status", "reason", "stored_bytes")
 
 
@@ -204,49 +202,21 @@ def render_actions(
         "quarantined": len(rejected),
         "samples": add_counts(list(by_embodiment.values())),
         "by_embodiment": by_embodiment,
-        "camera_motion": _camera_motion(rows),
         "quarantine_reasons": dict(sorted(Counter(row.reason for row in rejected).items())),
     }
     write_json_atomic(output / "summary.json", summary)
     return summary
 
 
-def _camera_motion(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """By view, how many episodes take the camera's poses from where."""
-    motion: dict[str, Counter[str]] = {}
-    for row in rows:
-        for view, kind in zip(row["views"], row["camera_motion"], strict=True):
-            motion.setdefault(view, Counter()).update([kind])
-    return {view: dict(sorted(counted.items())) for view, counted in sorted(motion.items())}
-
-
-def _preview_positions(config: RenderActionsConfig, episodes: EpisodeSet, tracks: ActionTracks) -> list[int]:
-    """The first episodes of different embodiments, then further ones, up to the wanted number."""
+def _previews(config: RenderActionsConfig, episodes: EpisodeSet, tracks: ActionTracks, output: Path) -> None:
+    """Sheets of a few episodes under `previews/`: the first of each embodiment, then further ones."""
     usable = [i for i, row in enumerate(episodes.rows) if row.episode_id in tracks and row.video_frames > 0]
     firsts = {episodes.rows[i].embodiment: i for i in reversed(usable)}
-    chosen = sorted(firsts.values())
-    chosen += [i for i in usable if i not in chosen]
-    return chosen[: config.previews]
-
-
-def _previews(config: RenderActionsConfig, episodes: EpisodeSet, tracks: ActionTracks, output: Path) -> None:
-    """Overlay video and contact sheet of a few episodes, under `previews/`."""
-    folder, used = output / "previews", set[str]()
-    for position in _preview_positions(config, episodes, tracks):
+    chosen = dict.fromkeys([*sorted(firsts.values()), *usable])
+    for position in islice(chosen, config.previews):
         row = episodes.rows[position]
-        name = row.episode_id.replace("/", "_")
-        if name in used or len(name.encode()) > _LONGEST_NAME:
-            name = part_name(row.episode_id)
-        used.add(name)
-        sheet_path, video_path = folder / f"{name}.png", folder / f"{name}.mp4"
-        if sheet_path.is_file() and video_path.is_file():
-            continue
-        frames = {view: VideoFrames(episodes.clip(position, view)) for view in row.views}
-        found, height = tracks.tracks(row.episode_id), config.preview_height
-        style, title = OverlayStyle(config.sigma_px_ref), f"{row.embodiment}  ·  {row.instruction}"
-        write_overlay_video(video_path, frames, found, row.fps, tile_height=height, style=style, title=title)
-        moments = evenly_spaced(min(found.num_frames, row.video_frames), config.preview_rows)
-        chosen = {view: images[moments] for view, images in frames.items()}
-        title = f"{row.episode_id}  ·  {title}"
-        sheet = overlay_sheet(chosen, found, moments, tile_height=height, style=style, title=title)
-        write_bytes_atomic(sheet_path, png_bytes(sheet))
+        found, title = tracks.tracks(row.episode_id), f"{row.episode_id}  ·  {row.embodiment}  ·  {row.instruction}"
+        moments = evenly_spaced(min(found.num_frames, row.video_frames), _PREVIEW_MOMENTS)
+        frames = {view: episodes.frames(position, view, moments) for view in row.views}
+        sheet = overlay_sheet(frames, found, moments, style=OverlayStyle(config.sigma_px_ref), title=title)
+        write_bytes_atomic(output / "previews" / f"{part_name(row.episode_id)}.png", png_bytes(sheet))

@@ -21,11 +21,10 @@ import torch
 from markupsafe import Markup
 from pydantic import ConfigDict, TypeAdapter
 
-from worldline_core.actions.action_tracks import tracks_of_projection
+from worldline_core.actions.action_tracks import project_tools, tracks_of_projection
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
 from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip, view_name
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
-from worldline_core.actions.tool_projection import project_tools
 from worldline_core.calibration.camera_errors import corrected_camera
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, SourceDiagnosis
 from worldline_core.data.episodes.conventions import along_tool_z, apply_conventions, image_frames

@@ -138,7 +138,7 @@ class DistillationRun:
         rows = training_rows(store, episodes, stage=2, needed=needed, tracks=tracks)
         contract.require_tracks((row.episode_id for row in rows), tracks)
         loader = ClipLoader(
-            store, views=tuple(config.views), tracks=tracks, wrist_projection=contract.wrist_projection,
+            store, views=tuple(config.views), tracks=tracks,
             action_frames=info.config.action_frames, frame_rates={row.episode_id: row.fps for row in episodes.rows},
             native_size=native, device=device,
         )  # fmt: skip

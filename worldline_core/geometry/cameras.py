@@ -30,7 +30,7 @@ def project_points(points: np.ndarray, K: np.ndarray, T_base_camera: np.ndarray)
     """Pixels (n, 2) and depth (n,) [m] of base points (n, 3) in cameras (n or 1, 4, 4) with one K (3, 3).
 
     A point on or behind the camera plane has a meaningless pixel (finite, never NaN); look at its depth. End-effectors
-    of action maps are projected with gradients, by `actions.tool_projection`.
+    of action maps are projected with gradients, by `actions.action_tracks`.
     """
     T_camera_base = rigid_inverse(T_base_camera)
     in_camera = (T_camera_base[:, :3, :3] @ points[:, :, None])[:, :, 0] + T_camera_base[:, :3, 3]

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from worldline_core.actions.actions_config import WristProjection
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
 
@@ -176,7 +175,6 @@ class ActionContract(StrictModel):
     Attributes:
         controls: what is projected: commands, measured joints, or recorded tool poses.
         sigma_px_ref: width of the Gaussian, pixels on the reference canvas (H, W).
-        wrist_projection: into each frame's wrist camera, or into that of the clip's first frame.
         fps: control frames per second of the recordings.
         grid_size: (rows, columns) of the latents and of the maps.
         tokenizer: fingerprint of the encoder that the latents come from.
@@ -184,7 +182,7 @@ class ActionContract(StrictModel):
 
     controls: Literal["action", "state", "ee_pose"]
     sigma_px_ref: float = Field(gt=0)
-    wrist_projection: WristProjection
+    wrist_projection: Literal["current_camera"] = "current_camera"  # as the shipped checkpoints have it
     fps: float = Field(gt=0)
     grid_size: tuple[int, int]
     tokenizer: str = Field(min_length=1)

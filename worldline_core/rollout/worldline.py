@@ -311,8 +311,7 @@ class WorldLine:
         for track in tracks:
             # Of every latent frame, and of those between it and the one before: `control_frames`.
             drawn = [max(start, frame - stride * back) for frame in frames for back in range(count)]
-            index, last = [min(frame, track.num_frames - 1) for frame in drawn], track.num_frames - 1
-            cut.append(track.clip(index, wrist_projection=self.contract.wrist_projection, start=min(start, last)))
+            cut.append(track.clip([min(frame, track.num_frames - 1) for frame in drawn]))
         if native is not None:
             maps = native_vectors(cut, views, native)
         else:

@@ -21,7 +21,6 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from worldline_core.actions.action_maps import control_frames, render_action_maps, stack_controls
-from worldline_core.actions.actions_config import WristProjection
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, native_vectors
 from worldline_core.errors import ConfigError, DataError, TrainingError, WorldLineError
 from worldline_core.model.text import ClipFacts, TextEncoder
@@ -199,7 +198,6 @@ class ClipLoader:
         views: the model's slots.
         text: turns instructions into ids; its prompts may name a clip's duration and size.
         tracks: controls; the maps get the width that the tracks were made for.
-        wrist_projection: how maps of wrist views are projected.
         native_size: of the control vectors that are given instead of maps, where the model takes these.
         action_frames: control frames whose maps a latent frame takes.
         frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
@@ -214,7 +212,6 @@ class ClipLoader:
         tracks: ActionTracks | None = None,
         text: TextEncoder | None = None,
         frame_rates: Mapping[str, float] | None = None,
-        wrist_projection: WristProjection = "current_camera",
         native_size: int | None = None,
         action_frames: int = 1,
         device: str = "cpu",
@@ -224,14 +221,12 @@ class ClipLoader:
         self.tracks = tracks
         self.text = text
         self.frame_rates = frame_rates or {}
-        self.wrist_projection: WristProjection = wrist_projection
         self.native_size = native_size
         self.action_frames = action_frames
         self.device = device
         self._tracks: dict[str, EpisodeTracks] = {}
         self._resident: ResidentTracks | None = None
-        # Maps that depend on a clip's start are rendered from the tracks of that clip.
-        if isinstance(source, ResidentLatents) and tracks and wrist_projection == "current_camera" and not native_size:
+        if isinstance(source, ResidentLatents) and tracks and not native_size:
             names = [row.episode_id for row in source.rows if row.episode_id in tracks]
             self._resident = ResidentTracks(tracks, names, views, device)
 
@@ -333,5 +328,4 @@ class ClipLoader:
         if clip.episode_id not in self._tracks:
             self._tracks[clip.episode_id] = tracks.tracks(clip.episode_id)
         frames = [clip.frames[index] for index in control_frames(clip.num_frames, self.action_frames)]
-        track = self._tracks[clip.episode_id]
-        return track.clip(frames, wrist_projection=self.wrist_projection, start=clip.start)
+        return self._tracks[clip.episode_id].clip(frames)

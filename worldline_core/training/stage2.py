@@ -81,7 +81,6 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
             "controls": tracks.tracks(stage.training_rows[0].episode_id).controls,
             "fps": stage.episodes.rows[0].fps,
             "sigma_px_ref": tracks.sigma_px_ref,
-            "wrist_projection": config.wrist_projection,
             "grid_size": stage.source.latent_shape[1:],
             "tokenizer": stage.source.description["tokenizer"],
         }
@@ -94,10 +93,10 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
                 "The Stage II model is driven otherwise", where=f"{parent}: native_size", expected=before.config.native_size,
                 got=config.native_size,
             )  # fmt: skip
-        kept = {"sigma_px_ref", "wrist_projection", "tokenizer", "fps"}
+        kept = {"sigma_px_ref", "tokenizer", "fps"}
         learnt.require_tracks((row.episode_id for row in stage.rows), tracks)
         learnt.require(where=inputs["tracks"], **contract.model_dump(include=kept))
-    loader = stage.loader(tracks=tracks, wrist_projection=config.wrist_projection)
+    loader = stage.loader(tracks=tracks)
     objective = FlowMatchingObjective(
         model,
         sigma=config.sigma,

@@ -9,7 +9,6 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from worldline_core.actions.actions_config import WristProjection
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
 from worldline_core.training.clip_config import ClipInput, ClipSampling, LatentInput
@@ -196,7 +195,6 @@ class Stage2Config(StageConfig):
     action_multiplier: float = Field(default=66.0, gt=0)
     action_dropout: float = Field(default=0.0, ge=0, lt=1)
     action_frames: Literal[1, 4] = 1
-    wrist_projection: WristProjection = "current_camera"
     relational: RelationalConfig | None = RelationalConfig()
     native_size: int | None = Field(default=None, ge=1)
 
