@@ -25,7 +25,6 @@ from worldline_core.untrusted_text import visible
 Picture = NDArray[np.uint8]
 """One RGB picture, `h w 3`."""
 Colour = tuple[int, int, int]
-Upscale = Literal["lanczos", "nearest"]
 
 INK: Colour = (24, 26, 31)
 PAPER: Colour = (250, 249, 246)
@@ -97,13 +96,12 @@ def scaled_size(height: int, width: int, target_height: int) -> tuple[int, int]:
     return scaled[0] + scaled[0] % 2, scaled[1] + scaled[1] % 2
 
 
-def scale_frames(frames: NDArray[np.uint8], size: tuple[int, int], upscale: Upscale = "lanczos") -> NDArray[np.uint8]:
-    """Frames `n h w 3` at size (h, w): enlarged by `upscale`, reduced by area averages."""
+def scale_frames(frames: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Frames `n h w 3` at size (h, w): enlarged by Lanczos' filter, reduced by area averages."""
     height, width = size
     if frames.shape[1:3] == (height, width):
         return frames
-    enlarge = {"lanczos": cv2.INTER_LANCZOS4, "nearest": cv2.INTER_NEAREST}[upscale]
-    interpolation = enlarge if height >= frames.shape[1] else cv2.INTER_AREA
+    interpolation = cv2.INTER_LANCZOS4 if height >= frames.shape[1] else cv2.INTER_AREA
     return np.stack([cv2.resize(frame, (width, height), interpolation=interpolation) for frame in frames])
 
 
@@ -146,7 +144,6 @@ def contact_sheet(
     tile_height: int = 128,
     title: str | None = None,
     column_titles: Sequence[str] = (),
-    upscale: Upscale = "lanczos",
     min_width: int = 0,
 ) -> Picture:
     """Labelled rows in one picture; rows may differ in length and in picture size.
@@ -161,8 +158,7 @@ def contact_sheet(
     if not rows or any(row.frames.shape[0] == 0 for row in rows):
         raise ValueError("a contact sheet needs at least one row, and at least one picture in every row")
     tiles = [
-        scale_frames(row.frames, scaled_size(row.frames.shape[1], row.frames.shape[2], tile_height), upscale)
-        for row in rows
+        scale_frames(row.frames, scaled_size(row.frames.shape[1], row.frames.shape[2], tile_height)) for row in rows
     ]
     width = max(tile.shape[0] * (tile.shape[2] + GAP_PX) - GAP_PX for tile in tiles) + 2 * MARGIN_PX
     width = max(width, min_width)
@@ -270,23 +266,15 @@ def clip_strip(strip: ClipStrip, *, tile_height: int = 96) -> Picture:
 
 
 def _bands(strip: ClipStrip, width: int) -> Picture:
-    """Along time: green where kept, a band in its own colour for each reason where dropped."""
-    reasons = [reason for reason, flags in strip.dropped.items() if flags.any()]
-    height = _BAND + max(0, len(reasons) - 1) * (_BAND // 2)
-    canvas = Image.new("RGB", (width, height), PAPER)
-    draw = ImageDraw.Draw(canvas)
-    draw.rectangle((0, 0, width, _BAND - 1), fill=KEPT_COLOUR)
-    for number, reason in enumerate(reasons):
-        top = _BAND + (number - 1) * (_BAND // 2) + 1
-        for i in np.flatnonzero(strip.dropped[reason]):
-            left, right = i * width / strip.count, (i + 1) * width / strip.count - 1
-            draw.rectangle((left, 0, right, _BAND - 1), fill=reason_colour(reason))
-            if number:
-                draw.rectangle((left, top, right, top + _BAND // 2 - 2), fill=reason_colour(reason))
+    """Along time: green where kept, the colour of the reason where dropped; white marks at the moments shown."""
+    colours = np.full((strip.count, 3), KEPT_COLOUR, dtype=np.uint8)
+    for reason, flags in strip.dropped.items():
+        colours[flags] = reason_colour(reason)
+    band = np.repeat(colours[None, np.arange(width) * strip.count // width], _BAND, axis=0)
     for moment in strip.moments:
-        x = (moment + 0.5) * width / strip.count
-        draw.line((x, _BAND - 4, x, _BAND - 1), fill=(255, 255, 255), width=2)
-    return np.asarray(canvas, dtype=np.uint8)
+        x = int((moment + 0.5) * width / strip.count)
+        band[-4:, x : x + 2] = 255
+    return band
 
 
 def _curve(curve: tuple[str, NDArray[np.floating], float], count: int, width: int) -> Picture:
@@ -294,20 +282,17 @@ def _curve(curve: tuple[str, NDArray[np.floating], float], count: int, width: in
     name, values, threshold = curve
     low, high = min(0.0, float(values.min())), max(float(values.max()), 1.15 * threshold)
     high = min(high, 6 * threshold) if threshold > 0 else high
-    span = max(high - low, 1e-9)
     canvas = Image.new("RGB", (width, _CURVE), (255, 255, 255))
     draw = ImageDraw.Draw(canvas)
 
     def y(value: float) -> float:
-        return _CURVE - 4 - (min(value, high) - low) / span * (_CURVE - _LABEL - 8)
+        return _CURVE - 4 - (min(value, high) - low) / max(high - low, 1e-9) * (_CURVE - _LABEL - 8)
 
-    points = [((i + 0.5) * width / count, y(float(value))) for i, value in enumerate(values)]
     for x in range(0, width, 12):
         draw.line((x, y(threshold), x + 6, y(threshold)), fill=(179, 55, 47), width=1)
-    if len(points) > 1:
-        draw.line(points, fill=INK, width=2, joint="curve")
+    points = [((i + 0.5) * width / count, y(float(value))) for i, value in enumerate(values)]
+    draw.line(points, fill=INK, width=2, joint="curve")
     draw.text((6, 3), f"{name.replace('_', ' ')}; dashed: threshold {threshold:.3g}", font=font(12), fill=MUTED)
-    draw.rectangle((0, 0, width - 1, _CURVE - 1), outline=(220, 217, 208))
     return np.asarray(canvas, dtype=np.uint8)
 
 
@@ -330,9 +315,7 @@ class WrittenVideo:
     num_frames: int
 
 
-def side_by_side(
-    columns: Mapping[str, Frames], *, tile_height: int = 256, upscale: Upscale = "lanczos", labels: bool = True
-) -> Iterator[Picture]:
+def side_by_side(columns: Mapping[str, Frames], *, tile_height: int = 256, labels: bool = True) -> Iterator[Picture]:
     """Pictures of labelled columns of frames `n h w 3`, one after the other.
 
     They end with the shortest column, so that no frozen picture looks like a prediction.
@@ -356,7 +339,7 @@ def side_by_side(
     def picture(frames: Mapping[str, Picture]) -> Picture:
         pieces: list[Picture] = []
         for label, frame in frames.items():
-            body = scale_frames(frame[None], (height, width), upscale)[0]
+            body = scale_frames(frame[None], (height, width))[0]
             pieces += [np.concatenate([strips[label], body], axis=0) if labels else body, gap]
         return np.concatenate(pieces[:-1], axis=1)
 
@@ -364,22 +347,20 @@ def side_by_side(
 
 
 def write_side_by_side(
-    path: Path, columns: Mapping[str, Frames], fps: float, *, tile_height: int = 256, upscale: Upscale = "lanczos"
+    path: Path, columns: Mapping[str, Frames], fps: float, *, tile_height: int = 256
 ) -> WrittenVideo:
     """Write labelled columns as `path` (mp4) with a poster beside it."""
     count = min(map(len, columns.values()), default=0)
-    return write_video(path, side_by_side(columns, tile_height=tile_height, upscale=upscale), count, fps)
+    return write_video(path, side_by_side(columns, tile_height=tile_height), count, fps)
 
 
-def write_video(
-    path: Path, frames: Iterable[Picture], count: int, fps: float, *, poster_at: float = 0.6
-) -> WrittenVideo:
-    """Write `count` pictures as `path` (mp4), and a poster JPEG of the fraction `poster_at` of the clip beside it."""
+def write_video(path: Path, frames: Iterable[Picture], count: int, fps: float) -> WrittenVideo:
+    """Write `count` pictures as `path` (mp4), and a poster JPEG of a moment after its middle beside it."""
     shown: list[Picture] = []
 
     def watched() -> Iterator[Picture]:
         for number, frame in enumerate(frames):
-            if number == round(poster_at * (count - 1)):
+            if number == round(0.6 * (count - 1)):
                 shown.append(frame)
             yield frame
 

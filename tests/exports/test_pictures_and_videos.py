@@ -16,9 +16,6 @@ from worldline_core.pictures import (
     contact_sheet,
     evenly_spaced,
     fit_text,
-    jpeg_bytes,
-    png_bytes,
-    scale_frames,
     scaled_size,
     side_by_side,
     text_strip,
@@ -43,11 +40,6 @@ def clip(count: int, value: int, size: tuple[int, int] = (64, 96)) -> np.ndarray
 )
 def test_display_sizes_are_even_and_fit(size: tuple[int, int], target: int, expected: tuple[int, int]) -> None:
     assert scaled_size(*size, target) == expected
-
-
-def test_nearest_keeps_every_pixel() -> None:
-    frames = np.random.default_rng(0).integers(0, 255, (2, 4, 6, 3), dtype=np.uint8)
-    assert np.array_equal(scale_frames(frames, (8, 12), "nearest"), frames.repeat(2, axis=1).repeat(2, axis=2))
 
 
 def test_long_labels_are_cut_to_their_strip() -> None:
@@ -98,9 +90,3 @@ def test_side_by_side_video_and_poster(tmp_path: Path) -> None:
     assert poster.shape == frames[0].shape
     again = write_side_by_side(tmp_path / "again.mp4", columns, 8.0, tile_height=64)
     assert again.video.read_bytes() == made.video.read_bytes()
-
-
-def test_encoded_pictures_are_reproducible() -> None:
-    picture = np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8)
-    assert png_bytes(picture) == png_bytes(picture.copy())
-    assert jpeg_bytes(picture) == jpeg_bytes(picture.copy())

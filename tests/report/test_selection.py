@@ -43,7 +43,7 @@ def test_median_best_and_worst() -> None:
 
 
 def test_without_scores_episodes_are_taken_by_name() -> None:
-    chosen = choose_episodes(VideoScores([], [], []), None, ["c", "a", "b"])
+    chosen = choose_episodes(VideoScores([], [], []), ["c", "a", "b"])
     assert [item.episode_id for item in chosen] == ["a", "b", "c"]
     assert "no scores" in chosen[0].reason
 

@@ -116,7 +116,7 @@ CONFIGS: dict[str, StrictModel] = {
     "evaluate_video": VideoEvaluationConfig(segmenters=("colour",), resamples=100),
     "evaluate_policy": PolicyEvaluationConfig(segmenter="colour", splits=("test",), resamples=100),
     "evaluate_planning": PlanningConfig(segmenter="colour", budgets=(2,), runs=1, resamples=100),
-    "report": ReportConfig(rerun=False, mcap=False),
+    "report": ReportConfig(),
 }
 
 

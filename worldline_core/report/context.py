@@ -39,10 +39,6 @@ KINDS = {
 """Label and colour of each kind of method, in the report's order."""
 GROUPS = {TRUE_METHOD: "", "shipped": "long-trained", "run": "this run", "baseline": ""}
 """Origin of a method's weights, in the report's order."""
-STEPS_NAME = re.compile(r"(?:shipped_)?(?P<base>stage2|causal)_(?P<steps>\d+)_steps")
-ZERO_WORDS = frozenset({"zero", "zeroed", "none", "noaction", "noactions", "no"})
-SHUFFLED_WORDS = frozenset({"shuffled", "shuffle"})
-
 SPLIT_LABELS = {
     "test": "held-out scenes",
     "ood_test": "held-out embodiment",
@@ -58,14 +54,9 @@ IOU_METRICS = ("robot_iou_exact", "robot_iou")
 class ReportConfig(StrictModel):
     """Options of the step `report`."""
 
-    primary_method: str | None = Field(
-        default=None, description="the method that heads the page; none: the long-trained Stage II, else this run's"
-    )
     tile_height: int = Field(
         default=256, ge=32, le=1080, description="height of one video in a side-by-side video, pixels"
     )
-    rerun: bool = Field(default=True, description="write a Rerun recording of every episode shown")
-    mcap: bool = Field(default=True, description="write MCAP files of every episode shown")
 
 
 @dataclass(frozen=True)
@@ -78,9 +69,9 @@ class Method:
 
     @property
     def label(self) -> str:
-        found = STEPS_NAME.fullmatch(self.name)
+        found = re.fullmatch(r"(?:shipped_)?(stage2|causal)_(\d+)_steps", self.name)
         if found:
-            return f"{KINDS[found['base']][0]}, {found['steps']} steps"
+            return f"{KINDS[found[1]][0]}, {found[2]} steps"
         return KINDS[self.kind][0] or self.name.replace("_", " ")
 
     @property
@@ -92,30 +83,28 @@ class Method:
     def colour(self) -> str:
         return KINDS[self.kind][1]
 
-    @property
-    def rank(self) -> tuple[int, int, str]:
-        return [*GROUPS].index(self.group), [*KINDS].index(self.kind), self.name
-
 
 def method(name: str) -> Method:
     """The method of a name: `shipped_stage2_shuffled`, `causal`, `stage2.zero`, `copy_first_frame`, `true`, ..."""
-    words = set(re.split(r"[._\-\s]+", name.lower()))
+    words = set(re.split(r"[._-]+", name))
     if name == TRUE_METHOD:
         return Method(name, TRUE_METHOD, TRUE_METHOD)
     if "copy" in words:
         return Method(name, "copy", "baseline")
-    # Another number of steps is another method, with a label of its own.
-    if "steps" not in words and (found := words & {"stage1", "backbone"}):
+    group = "shipped" if "shipped" in words else "run"
+    if "steps" in words:  # another number of steps is another method
+        return Method(name, "other", group)
+    if found := words & {"stage1", "backbone"}:
         return Method(name, found.pop(), "baseline")
-    base = "causal" if "causal" in words else "stage2" if words & {"stage2", "stageii"} else ""
-    control = "_zero" if words & ZERO_WORDS else "_shuffled" if words & SHUFFLED_WORDS else ""
-    kind = f"{base}{control}" if base and "steps" not in words else "other"
-    return Method(name, kind, "shipped" if "shipped" in words else "run")
+    base = next((word for word in ("causal", "stage2") if word in words), "other")
+    control = "_zero" if words & {"zero", "no"} else "_shuffled" if "shuffled" in words else ""
+    return Method(name, base + control if base != "other" else base, group)
 
 
 def in_order(names: Iterable[str]) -> list[Method]:
     """Recorded videos, long-trained weights, this run's, then baselines without actions."""
-    return sorted((method(name) for name in names), key=lambda m: m.rank)
+    kinds, groups = [*KINDS], [*GROUPS]
+    return sorted(map(method, names), key=lambda m: (groups.index(m.group), kinds.index(m.kind), m.name))
 
 
 def predicting(names: Iterable[str]) -> list[Method]:
@@ -143,35 +132,28 @@ class VideoScores:
     @cached_property
     def groups(self) -> list[str]:
         """Splits that have scores, the held-out ones first."""
-        found = {g for s in self.summaries for g in s.get("metrics", {}) if "/" not in g}
         order = [*SPLIT_LABELS]
-        return sorted(found, key=lambda g: (order.index(g) if g in order else 99, g))
+        return sorted({g for s in self.summaries for g in s["metrics"] if "/" not in g}, key=order.index)
 
     def methods(self, group: str) -> list[Method]:
-        return in_order({m for s in self.summaries for m in s.get("metrics", {}).get(group, {})})
+        return in_order({m for s in self.summaries for m in s["metrics"].get(group, {})})
 
     def names(self, group: str) -> set[str]:
         """Measured metrics of any method of a group: ``psnr``, ``psnr@head``, ``robot_iou[colour]@head``, ..."""
-        return {n for s in self.summaries for found in s.get("metrics", {}).get(group, {}).values() for n in found}
+        return {n for s in self.summaries for found in s["metrics"].get(group, {}).values() for n in found}
 
     def value(self, group: str, method: str, metric: str) -> JsonObject | None:
         """`{"mean", "low", "high", "count"}` of a metric, or None."""
-        for summary in self.summaries:
-            found = summary.get("metrics", {}).get(group, {}).get(method, {}).get(metric)
-            if found is not None:
-                return found
-        return None
+        found = (s["metrics"].get(group, {}).get(method, {}).get(metric) for s in self.summaries)
+        return next((value for value in found if value is not None), None)
 
     def difference(self, group: str, first: str, second: str, metric: str) -> JsonObject | None:
         """Paired difference `first - second` over the trajectories that both have, or None."""
-        for summary in self.summaries:
-            for row in summary.get("differences", {}).get(group, []):
-                if row["metric"] != metric:
-                    continue
-                if (row["first"], row["second"]) == (first, second):
-                    return row
-                if (row["first"], row["second"]) == (second, first):
-                    return {**row, "mean": -row["mean"], "low": -row["high"], "high": -row["low"]}
+        for row in (row for s in self.summaries for row in s.get("differences", {}).get(group, [])):
+            if (row["first"], row["second"], row["metric"]) == (first, second, metric):
+                return row
+            if (row["first"], row["second"], row["metric"]) == (second, first, metric):
+                return {**row, "mean": -row["mean"], "low": -row["high"], "high": -row["low"]}
         return None
 
     @cached_property
@@ -182,11 +164,7 @@ class VideoScores:
     @cached_property
     def segmenters(self) -> list[dict[str, Any]]:
         """The segmenters used, each with its own accuracy on true frames."""
-        found: dict[str, dict[str, Any]] = {}
-        for summary in self.summaries:
-            for segmenter in summary.get("segmenters", []):
-                found.setdefault(segmenter["name"], segmenter)
-        return list(found.values())
+        return list({found["name"]: found for s in self.summaries for found in s.get("segmenters", [])}.values())
 
     def iou_metric(self, group: str, method: str) -> str | None:
         """The most trustworthy IoU that a method has."""
@@ -200,11 +178,10 @@ class VideoScores:
                 values[row["episode_id"]].append(row["value"])
         return {name: sum(items) / len(items) for name, items in sorted(values.items())}
 
-    def primary(self, group: str, configured: str | None = None) -> Method | None:
-        """The method that heads the page: the configured one, or the first Stage II."""
+    def primary(self, group: str) -> Method | None:
+        """The method that heads the page: the first Stage II, long-trained weights before this run's."""
         methods = self.methods(group)
-        named = next((m for m in methods if m.name == configured), None)
-        return named or next((m for m in methods if m.kind == "stage2"), methods[0] if methods else None)
+        return next((m for m in methods if m.kind == "stage2"), methods[0] if methods else None)
 
 
 @dataclass(frozen=True)

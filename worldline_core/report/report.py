@@ -1,7 +1,7 @@
 """The step report: static pages from whatever artifacts are finished, with their media beside them; and its first page.
 
 Pages and media are reproducible. Times, devices and versions are not: they go to `run/run.js` and into the pages when these are
-opened. Recordings for viewers are in `run/recordings/`.
+opened.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = ["ReportConfig", "report"]
 logger = logging.getLogger(__name__)
 
 PAGES = {
-    videos_section: "Truth beside every model, in every view, with recordings to open in 3-D.",
+    videos_section: "Truth beside every model, in every view.",
     quality_section: "Robot IoU, SSIM, PSNR, LPIPS, drift along time, and time per frame.",
     decisions_section: "Outcomes judged, and plans chosen, by predicted videos.",
     data_section: "Recorded robots, scenes and tasks; kept and dropped episodes with their reasons.",
@@ -134,7 +134,7 @@ def head_view(context: ReportContext) -> HeadView | None:
     """The scores that head the page; None where no robot IoU was measured."""
     scores = context.video_scores
     group = scores.groups[0] if scores.groups else None
-    primary = scores.primary(group, context.config.primary_method) if group else None
+    primary = scores.primary(group) if group else None
     metric = scores.iou_metric(group, primary.name) if group and primary else None
     return None if group is None or primary is None or metric is None else HeadView(scores, group, primary, metric)
 

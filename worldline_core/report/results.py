@@ -58,7 +58,7 @@ def quality_section(context: ReportContext) -> Section:
                     for view in ("head", "left_wrist", "right_wrist")
                     for table in metric_tables(scores, group, view)
                 ],
-                "charts": [*difference_charts(context, scores, group), *charts_over_time(scores, group)],
+                "charts": [*difference_charts(scores, group), *charts_over_time(scores, group)],
             }
             for group in scores.groups
         ],
@@ -98,9 +98,9 @@ def metric_tables(scores: VideoScores, group: str, view: str) -> list[Table]:
     return tables
 
 
-def difference_charts(context: ReportContext, scores: VideoScores, group: str) -> list[Markup]:
+def difference_charts(scores: VideoScores, group: str) -> list[Markup]:
     """Paired differences of the main method to every other, in robot IoU and SSIM of the head view."""
-    primary, charts = scores.primary(group, context.config.primary_method), list[Markup]()
+    primary, charts = scores.primary(group), list[Markup]()
     if primary is None:
         return []
     for metric, label in CHARTED.items():

@@ -1,4 +1,4 @@
-"""Page "Predicted videos": truth and predictions side by side, in each view, with recordings to open in 3-D.
+"""Page "Predicted videos": truth and predictions side by side, in each view.
 
 Episodes are never picked by hand: shown are the best, the median and the worst by a stated score.
 """
@@ -15,13 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import DataError
 from worldline_core.evaluation.recordings import stride_of
-from worldline_core.exports.export import export_rollout
 from worldline_core.pages.page import words
 from worldline_core.pictures import (
     Picture,
@@ -62,31 +60,26 @@ def best_median_worst(values: Mapping[str, float]) -> list[tuple[str, str, float
     return [(label, *item) for item, label in chosen.items()]
 
 
-def choose_episodes(scores: VideoScores, primary: str | None, available: Sequence[str]) -> list[ChosenEpisode]:
-    """Median, best and worst of the first held-out group, and the median of every further one.
+def choose_episodes(scores: VideoScores, available: Sequence[str]) -> list[ChosenEpisode]:
+    """Median, best and worst by the main method's robot IoU of the first held-out group, and the median of every further one.
 
-    Args:
-        primary: the method whose robot IoU ranks the episodes.
-        available: episodes that have predicted videos; without scores the first, middle and last of them are taken.
+    ``available`` have predicted videos; without scores the first, middle and last of them are taken.
     """
-    known = set(available)
     chosen: list[ChosenEpisode] = []
     for group in scores.groups:
-        first = scores.primary(group, primary)
+        first = scores.primary(group)
         metric = scores.iou_metric(group, first.name) if first is not None else None
         if first is None or metric is None or group == "train":
             continue
-        values = {k: v for k, v in scores.per_episode(first.name, metric, "head", group).items() if k in known}
-        ranked = best_median_worst(values)
-        where = SPLIT_LABELS.get(group, group)
+        values = scores.per_episode(first.name, metric, "head", group)
+        ranked = best_median_worst({name: value for name, value in values.items() if name in available})
         for label, episode, value in ranked if not chosen else ranked[:1]:
-            chosen.append(ChosenEpisode(episode, f"{label} of {len(values)} on {where}", value))
-    if chosen or not available:
-        return chosen
-    ordered = sorted(known)
-    places = sorted({0, len(ordered) // 2, len(ordered) - 1})
-    return [
-        ChosenEpisode(ordered[i], f"number {i + 1} of {len(ordered)} by name (no scores were given)") for i in places
+            reason = f"{label} of {len(values)} on {SPLIT_LABELS.get(group, group)}"
+            chosen.append(ChosenEpisode(episode, reason, value))
+    ordered = sorted(available)
+    places = sorted({0, len(ordered) // 2, len(ordered) - 1}) if ordered and not chosen else []
+    return chosen or [
+        ChosenEpisode(ordered[i], f"number {i + 1} of {len(ordered)} by name (no scores)") for i in places
     ]
 
 
@@ -96,7 +89,7 @@ def chosen_episodes(context: ReportContext) -> list[ChosenEpisode]:
         return []
     known = {row.episode_id for row in context.episodes.rows}
     predicted = sorted({name for rollout in context.rollouts.values() for name in rollout.episode_ids if name in known})
-    return choose_episodes(context.video_scores, context.config.primary_method, predicted)
+    return choose_episodes(context.video_scores, predicted)
 
 
 def videos_section(context: ReportContext) -> Section:
@@ -135,7 +128,6 @@ def card(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, numb
     return {
         "item": item, "row": row, "number": number, "panels": panels,
         "tone": {"success": "good", "failure": "bad"}.get(row.outcome, ""),
-        "recordings": recordings(context, episodes, item, number),
     }  # fmt: skip
 
 
@@ -163,21 +155,6 @@ def video(
     return {"video": made, "caption": caption}
 
 
-def recordings(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, number: int) -> list[str]:
-    """Names of the Rerun and MCAP files written below run/recordings (a Rerun recording's bytes are not reproducible)."""
-    formats = [name for name, wanted in (("rrd", context.config.rerun), ("mcap", context.config.mcap)) if wanted]
-    shown = {m.name for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)}
-    if not formats:
-        return []
-    folder = context.inputs.get("render_actions")
-    written = export_rollout(
-        {name: rollout for name, rollout in context.rollouts.items() if name in shown}, episodes,
-        None if folder is None else ActionTracks.open(folder), item.episode_id, context.output / "run" / "recordings",
-        formats=formats, name=f"episode{number}",
-    )  # fmt: skip
-    return [path.name for path in written]
-
-
 def overview_video(context: ReportContext) -> dict[str, Any] | None:
     """Truth beside the first model's prediction, one row per view, of the first chosen episode; None without one."""
     episodes, chosen = context.episodes, chosen_episodes(context)
@@ -187,7 +164,7 @@ def overview_video(context: ReportContext) -> dict[str, Any] | None:
     methods = [m for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)]
     if not methods:
         return None
-    method = next((m for m in methods if m.name == context.config.primary_method), methods[0])
+    method = methods[0]
     index = episodes.position(item.episode_id)
     row = episodes.rows[index]
     rows: list[Iterator[Picture]] = []
