@@ -5,11 +5,10 @@ from tasks.execution.artifact_task import ArtifactTask
 train_segmenter = ArtifactTask(
     name="train_segmenter",
     summary="train the small robot segmenter of the embedded default",
-    version=2,
+    version=3,
     function="worldline_core.evaluation.segmenters.learned:train_segmenter",
     config="worldline_core.evaluation.evaluation_config:SegmenterConfig",
     inputs=("episodes",),
-    optional_inputs=("evaluation",),
 )
 
 if __name__ == "__main__":

@@ -1,4 +1,3 @@
-import json
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,7 @@ from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter, Sam3
 from worldline_core.rehearsal.outside_models import write_sam3
 from worldline_core.training import trainer
 
-CONFIG = SegmenterConfig(
-    widths=(8, 16), steps=4, batch_size=2, checkpoint_every=1, evaluate_splits=("test",), frame_stride=4
-)
+CONFIG = SegmenterConfig(widths=(8, 16), steps=4, batch_size=2, checkpoint_every=1, frame_stride=4)
 
 
 @pytest.fixture
@@ -55,8 +52,6 @@ def test_killed_training_continues_to_the_same_bytes(training, tmp_path, monkeyp
     train_segmenter(CONFIG, {"episodes": training}, resumed)
     for name in ("model.safetensors", "segmenter.json", "metrics.jsonl"):
         assert (whole / name).read_bytes() == (resumed / name).read_bytes()
-    description = json.loads((whole / "segmenter.json").read_text())
-    assert set(description["metrics"]["test"]) == {"iou", "iou_degraded", "videos"}
     masks = LearnedSegmenter.load(whole).segment(np.zeros((2, 30, 50, 3), np.uint8))
     assert (masks.shape, masks.dtype) == ((2, 30, 50), bool)
 

@@ -18,10 +18,9 @@ msgpack = pytest.importorskip("msgpack")
 
 from websockets.sync.server import ServerConnection, serve
 
-from tests.robustness.test_hostile_endpoints import Endpoint
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import pack, unpack
-from worldline_core.policies.openpi import OpenpiPolicy, is_healthy
+from worldline_core.policies.openpi import OpenpiPolicy
 
 
 def encode(value: Any) -> Any:
@@ -72,8 +71,6 @@ def policy_server(
                 connection.send(each)
 
     def check(connection: ServerConnection, request: Any) -> Any:
-        if request.path == "/healthz":
-            return connection.respond(200, "OK\n")
         if key is not None and request.headers.get("Authorization") != f"Api-Key {key}":
             return connection.respond(401, "no\n")
         return None
@@ -94,7 +91,6 @@ def test_a_hundred_chunks() -> None:
         return {"actions": observation["state"][None] + np.arange(8, dtype=np.float32)[:, None]}
 
     with policy_server(answer, key="abc") as url:
-        assert is_healthy(url)
         with OpenpiPolicy(url, api_key="abc") as policy:
             assert policy.metadata == {"name": "scripted"}
             state = np.zeros(14, np.float32)
@@ -113,8 +109,6 @@ def test_a_hundred_chunks() -> None:
             OpenpiPolicy(url)
     with pytest.raises(UnavailableError, match=r"(?s)No server answers.*start it"):
         OpenpiPolicy(url, deadline_s=2)
-    with pytest.raises(UnavailableError, match="No server answers"):
-        is_healthy(url, deadline_s=2)
 
 
 def _fails(_: dict[str, Any]) -> Any:
@@ -163,15 +157,6 @@ def test_a_deadline_is_for_the_whole_exchange() -> None:
         OpenpiPolicy(url)
 
 
-def test_a_reply_that_nobody_asked_for_is_not_taken_for_the_next() -> None:
-    twice = [msgpack.packb(encode({"actions": np.full((1, 2), value)})) for value in (0.0, 1.0)]
-    with policy_server(lambda _: twice) as url, OpenpiPolicy(url) as policy:
-        assert policy.infer({})["actions"][0, 0] == 0.0
-        time.sleep(0.1)
-        with pytest.raises(DataError, match="unexpected message"):
-            policy.infer({})
-
-
 @pytest.mark.parametrize(
     ("key", "sent"), [("abc\r", "abc"), ("abc\r\nX-Evil: 1", None), ("\0", None), ("schl\u00fcssel", None)]
 )
@@ -199,23 +184,6 @@ def _fails_with_the_key(_: dict[str, Any]) -> Any:
 def test_an_address_that_is_none_is_named(url: str) -> None:
     with pytest.raises(UnavailableError, match="No server answers"):
         OpenpiPolicy(url, deadline_s=2)
-    with pytest.raises(UnavailableError, match="No server answers"):
-        is_healthy(url, deadline_s=2)
-
-
-def test_a_health_that_drips_is_given_up_in_time() -> None:
-    def drip(connection: socket.socket) -> None:
-        connection.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
-        for _ in range(100):
-            connection.sendall(b"x")
-            time.sleep(0.05)
-
-    endpoint = Endpoint(drip)
-    begin = time.monotonic()
-    with pytest.raises(UnavailableError, match="No server answers"):
-        is_healthy(endpoint.url.replace("http", "ws"), deadline_s=0.3)
-    assert time.monotonic() - begin < 2
-    endpoint.close()
 
 
 @pytest.mark.parametrize("dtype", ["?", "u1", "<i8", ">i4", "<f2", "<f4", "<f8", "S3", "<U5"])
@@ -261,20 +229,3 @@ def test_what_cannot_be_sent_is_named() -> None:
     for wrong in (np.array([object()]), np.zeros(2, "V4"), np.complex64(1), {1, 2}, math, 1 << 70):
         with pytest.raises(DataError, match="cannot be sent"):
             pack({"x": wrong})
-
-
-def test_a_name_that_is_not_resolved_counts_towards_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
-    resolved = threading.Event()
-
-    def hang(*_: object, **__: object) -> list[Any]:
-        resolved.wait(20)
-        raise socket.gaierror("no such name")
-
-    monkeypatch.setattr(socket, "getaddrinfo", hang)
-    begin = time.monotonic()
-    with pytest.raises(UnavailableError, match=r"ws://policy\.example"):
-        OpenpiPolicy("ws://policy.example:8000", deadline_s=0.3)
-    with pytest.raises(UnavailableError, match=r"ws://policy\.example"):
-        is_healthy("ws://policy.example:8000", deadline_s=0.3)
-    assert time.monotonic() - begin < 5
-    resolved.set()

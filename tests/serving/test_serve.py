@@ -19,7 +19,6 @@ from tests.policies.test_openpi import policy_server  # pyright: ignore[reportMi
 from worldline_core import WorldLine
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import unpack
-from worldline_core.policies.openpi import is_healthy
 from worldline_core.rollout.observation import Camera
 from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.serving.app import server_token
@@ -52,7 +51,7 @@ def drive(simulation: RemoteSimulation, steps: int, seed: int) -> str:
 def test_a_session_is_the_simulation_of_one_process(url: str, small_world: WorldLine, shipped) -> None:
     here = SessionHost(small_world, ServeConfig(episodes=shipped / "recordings")).simulate(EPISODE, [3])  # pyright: ignore[reportCallIssue]
     with SimulatorClient(url) as client:
-        assert is_healthy(url)
+        assert httpx.get(url.replace("ws", "http") + "/healthz").text == "OK\n"
         assert client.metadata["views"] == list(small_world.views)
         assert client.metadata["fps"] == 8
         assert EPISODE in {row["id"] for row in client.metadata["episodes"]}
@@ -233,7 +232,7 @@ def test_who_may_connect(serving: Callable, monkeypatch: pytest.MonkeyPatch) -> 
         assert status(url, authorization="Bearer correct hors") == 401
         assert status(url, authorization=f"Bearer {TOKEN}") == 200
         assert status(url, authorization=f"Bearer {TOKEN}", origin="http://attacker.example") == 403
-        assert is_healthy(url)
+        assert httpx.get(url.replace("ws", "http") + "/healthz").text == "OK\n"
         with pytest.raises(UnavailableError, match=r"(?s)403.*token"):
             SimulatorClient(url)
         with SimulatorClient(url, token=TOKEN) as client:

@@ -47,14 +47,9 @@ class SegmenterConfig(StrictModel):
     steps: int = Field(default=1000, ge=1)
     batch_size: int = Field(default=24, ge=1)
     learning_rate: float = Field(default=3e-3, gt=0)
-    weight_decay: float = Field(default=1e-4, ge=0)
-    average_decay: float = Field(default=0.995, ge=0, lt=1, description="of the moving average that is kept")
     image_size: ImageSize | None = Field(default=None, description="(height, width) to resize to; none: as stored")
     frame_stride: int = Field(default=2, ge=1, description="every n-th frame of a training episode is used")
     checkpoint_every: int = Field(default=200, ge=1)
-    evaluate_splits: tuple[str, ...] = ("validation", "test", "ood_test")
-    evaluate_frame_stride: int = Field(default=4, ge=1)
-    threshold: float = Field(default=0.5, gt=0, lt=1)
     seed: int = Field(default=42, ge=0)
 
     @property
@@ -64,10 +59,8 @@ class SegmenterConfig(StrictModel):
             steps=self.steps,
             batch_size=self.batch_size,
             seed=self.seed,
-            optimizer=OptimizerConfig(
-                learning_rate=self.learning_rate, betas=(0.9, 0.999), weight_decay=self.weight_decay
-            ),
-            ema_decay=self.average_decay,
+            optimizer=OptimizerConfig(learning_rate=self.learning_rate, betas=(0.9, 0.999), weight_decay=1e-4),
+            ema_decay=0.995,
             log_every=1,
             save_every_steps=self.checkpoint_every,
         )

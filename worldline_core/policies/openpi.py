@@ -7,14 +7,12 @@ closes with code 1011. There is no reset message.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from worldline_core.errors import DataError, UnavailableError
-from worldline_core.http_exchange import IncompleteResponseError, UnreachableError, exchange
+from worldline_core.errors import DataError
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
 from worldline_core.policies.message_socket import MessageSocket
 
@@ -61,12 +59,8 @@ class OpenpiPolicy(MessageSocket):
         """
         reply = self.request(observation, deadline_s=deadline_s)
         actions = reply.get("actions")
-        if (
-            not isinstance(actions, np.ndarray)
-            or actions.ndim != 2
-            or actions.dtype.kind not in "fiu"
-            or not actions.size
-        ):
+        numbers = isinstance(actions, np.ndarray) and actions.dtype.kind in "fiu"
+        if not numbers or actions.ndim != 2 or not actions.size:
             got = f"{actions.dtype} {actions.shape}" if isinstance(actions, np.ndarray) else type(actions).__name__
             raise DataError(
                 "The policy's actions are no chunk",
@@ -79,16 +73,3 @@ class OpenpiPolicy(MessageSocket):
             step, column = np.argwhere(~np.isfinite(actions))[0]
             raise DataError("An action is not finite", where=f"{self.url}, step {step}, column {column}")
         return {**reply, "actions": actions}
-
-
-def is_healthy(url: str, *, deadline_s: float = 5.0) -> bool:
-    """Returns True if the server at a websocket address answers ``GET /healthz`` with status 200.
-
-    Raises: UnavailableError: no server answers.
-    """
-    address = re.sub(r"^ws(s?://[^/?#]*).*", r"http\1/healthz", url)
-    try:
-        status, _ = exchange(address, None, headers={}, timeout_s=deadline_s, max_bytes=1 << 16, proxies=False)
-    except (UnreachableError, IncompleteResponseError) as error:
-        raise UnavailableError("No server answers", where=url, got=str(error)) from error
-    return status == 200
