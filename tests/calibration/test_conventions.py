@@ -17,7 +17,6 @@ from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     apply_conventions,
-    arm_blocks,
     image_frames,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
@@ -56,11 +55,6 @@ def two_arms(seed: int = 0, **changes: Any) -> Episode:
         "T_base_ee": tools, "gripper": opening, "state_names": names, "state_kind": "ee_pose",
     }  # fmt: skip
     return Episode(**(values | changes))
-
-
-def as_joints(episode: Episode) -> Episode:
-    names = tuple(name.replace("/q", "/joint_") for name in episode.state_names or ())
-    return replace(episode, state_kind="joints", state_names=names, T_base_ee=None, gripper=None)
 
 
 def quaternions_up_to_sign(state: np.ndarray) -> np.ndarray:
@@ -112,6 +106,22 @@ MISTAKES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
+def test_exchanged_arms_can_be_drawn() -> None:
+    exchanged = apply_conventions(two_arms(), RecordedConventions(arms="exchanged"))
+    for poses in (exchanged.T_base_ee, exchanged.gripper):
+        assert poses is not None
+        torch.from_numpy(poses)  # refuses an array that is read backwards; the doctor's pictures ended so
+
+
+def test_degrees_of_joints() -> None:
+    episode = replace(two_arms(), state_kind="joints", T_base_ee=None, gripper=None)
+    conventions = RecordedConventions(angle_unit="deg")
+    spoiled = corrupt(episode, conventions)
+    assert np.allclose(spoiled.state[:, 3], np.degrees(episode.state[:, 3]))
+    assert np.array_equal(spoiled.state[:, 7], episode.state[:, 7])  # an opening is no angle
+    assert_same(apply_conventions(spoiled, conventions), episode)
+
+
 @pytest.mark.parametrize("name", MISTAKES)
 @pytest.mark.parametrize("source_offset", [0.0, 0.23])
 def test_a_mistake_is_undone_and_changes_something(name: str, source_offset: float) -> None:
@@ -121,22 +131,6 @@ def test_a_mistake_is_undone_and_changes_something(name: str, source_offset: flo
     assert_same(apply_conventions(spoiled, conventions), episode)
     with pytest.raises(AssertionError):
         assert_same(spoiled, episode)
-
-
-def test_exchanged_arms_can_be_drawn() -> None:
-    exchanged = apply_conventions(two_arms(), RecordedConventions(arms="exchanged"))
-    for poses in (exchanged.T_base_ee, exchanged.gripper):
-        assert poses is not None
-        torch.from_numpy(poses)  # refuses an array that is read backwards; the doctor's pictures ended so
-
-
-def test_degrees_of_joints() -> None:
-    episode = as_joints(two_arms())
-    conventions = RecordedConventions(angle_unit="deg")
-    spoiled = corrupt(episode, conventions)
-    assert np.allclose(spoiled.state[:, 3], np.degrees(episode.state[:, 3]))
-    assert np.array_equal(spoiled.state[:, 7], episode.state[:, 7])  # an opening is no angle
-    assert_same(apply_conventions(spoiled, conventions), episode)
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
@@ -260,8 +254,3 @@ def test_lines_are_what_a_configuration_reads() -> None:
         RecordedConventions(intrinsics_size=(0, 640))
     with pytest.raises(ValidationError, match="extra"):
         RecordedConventions.model_validate({"extrinsic": "base_to_camera"})
-
-
-def test_blocks_of_arms() -> None:
-    assert arm_blocks(two_arms()) == (tuple(range(8)), tuple(range(8, 16)))
-    assert arm_blocks(two_arms(state_names=tuple(f"c{i}" for i in range(16)))) == ()

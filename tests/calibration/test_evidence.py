@@ -11,17 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from worldline_core.calibration.calibration_doctor import camera_lags, intrinsics_sizes
 from worldline_core.calibration.evidence import (
-    Typical,
-    correlation_log_likelihood,
     finger_flow,
-    hand_eye_log_likelihood,
     pose_terms,
     rms_hand_eye,
     still_view_agreement,
     stopped_share,
     wrist_flow_agreement,
 )
-from worldline_core.calibration.observation import observe, read
+from worldline_core.calibration.observation import Observation, Reading, observe, read
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.cameras import project_points
@@ -56,6 +53,13 @@ def episode(opening: np.ndarray | None = None) -> Episode:
             "right_wrist": CameraTrack("right_wrist", K, track[:, 0] @ MOUNT, WIDTH, HEIGHT),
         },
     )  # fmt: skip
+
+
+def seen_as(recording: Episode, pictures: dict[str, np.ndarray], **mistake: object) -> tuple[Observation, Reading]:
+    observation = observe(recording, pictures, None)
+    reading = read(observation, RecordedConventions.model_validate(mistake))
+    assert reading is not None
+    return observation, reading
 
 
 def texture(height: int, width: int, coarseness: int = 8) -> np.ndarray:
@@ -95,10 +99,7 @@ def seen() -> dict[str, np.ndarray]:
 
 
 def test_flow_of_the_tool_agrees_with_a_right_camera_only(seen: dict[str, np.ndarray]) -> None:
-    observation = observe(episode(), seen, None)
-    right = read(observation, RecordedConventions())
-    assert right is not None
-    flow, change, turn = still_view_agreement(observation, right, "head")
+    flow, change, turn = still_view_agreement(*seen_as(episode(), seen), "head")
     assert flow > 0.85
     assert change > 0.4
     assert abs(turn) < 8
@@ -107,41 +108,30 @@ def test_flow_of_the_tool_agrees_with_a_right_camera_only(seen: dict[str, np.nda
     roll[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     # The camera turned about its axis by 40 degrees, and the tool by as much about the same axis: the patch stays where
     # it is predicted while its motion is turned.
-    rolled = replace(observation.episode.cameras["head"], T_base_camera=(HEAD @ roll)[None])
-    other = observe(replace(episode(), cameras={"head": rolled}), {"head": seen["head"]}, None)
-    reading = read(other, RecordedConventions())
-    assert reading is not None
-    rolled_flow, _, rolled_turn = still_view_agreement(other, reading, "head")
+    rolled = replace(episode().cameras["head"], T_base_camera=(HEAD @ roll)[None])
+    other = seen_as(replace(episode(), cameras={"head": rolled}), {"head": seen["head"]})
+    rolled_flow, _, rolled_turn = still_view_agreement(*other, "head")
     assert rolled_flow < flow - 0.1
     assert abs(abs(rolled_turn) - 40) < 12
-    mirrored = read(observation, RecordedConventions(camera_axes="opengl", views=("head",)))
-    assert mirrored is not None
-    assert still_view_agreement(observation, mirrored, "head") == (0.0, 0.0, 0.0)  # the tool is behind the camera
+    mirrored = seen_as(episode(), seen, camera_axes="opengl", views=("head",))
+    assert still_view_agreement(*mirrored, "head") == (0.0, 0.0, 0.0)  # the tool is behind the camera
 
 
 @pytest.mark.parametrize("lag", [0, 2])
 def test_the_lag_of_pictures_is_where_flow_agrees_best(lag: int) -> None:
-    observation = observe(episode(), {"head": head_pictures(lag)}, None)
-    recorded = read(observation, RecordedConventions())
-    assert recorded is not None
+    observation, recorded = seen_as(episode(), {"head": head_pictures(lag)})
     found = {k: still_view_agreement(observation, recorded.with_image_lag(k), "head")[0] for k in range(-3, 4)}
     assert max(found, key=lambda k: found[k]) == lag
 
 
 def test_background_flow_of_a_wrist_camera_tells_its_axes(seen: dict[str, np.ndarray]) -> None:
-    observation = observe(episode(), seen, None)
-    agreement = {}
-    for name, conventions in (
-        ("right", RecordedConventions()),
-        ("opengl", RecordedConventions(camera_axes="opengl")),
-        ("inverse", RecordedConventions(extrinsics="base_to_camera")),
-    ):
-        reading = read(observation, conventions)
-        assert reading is not None
-        agreement[name] = wrist_flow_agreement(observation, reading, "right_wrist")
-    assert agreement["right"] > 0.9
-    assert all(agreement[name] < agreement["right"] - 0.05 for name in ("opengl", "inverse"))
-    assert agreement["opengl"] < 0.5
+    right, opengl, inverse = (
+        wrist_flow_agreement(*seen_as(episode(), seen, **mistake), "right_wrist")
+        for mistake in ({}, {"camera_axes": "opengl"}, {"extrinsics": "base_to_camera"})
+    )
+    assert right > 0.9
+    assert max(opengl, inverse) < right - 0.05
+    assert opengl < 0.5
 
 
 def finger_pictures(opening: np.ndarray, still: CameraTrack) -> np.ndarray:
@@ -153,14 +143,8 @@ def finger_pictures(opening: np.ndarray, still: CameraTrack) -> np.ndarray:
         frame = np.full((HEIGHT, WIDTH), 90, np.uint8)
         for side in (-1, 1):
             x = u + side * (4 + 14 * value)
-            cv2.rectangle(
-                frame,
-                (round(16 * (x - 3)), round(16 * (v - 12))),
-                (round(16 * (x + 3)), round(16 * (v + 12))),
-                220,
-                -1,
-                shift=4,
-            )
+            corners = ((round(16 * (x + 3 * i)), round(16 * (v + 12 * i))) for i in (-1, 1))
+            cv2.rectangle(frame, *corners, 220, -1, shift=4)
         frames.append(frame)
     return np.stack(frames)
 
@@ -169,45 +153,28 @@ def test_fingers_that_part_mean_opening() -> None:
     opening = 0.5 + 0.5 * np.sin(np.arange(COUNT) / 4)
     recording = episode(opening)
     pictures = {"right_wrist": finger_pictures(opening, recording.cameras["right_wrist"])}
-    observation = observe(recording, pictures, None)
-    as_written = read(observation, RecordedConventions())
-    inverted = read(observation, RecordedConventions(gripper="inverted"))
-    assert as_written is not None
-    assert inverted is not None
-    right, wrong = (finger_flow(observation, reading, 0) for reading in (as_written, inverted))
+    right = finger_flow(*seen_as(recording, pictures), 0)
     assert right is not None
-    assert wrong is not None
     assert right > 0.6
-    assert wrong == pytest.approx(-right)
-    still = observe(episode(), pictures, None)
-    resting = read(still, RecordedConventions())
-    assert resting is not None
-    assert finger_flow(still, resting, 0) is None
+    assert finger_flow(*seen_as(recording, pictures, gripper="inverted"), 0) == pytest.approx(-right)
+    assert finger_flow(*seen_as(episode(), pictures), 0) is None
 
 
 def test_an_object_stops_a_closing_gripper_never_an_opening_one() -> None:
     command = np.where(np.arange(COUNT) < 10, 1.0, 0.0)
     opening = np.where(np.arange(COUNT) < 10, 1.0, 0.6)
     recording = replace(episode(opening), action=command[:, None].astype(np.float32))
-    observation = observe(recording, {}, None)
-    as_written = read(observation, RecordedConventions())
-    inverted = read(observation, RecordedConventions(gripper="inverted"))
-    assert as_written is not None
-    assert inverted is not None
-    assert stopped_share(as_written, 0) == 1.0
-    assert stopped_share(inverted, 0) == 0.0
-    free = read(observe(episode(opening), {}, None), RecordedConventions())
-    assert free is not None
-    assert stopped_share(free, 0) is None
+    assert stopped_share(seen_as(recording, {})[1], 0) == 1.0
+    assert stopped_share(seen_as(recording, {}, gripper="inverted")[1], 0) == 0.0
+    assert stopped_share(seen_as(episode(opening), {})[1], 0) is None
 
 
 def test_lag_of_camera_poses() -> None:
     recording = episode()
     wrist = recording.cameras["right_wrist"]
     late = wrist.T_base_camera[np.maximum(np.arange(COUNT) - 3, 0)]
-    observation = observe(replace(recording, cameras={"right_wrist": replace(wrist, T_base_camera=late)}), {}, None)
-    reading = read(observation, RecordedConventions())
-    assert reading is not None
+    cameras = {"right_wrist": replace(wrist, T_base_camera=late)}
+    observation, reading = seen_as(replace(recording, cameras=cameras), {})
     assert camera_lags(observation, reading)[0] == 3
     mount, metres, degrees = rms_hand_eye(reading.tools[:-3, 0], late[3:])
     assert np.allclose(mount, MOUNT, atol=1e-9)
@@ -229,10 +196,7 @@ def test_sizes_that_put_the_principal_point_into_the_middle() -> None:
 
 def test_pose_terms_blame_the_right_thing() -> None:
     def terms(**mistake: object) -> dict[str, float]:
-        observation = observe(episode(), {}, None)
-        reading = read(observation, RecordedConventions.model_validate(mistake))
-        assert reading is not None
-        return pose_terms(observation, reading)
+        return pose_terms(*seen_as(episode(), {}, **mistake))
 
     assert min(terms().values()) > -0.5
     assert terms(pose_unit="mm")["hand-eye right_wrist"] < -30
@@ -241,24 +205,6 @@ def test_pose_terms_blame_the_right_thing() -> None:
     assert terms(camera_axes="opengl")["hand-eye right_wrist"] > -0.1  # still rigid: only the view direction tells
     assert terms(intrinsics_size=(480, 640))["intrinsics head"] < -20
     assert terms(extrinsics="base_to_camera")["hand-eye right_wrist"] < -20
-    large = replace(episode(), T_base_ee=tools() @ np.diag([1.0, 1, 1, 1]))
-    scaled = large.T_base_ee
-    assert scaled is not None
+    scaled = tools()
     scaled[..., :3, 3] *= 1000
-    observation = observe(replace(large, T_base_ee=scaled), {}, None)
-    reading = read(observation, RecordedConventions())
-    assert reading is not None
-    assert pose_terms(observation, reading)["workspace"] == -40.0
-
-
-def test_log_likelihoods_fall_with_disagreement() -> None:
-    typical = Typical(value=0.9, samples=20)
-    assert correlation_log_likelihood(0.9, typical) == pytest.approx(0.0)
-    assert correlation_log_likelihood(0.95, typical) > 0 > correlation_log_likelihood(0.8, typical)
-    assert (
-        correlation_log_likelihood(-0.5, typical)
-        == correlation_log_likelihood(0.0, typical)
-        == pytest.approx(10 * np.log(1 - 0.81))
-    )
-    assert hand_eye_log_likelihood(0.0, 0.0) == 0.0
-    assert hand_eye_log_likelihood(100.0, 90.0) == -60.0
+    assert pose_terms(*seen_as(replace(episode(), T_base_ee=scaled), {}))["workspace"] == -40.0

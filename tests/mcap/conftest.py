@@ -21,48 +21,36 @@ from mcap_ros2.writer import Writer
 HEIGHT, WIDTH = 12, 16
 START_NS = 1_700_000_000_000_000_000
 
-STAMP = "builtin_interfaces/Time stamp\nstring frame_id\n"
-HEADER = "================\nMSG: std_msgs/Header\n" + STAMP
-TIME = "================\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-POINT = "================\nMSG: geometry_msgs/{}\nfloat64 x\nfloat64 y\nfloat64 z\n"
-QUATERNION = "================\nMSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"
-STAMPED_TRANSFORM = "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"
-TRANSFORM = "================\nMSG: geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
-DIMENSIONS = (
-    "std_msgs/MultiArrayLayout layout\n{}[] data\n"
-    "================\nMSG: std_msgs/MultiArrayLayout\nstd_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n"
-    "================\nMSG: std_msgs/MultiArrayDimension\nstring label\nuint32 size\nuint32 stride\n"
-)
-DEFINITIONS = {
-    "sensor_msgs/msg/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data\n" + HEADER + TIME,
-    "sensor_msgs/msg/Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
-    "uint32 step\nuint8[] data\n" + HEADER + TIME,
-    "sensor_msgs/msg/CameraInfo": "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\n"
-    "float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n"
-    + HEADER
-    + "================\nMSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\n"
-    "bool do_rectify\n" + TIME,
-    "sensor_msgs/msg/JointState": "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\n"
-    "float64[] effort\n" + HEADER + TIME,
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"
-    "================\nMSG: geometry_msgs/TransformStamped\n"
-    + STAMPED_TRANSFORM
-    + HEADER
-    + TRANSFORM
-    + POINT.format("Vector3")
-    + QUATERNION
-    + TIME,
-    "geometry_msgs/msg/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose\n"
-    + HEADER
-    + "================\nMSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
-    + POINT.format("Point")
-    + QUATERNION
-    + TIME,
-    "std_msgs/msg/Float64MultiArray": DIMENSIONS.format("float64"),
-    "std_msgs/msg/Float32": "float32 data\n",
-    "std_msgs/msg/String": "string data\n",
-    "sensor_msgs/msg/Imu": "std_msgs/Header header\n" + HEADER + TIME,
+FIELDS = {
+    "builtin_interfaces/Time": "int32 sec, uint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp, string frame_id",
+    "geometry_msgs/Vector3": "float64 x, float64 y, float64 z",
+    "geometry_msgs/Point": "float64 x, float64 y, float64 z",
+    "geometry_msgs/Quaternion": "float64 x 0, float64 y 0, float64 z 0, float64 w 1",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation, geometry_msgs/Quaternion rotation",
+    "geometry_msgs/TransformStamped": "std_msgs/Header header, string child_frame_id, geometry_msgs/Transform transform",
+    "geometry_msgs/Pose": "geometry_msgs/Point position, geometry_msgs/Quaternion orientation",
+    "geometry_msgs/PoseStamped": "std_msgs/Header header, geometry_msgs/Pose pose",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "sensor_msgs/CompressedImage": "std_msgs/Header header, string format, uint8[] data",
+    "sensor_msgs/Image": "std_msgs/Header header, uint32 height, uint32 width, string encoding, uint8 is_bigendian, "
+    "uint32 step, uint8[] data",
+    "sensor_msgs/RegionOfInterest": "uint32 x_offset, uint32 y_offset, uint32 height, uint32 width, bool do_rectify",
+    "sensor_msgs/CameraInfo": "std_msgs/Header header, uint32 height, uint32 width, string distortion_model, float64[] d, "
+    "float64[9] k, float64[9] r, float64[12] p, uint32 binning_x, uint32 binning_y, sensor_msgs/RegionOfInterest roi",
+    "sensor_msgs/JointState": "std_msgs/Header header, string[] name, float64[] position, float64[] velocity, float64[] effort",
+    "sensor_msgs/Imu": "std_msgs/Header header",
+    "std_msgs/MultiArrayDimension": "string label, uint32 size, uint32 stride",
+    "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim, uint32 data_offset",
+    "std_msgs/Float64MultiArray": "std_msgs/MultiArrayLayout layout, float64[] data",
+    "std_msgs/String": "string data",
 }
+
+
+def definition(schema: str) -> str:
+    """A message definition with all types, some of which it does not need."""
+    own = FIELDS[schema.replace("/msg/", "/")].replace(", ", "\n")
+    return own + "".join(f"\n{'=' * 80}\nMSG: {name}\n" + text.replace(", ", "\n") for name, text in FIELDS.items())
 
 
 def joints(time: np.ndarray | float) -> np.ndarray:
@@ -148,7 +136,7 @@ class Recording:
             schemas = {}
             for number, sent in enumerate(self.sent):
                 if sent.schema not in schemas:
-                    schemas[sent.schema] = writer.register_msgdef(sent.schema, DEFINITIONS[sent.schema])
+                    schemas[sent.schema] = writer.register_msgdef(sent.schema, definition(sent.schema))
                 writer.write_message(sent.topic, schemas[sent.schema], sent.message, sent.log_ns, sent.log_ns, number)
             writer.finish()
         return path

@@ -21,7 +21,6 @@ from mcap_protobuf.writer import Writer
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap.exported import Encoding, write_episode_mcap
 from worldline_core.data.sources.open import open_source
 
 NAMES = (
@@ -95,7 +94,7 @@ def write(
         if number in leave_out:
             continue
         if packets is None:
-            data = {"data": png(coloured(number)), "format": "png"}
+            data = {"data": toy.png(coloured(number)), "format": "png"}
             message = stamped("CompressedImage", number / 30, frame_id="camera", **data)
         else:
             message = stamped(
@@ -126,12 +125,6 @@ def write(
         for seconds, topic, message in sorted(sent, key=lambda each: each[0]):
             writer.write_message(topic, message, at(seconds)[0] + 10**6, at(seconds)[0])
         writer.finish()
-
-
-def png(image: np.ndarray) -> bytes:
-    import cv2
-
-    return cv2.imencode(".png", image)[1].tobytes()
 
 
 def declared(path: Path, **changes: Any) -> dict[str, Any]:
@@ -266,38 +259,3 @@ def test_video_that_does_not_decode_is_refused(tmp_path: Path, toy: Any, foxglov
     write(tmp_path / "c.mcap", toy, foxglove, no_keys[:60])
     with pytest.raises(RejectedInputError, match="No key frame comes before"):
         load(declared(tmp_path), "toy-c").frames("head")
-
-
-@pytest.mark.parametrize("encoding", ["protobuf", "ros2"])
-def test_the_projects_own_export_is_read_through_its_topics(tmp_path: Path, toy: Any, encoding: Encoding) -> None:
-    """The same recording as any other tool would see it."""
-    from worldline_core.data.episodes.episode import CameraTrack, Episode
-
-    count = 20
-    time = np.arange(count) / 10
-    state = np.concatenate([toy.joints(time), toy.finger(time)[:, None] / 0.04], axis=1).astype(np.float32)
-    K = np.array([[20.0, 0, 7.5], [0, 21.0, 5.5], [0, 0, 1]])
-    cameras = {"head": CameraTrack("head", K, np.eye(4)[None], 16, 12)}
-    episode = Episode(
-        episode_id="e", source="s", embodiment="none", scene="x", task_family="lift", instruction="lift", outcome="success",
-        split="test", fps=10.0, state=state, action=state + np.float32(0.5), timestamps=time, cameras=cameras,
-        state_names=("right/a", "right/b", "right/gripper"),
-    )  # fmt: skip
-    frames = {"head": np.stack([toy.picture(number) for number in range(count)])}
-    write_episode_mcap(tmp_path / "a.mcap", episode, frames, encoding=encoding)
-    unit = {"closed": 0.0, "open": 1.0}
-
-    def readings(topic: str) -> dict[str, Any]:
-        return {
-            "joints": {"topic": topic, "names": ["right/a", "right/b"]},
-            "gripper": {"topic": topic, "names": ["right/gripper"], "range": unit},
-        }
-
-    source = declared(
-        tmp_path, fps=10, base_frame="base", views={"head": {"image": "/head/image", "calibration": "/head/calibration"}},
-        arms=[{"name": "right", "state": readings("/joint_states"), "command": readings("/joint_commands")}],
-    )  # fmt: skip
-    loaded = load(source)
-    assert np.array_equal(loaded.episode.state, state)
-    assert np.array_equal(loaded.frames("head"), frames["head"])
-    assert np.array_equal(loaded.episode.cameras["head"].K, K)
