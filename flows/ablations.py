@@ -1,4 +1,4 @@
-"""The flow of the paper's ablations: every variant is trained and evaluated, and one table is made of all."""
+"""The flow of the ablations: every variant is trained and evaluated with every seed, and one table is made of all."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from prefect import flow
 
-from flows.pipeline import Inputs, choose, evaluate, predict, prepare, prepare_banks, train
+from flows.pipeline import Inputs, evaluate, predict, prepare, prepare_models, train
 from tasks.ablation_table import ablation_table
 from tasks.execution.artifact_task import variant
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
@@ -24,27 +24,35 @@ def ablations(
     overrides: tuple[str, ...] = (),
     artifacts: Path = Path("artifacts"),
     variants: tuple[str, ...] | None = None,
+    variants_file: Path | None = None,
+    seeds: tuple[int, ...] = (),
 ) -> ArtifactReference:
-    """The full model and its variants (default: all five). Returns the table."""
+    """The full model and its variants (default: the paper's five). Returns the table.
+
+    ``variants_file`` holds other variants, of the same form as the paper's (`worldline_core/report/ablations.yaml`).
+    ``seeds``: of the trainings, each of which is made with every seed; none: the configured ones, once.
+    """
     load = partial(load_changed, preset, config, overrides)
     with PrefectRun(artifacts.resolve(), load([]).runner) as run:
-        compare_variants(load, choose_variants(variants))
+        compare_variants(load, choose_variants(variants, variants_file), seeds)
     return run.artifacts[ablation_table.name]
 
 
-def compare_variants(load: LoadConfig, variants: Mapping[str, Variant]) -> None:
+def compare_variants(load: LoadConfig, variants: Mapping[str, Variant], seeds: Sequence[int] = ()) -> None:
     """The chain of every variant up to its evaluations, and the table. Equal calls of several variants are one call."""
     scores: dict[str, Inputs] = {}
-    for name, changes in variants.items():
-        settings = variant_config(load, changes)
-        with variant("" if name == FULL else name):
-            (_, data), banks = prepare(settings), prepare_banks(settings)
-            trained = train(settings, data)
-            made = evaluate(settings, data, predict(settings, data, trained))
-            made |= choose(settings, banks, predict(settings, banks, trained, banks=True))
-            for step, call in made.items():
-                scores.setdefault(step, {})[name] = call
-    ablation_table.submit(AblationTableConfig(method=METHOD, variants=dict(variants)), **scores)
+    runs = [(name, seed) for seed in seeds or (None,) for name in variants]  # a table of the first seed comes first
+    for name, seed in runs:
+        c = variant_config(load, variants[name], seed)
+        suffix = [] if name == FULL else [name]
+        with variant(".".join([*suffix, *([] if seed is None else [f"seed_{seed}"])])):
+            _, data, banks = prepare(c)
+            models = prepare_models(c, data)
+            predicted = predict(c, data, banks, models, train(c, data, models))
+            for step, call in evaluate(c, data, banks, models, predicted).items():
+                scores.setdefault(step, {})[f"{name}.{seed or 0}"] = call
+    table = AblationTableConfig(method=METHOD, variants=dict(variants), seeds=tuple(seeds) or (0,))
+    ablation_table.submit(table, **scores)
 
 
 def load_changed(

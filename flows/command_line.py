@@ -34,6 +34,10 @@ def build_parser() -> argparse.ArgumentParser:
     )
     ablations = commands.add_parser("ablations", help="train and evaluate the paper's ablations, print their table")
     ablations.add_argument("--variant", action="append", metavar="NAME", help="only this one and the full model")
+    ablations.add_argument("--variants", type=Path, metavar="FILE", help="other variants than the paper's (YAML)")
+    ablations.add_argument(
+        "--seeds", type=int, nargs="+", default=(), help="train every variant with each of these seeds"
+    )
     ablations.set_defaults(run=_ablations)
     for parser_with_config in (pipeline, nightly, ablations):
         add_config_arguments(parser_with_config)
@@ -154,7 +158,10 @@ def _ablations(arguments: argparse.Namespace) -> None:
     from flows.ablations import ablations
 
     variants = None if arguments.variant is None else tuple(arguments.variant)
-    table = ablations(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, variants)
+    overrides, seeds = tuple(arguments.overrides), tuple(arguments.seeds)
+    table = ablations(
+        preset, arguments.config, overrides, arguments.artifacts, variants, arguments.variants, seeds
+    )
     print((Path(str(table.path)) / "table.md").read_text(), f"table: {table.path / 'table.md'}", sep="\n")
 
 
@@ -166,21 +173,9 @@ def _task(arguments: argparse.Namespace) -> None:
 
 
 def _record(arguments: argparse.Namespace) -> None:
-    from worldline_core.config import load_config, read_yaml
-    from worldline_core.recorder.attempts import RecordBanksConfig, RecordPoliciesConfig, record_banks, record_policies
-    from worldline_core.recorder.record import RecordConfig, record, record_with_manifest
+    from worldline_core.recorder.recording import load_recording, record_into
 
-    path, overrides, output = arguments.config, arguments.overrides, arguments.output
-    keys = set(read_yaml(path))
-    if "policies" in keys:
-        config = load_config(RecordPoliciesConfig, path=path, overrides=overrides)
-        print(record_with_manifest("record_policies", record_policies, config, output))
-    elif "banks" in keys:
-        config = load_config(RecordBanksConfig, path=path, overrides=overrides)
-        print(record_with_manifest("record_banks", record_banks, config, output))
-    else:
-        config = load_config(RecordConfig, path=path, overrides=overrides)
-        print(record_with_manifest("record_episodes", record, config, output))
+    print(record_into(load_recording(arguments.config, arguments.overrides), arguments.output))
 
 
 def _inspect(arguments: argparse.Namespace) -> None:

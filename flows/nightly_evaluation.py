@@ -6,7 +6,7 @@ from pathlib import Path
 
 from prefect import flow, task
 
-from flows.pipeline import choose, evaluate, predict, prepare, prepare_banks
+from flows.pipeline import Inputs, evaluate, predict, prepare
 from tasks.execution.prefect_artifacts import show_in_prefect
 from tasks.execution.prefect_run import PrefectRun
 from tasks.report import report
@@ -35,12 +35,12 @@ def nightly_evaluation(
     """
     settings = PipelineConfig.load(preset, config, overrides)
     with PrefectRun(artifacts.resolve(), settings.runner) as run:
-        (curated, data), banks = prepare(settings), prepare_banks(settings)
-        predicted = predict(settings, data, trained={})
-        planned = predict(settings, banks, trained={}, banks=True)
-        scores = evaluate(settings, data, predicted) | choose(settings, banks, planned)
+        curated, data, banks = prepare(settings)
+        models: Inputs = {**settings.model_folders()}
+        predicted = predict(settings, data, banks, models, trained={})
+        scores = evaluate(settings, data, banks, models, predicted)
         made = {"curate": curated, "filter": data["episodes"], "render_actions": data["tracks"], **scores}
-        report.submit(settings.report, **made, rollout=predicted | planned, models=settings.model_folders())
+        report.submit(settings.report, **made, rollout=predicted, models=models)
     history = artifacts.resolve() / "nightly"
     compared = compare_nights({name: made.folder for name, made in run.artifacts.items()}, history, night)
     show_in_prefect(history, run.artifacts, [history / file for file in compared.pictures.values()])

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import worldline_core
 from flows.pipeline import chain
@@ -22,7 +23,7 @@ def import_base(config: PipelineConfig, store: ArtifactStore) -> None:
     """Import the backbone beside its autoencoder and link it to the folder that the configuration names, as a user does."""
     if config.models.base is None or config.models.base.exists():
         return
-    source = config.models.tokenizer.parent
+    source = cast("Path", config.models.tokenizer).parent
     settings = config.import_backbone or ImportBackboneConfig.model_validate({})
     imported = import_backbone.run(store, settings, {"diffusers": source})
     config.models.base.parent.mkdir(parents=True, exist_ok=True)

@@ -300,7 +300,7 @@ def load_config[Model: BaseModel](
 
 
 def _with_extended(source: Path) -> dict[str, Any]:
-    """The values of a file over those of the preset that it extends. Mappings are merged, null takes a key away."""
+    """The values of a file over those of the preset that it extends. Mappings are merged; null takes away a key that the preset has."""
     values = read_yaml(source)
     if "extends" not in values:
         return values
@@ -315,8 +315,8 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     result = dict(base)
     for key, change in changes.items():
         below = result.get(key)
-        if change is None:
-            result.pop(key, None)
+        if change is None and key in result:
+            result.pop(key)
         elif isinstance(change, Mapping) and isinstance(below, Mapping):
             result[key] = merged(below, change)
         else:
@@ -335,10 +335,11 @@ class StrictModel(BaseModel):
         return {}
 
 
+NEVER_RELEVANT = ("sharding", "saving", "workers")
+
+
 def cache_relevant_config(config: Any) -> Any:
-    """The part of a JSON config that enters cache keys and a training's identity: all but ``sharding`` and ``saving``."""
+    """The part of a JSON config that enters cache keys and a training's identity: all but ``sharding``, ``saving`` and ``workers``."""
     if isinstance(config, Mapping):
-        return {
-            name: cache_relevant_config(part) for name, part in config.items() if name not in ("sharding", "saving")
-        }
+        return {name: cache_relevant_config(part) for name, part in config.items() if name not in NEVER_RELEVANT}
     return [cache_relevant_config(part) for part in config] if isinstance(config, list | tuple) else config

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import base64
 import mimetypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
-from tasks.execution.prefect_run import ArtifactReference
+from tasks.execution.chain import outline
+from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+from worldline_core.config import StrictModel
 from worldline_core.evaluation.paired import collect_metrics
+from worldline_core.scale.mapping import RunnerConfig
 
 
 def _report_pictures(report: Path) -> list[Path]:
@@ -45,3 +48,13 @@ def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures:
         key = "picture" if number == 0 else f"picture-{number}"
         data = f"data:{mimetypes.guess_type(picture)[0]};base64,{base64.b64encode(picture.read_bytes()).decode()}"
         create_image_artifact(data, key=key, description=f"{picture.stem}: {page / 'index.html'}")
+
+
+def run_chain[C: StrictModel](
+    chain: Callable[[C], object], config: C, runner: RunnerConfig, artifacts: Path
+) -> dict[str, ArtifactReference]:
+    """Run a whole chain in a flow, with a page that shows how far it is and links in Prefect; returns the artifacts."""
+    with PrefectRun(artifacts, runner, page_of=outline(chain, config)) as run:
+        chain(config)
+    show_in_prefect(run.page_folder, run.artifacts)
+    return run.artifacts

@@ -21,6 +21,7 @@ from worldline_core.data.sources.lerobot import LeRobotSourceConfig
 from worldline_core.data.sources.video_folder import VideoFolderSourceConfig
 from worldline_core.geometry.embodiment import Embodiment
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.report.ablation_table import Variant
 from worldline_core.serving.serve_config import ServeConfig
 from worldline_core.training.training_config import Stage2Config, StageConfig
 
@@ -97,7 +98,7 @@ def test_documented_commands_exist(page: str) -> None:
 
 SNIPPETS = {
     "captions": VideoFolderSourceConfig, "arms": LeRobotSourceConfig, "views": CalibrationFile, "policies": ServeConfig,
-    "clips": StageConfig, "input": Stage2Config,
+    "clips": StageConfig, "input": Stage2Config, "full": Variant, "more_noise": Variant,
 }  # fmt: skip
 
 

@@ -23,9 +23,9 @@ from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.tokenizers import resize_frame
-from worldline_core.recorder.attempts import BankGrid, RecordPoliciesConfig, record_policies
+from worldline_core.recorder.attempts import BankGrid, RecordPoliciesConfig
 from worldline_core.recorder.controllers import ScriptedPolicy
-from worldline_core.recorder.record import record_with_manifest
+from worldline_core.recorder.recording import RecordingConfig, record_into
 from worldline_core.rollout.recorded_starts import RecordedStarts
 
 ROBOT = "ur5e_silver"
@@ -54,7 +54,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("policies") / "recordings"
     grid = BankGrid(embodiments=(ROBOT,), families=("press",), scenes=("scene_12", "scene_13"), count=2)
     config = RecordPoliciesConfig(policies=POLICIES, starts=grid, seed=3, num_frames=33, workers=1)
-    record_with_manifest("record_policies", record_policies, config, folder)
+    record_into(RecordingConfig(policies=config), folder)
     return folder
 
 
@@ -149,7 +149,7 @@ def test_a_start_is_drawn_by_the_policies_in_the_order_of_their_recording(
 def test_recordings_whose_starts_are_not_known_are_refused(
     world: MujocoEnv, shipped: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(DataError, match=r"(?s)The manifest does not say where things stood.*record_banks"):
+    with pytest.raises(DataError, match=r"(?s)The manifest does not say where things stood.*banks"):
         MujocoEnv(shipped / "banks", embodiment=ROBOT, splits=("bank", "test"))
     with pytest.raises(ConfigError, match="observe_every 0"):
         MujocoEnv(embodiment=ROBOT, observe_every=0)

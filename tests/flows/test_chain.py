@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.pipeline import chain, choose, evaluate, predict, prepare, prepare_banks
+from flows.pipeline import Inputs, chain, evaluate, predict, prepare
 from tasks.curate import curate
 from tasks.execution.artifact_task import TaskCall, find_task, task_names
 from tasks.execution.chain import find_artifacts, find_call, load_chain, outline, ready_inputs
@@ -23,12 +23,12 @@ def calls() -> dict[str, TaskCall]:
 
 
 def nightly(config: PipelineConfig) -> None:
-    (_, data), banks = prepare(config), prepare_banks(config)
-    evaluate(config, data, predict(config, data, trained={}))
-    choose(config, banks, predict(config, banks, trained={}, banks=True))
+    _, data, banks = prepare(config)
+    models: Inputs = {**config.model_folders()}
+    evaluate(config, data, banks, models, predict(config, data, banks, models, trained={}))
 
 
-@pytest.mark.parametrize("preset", ["demo", "tiny", "smoke", "cosmos3-nano"])
+@pytest.mark.parametrize("preset", ["demo", "tiny", "smoke", "cosmos3-nano", "small_world"])
 def test_every_preset_is_valid_and_every_input_comes_before_its_use(preset: str) -> None:
     seen: set[str] = set()
     for call in outline(chain, PipelineConfig.load(preset)).values():

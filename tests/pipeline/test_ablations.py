@@ -22,7 +22,7 @@ from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.scores import Score, summarise, write_scores
 from worldline_core.pipeline.ablations import choose_variants, matched_length, tokens_a_step, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.report.ablation_table import AblationTableConfig, ablation_table, load_variants
+from worldline_core.report.ablation_table import AblationTableConfig, Variant, ablation_table, load_variants
 from worldline_core.store.atomic import write_json_atomic
 
 VARIANTS = ("no_action_free", "head_only", "success_only", "native_film", "no_regularization")
@@ -59,7 +59,7 @@ def test_what_variants_share_is_one_call(calls: dict[str, TaskCall]) -> None:
     }
     assert not any(name.startswith(("distill", "evaluate_policy", "report")) for name in calls)
     assert set(calls["ablation_table"].inputs) == {
-        f"{step}.{name}" for step in ("evaluate_video", "evaluate_planning") for name in ("full", *VARIANTS)
+        f"{step}.{name}.0" for step in ("evaluate_video", "evaluate_planning") for name in ("full", *VARIANTS)
     }
 
 
@@ -141,17 +141,17 @@ def test_the_table_shows_numbers_counts_intervals_and_reasons(tmp_path: Path) ->
     config = AblationTableConfig(variants=variants, resamples=200)
     good = {"a": 0.6, "b": 0.8, "c": 0.7}
     inputs = {
-        "evaluate_video.full": evaluation(tmp_path / "full", good),
-        "evaluate_video.head_only": evaluation(tmp_path / "head", {k: v - 0.1 for k, v in good.items()}),
-        "evaluate_video.success_only": evaluation(tmp_path / "success", {"a": 0.5}),
+        "evaluate_video.full.0": evaluation(tmp_path / "full", good),
+        "evaluate_video.head_only.0": evaluation(tmp_path / "head", {k: v - 0.1 for k, v in good.items()}),
+        "evaluate_video.success_only.0": evaluation(tmp_path / "success", {"a": 0.5}),
     }
     planning = {"mean": 0.75, "low": 0.5, "high": 1.0, "count": 4}
     budget = {"success": planning, "gain": planning | {"mean": 0.25}, "banks": {"x": 1.0, "y": 0.5}}
     write_json_atomic(
         tmp_path / "plan/summary.json", {"methods": {"banks_stage2": {"budgets": {"8": {}, "32": budget}}}}
     )
-    counts = ablation_table(config, inputs | {"evaluate_planning.full": tmp_path / "plan"}, tmp_path / "out")
-    assert (counts["cells"], counts["measured"]) == (18, 5)
+    counts = ablation_table(config, inputs | {"evaluate_planning.full.0": tmp_path / "plan"}, tmp_path / "out")
+    assert (counts["cells"], counts["measured"]) == (21, 5)
     rows = {(row["variant"], row["column"]): row for row in pq.read_table(tmp_path / "out/table.parquet").to_pylist()}
     full, head = rows["full", "held_out_robot_iou"], rows["head_only", "held_out_robot_iou"]
     assert (full["mean"], full["count"], full["paper"]) == (pytest.approx(0.7), 3, "0.5622")
@@ -169,7 +169,48 @@ def test_the_table_shows_numbers_counts_intervals_and_reasons(tmp_path: Path) ->
     assert "n=3 (0.5622)" in text
     assert all(word in text for word in ("Success-only trajectories", "0.4348", "less the full model -0.100"))
     with pytest.raises(ArtifactError, match=r"(?s)not those of the variants.*evaluate_video\.head_only"):
-        ablation_table(config, {"evaluate_video.full": inputs["evaluate_video.full"]}, tmp_path / "few")
+        ablation_table(config, {"evaluate_video.full.0": inputs["evaluate_video.full.0"]}, tmp_path / "few")
+
+
+def test_every_variant_is_trained_with_every_seed_on_the_same_data(tmp_path: Path) -> None:
+    (tmp_path / "own.yaml").write_text(
+        "full: {label: all}\nnoise: {label: noise, changes: [train_stage2.sigma.shift=9]}\n"
+    )
+    chosen = choose_variants(file=tmp_path / "own.yaml")
+    calls = outline(compare_variants, load, chosen, (3, 4))
+    trainings = {name: call.config for name, call in calls.items() if call.task.name == "train_stage2"}
+    assert {name: (c.trainer.seed, c.sigma.shift) for name, c in trainings.items()} == {
+        "train_stage2.seed_3": (3, 1), "train_stage2.noise.seed_3": (3, 9),
+        "train_stage2.seed_4": (4, 1), "train_stage2.noise.seed_4": (4, 9),
+    }  # fmt: skip
+    assert [name for name in calls if name.startswith("curate")] == ["curate.seed_3", "curate.banks.seed_3"]
+    table = calls["ablation_table"]
+    assert table.config.seeds == (3, 4)
+    assert {"evaluate_video.full.3", "evaluate_video.noise.4"} <= set(table.inputs)
+    (tmp_path / "own.yaml").write_text("noise: {label: noise}\n")
+    with pytest.raises(ConfigError, match=r"(?s)own\.yaml.*full: first"):
+        choose_variants(file=tmp_path / "own.yaml")
+
+
+def test_an_interval_over_seeds_and_recordings_is_wider_than_over_recordings(tmp_path: Path) -> None:
+    config = AblationTableConfig(
+        variants={"full": Variant(label="all"), "less": Variant(label="less")}, seeds=(1, 2), resamples=400
+    )
+    inputs = {
+        f"evaluate_video.{name}.{seed}": evaluation(
+            tmp_path / f"{name}{seed}",
+            {r: base + 0.1 * seed * (name == "full") for r, base in (("a", 0.4), ("b", 0.5), ("c", 0.6))},
+        )
+        for name in config.variants
+        for seed in config.seeds
+    }
+    ablation_table(config, inputs, tmp_path / "out")
+    rows = {(row["variant"], row["column"]): row for row in pq.read_table(tmp_path / "out/table.parquet").to_pylist()}
+    assert rows["full", "held_out_robot_iou"]["mean"] == pytest.approx(0.65)
+    less = rows["less", "held_out_robot_iou"]
+    assert less["difference"] == pytest.approx(-0.15)
+    # Differences are equal in all recordings: what is left is between the two seeds.
+    assert (less["difference_low"], less["difference_high"]) == pytest.approx((-0.2, -0.1))
 
 
 @pytest.mark.slow

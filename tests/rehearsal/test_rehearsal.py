@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from tasks.execution.command_line import add_task_arguments
@@ -134,8 +135,8 @@ def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project
     assert all(manifest["environment"]["processes"] == 2 for manifest in manifests["distill"])
     assert any(manifest["metrics"].get("relational_intra", 0) > 0 for manifest in manifests["train_stage2"])
     assert [manifest["metrics"]["lpips"] for manifest in manifests["distill"]] == ["on"]
-    (ablations,) = (folder / "artifacts" / "ablation_table").glob("*/table.json")
-    rows = {cell["variant"] for cell in json.loads(ablations.read_text())["cells"] if cell["mean"] is not None}
+    (ablations,) = (folder / "artifacts" / "ablation_table").glob("*/table.parquet")
+    rows = {cell["variant"] for cell in pq.read_table(ablations).to_pylist() if cell["mean"] is not None}
     assert rows == load_variants().keys()
     assert len(manifests["train_stage2"]) == len(rows)
     whole = [rollout for rollout in manifests["rollout"] if rollout["config"]["num_frames"] == 129]

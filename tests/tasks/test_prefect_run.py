@@ -19,7 +19,7 @@ from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.settings import PREFECT_API_URL, PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
-from flows.pipeline import prepare, prepare_banks
+from flows.pipeline import prepare
 from tasks.execution.artifact_task import variant
 from tasks.execution.chain import outline
 from tasks.execution.prefect_artifacts import show_in_prefect
@@ -138,7 +138,6 @@ def test_steps_side_by_side_give_the_artifacts_of_one_process(
 
     def chain() -> None:
         prepare(settings)
-        prepare_banks(settings)
 
     @flow(name=tmp_path.name)
     def side_by_side(at_once: int) -> dict[str, ArtifactReference]:

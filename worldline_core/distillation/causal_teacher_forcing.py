@@ -87,20 +87,13 @@ class TeacherForcingObjective(CausalObjective[Batch]):
         """The clean blocks that a block sees: recorded and slightly disturbed, or the model's own rollout from this noise."""
         latents = batch.latents
         if self.settings.history == "recorded":
-            return latents + self.disturbance(
-                with_observed_frame(torch.zeros_like(noise[..., :1, :, :]), noise[..., 1:, :, :]), generator
-            )
+            level = torch.rand((len(noise), 1, 1, 1, 1, 1), generator=generator, device=noise.device)
+            later = self.settings.history_noise * level * noise[..., 1:, :, :]
+            return latents + with_observed_frame(torch.zeros_like(noise[..., :1, :, :]), later)
         size = self.spec.block_size  # no block follows the last one
         maps = maps_of(batch)[..., :-size, :, :]
         generated = self.rollout(batch, maps, noise[..., :-size, :, :], self.spec.steps - 1, with_gradient=False)
         return torch.cat((generated.to(latents), latents[..., -size:, :, :]), dim=3)
-
-    def disturbance(
-        self, noise: Float[Tensor, "b v c t h w"], generator: torch.Generator
-    ) -> Float[Tensor, "b v c t h w"]:
-        """Perturbation of recorded blocks, from noise that is 0 on the observed frame."""
-        del generator
-        return self.settings.history_noise * noise
 
 
 def teacher_forcing_loss(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -58,7 +59,7 @@ from worldline_core.training.processes import (
     processes,
     wait_for_all,
 )
-from worldline_core.training.stage import input_facts, validation_function
+from worldline_core.training.stage import input_facts, validation_function, weights_of
 from worldline_core.training.trainer import ParameterGroup, batch_plan, train
 from worldline_core.training.training_config import TrainerConfig
 
@@ -103,6 +104,7 @@ class DistillationRun:
     config: DistillConfig
     stage2: Path
     stage2_info: CheckpointInfo
+    episodes: EpisodeSet
     store: ClipSource
     loader: ClipLoader
     rows: list[ClipRow]
@@ -146,6 +148,7 @@ class DistillationRun:
             config=config,
             stage2=Path(inputs["stage2"]),
             stage2_info=info,
+            episodes=episodes,
             store=store,
             loader=loader,
             rows=rows,
@@ -173,7 +176,9 @@ class DistillationRun:
         teacher = self._model(self.stage2, settings.trainer)[0] if settings.teacher_share else None
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
         stop = settings.trainer.steps and settings.trainer.steps * plan.accumulation
-        load = self.loader.batches(sampler, self.config.input, self._work(STEPS[0]), stop)
+        loader = copy(self.loader)
+        loader.object_weights = weights_of(settings.weighting, self.episodes, self.store)
+        load = loader.batches(sampler, self.config.input, self._work(STEPS[0]), stop)
         return self._train(STEPS[0], settings.trainer, objective, load, info)
 
     def trajectory_regression(self) -> dict[str, float]:

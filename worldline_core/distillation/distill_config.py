@@ -50,7 +50,7 @@ class TeacherForcingConfig(StrictModel):
     """Step 1.
 
     ``history``: what a block sees before it, the recorded blocks (the paper) or the model's own, as in a rollout.
-    ``history_noise``: standard deviation of noise on recorded blocks (0 in the paper).
+    ``history_noise``: largest standard deviation of noise on recorded blocks, drawn for each clip (0 in the paper).
     ``teacher_share``: of what a block should become, the share that the Stage II model predicts of the whole clip in one
     step; the rest is the recording (the paper: all). ``teacher_frames``: longest clip that it is asked about, the longest
     it was trained on; None: all.

@@ -182,9 +182,12 @@ Drawn = tuple[Layout, str, np.random.Generator, np.ndarray]
 def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
     """Returns a function that draws a recording again: its things, scene, camera draws and first command."""
     manifest = read_manifest(recordings)
-    step, where = manifest.get("step"), recordings / MANIFEST_NAME
-    if step == "record_policies":
-        compared = validate(RecordPoliciesConfig, manifest["config"], where=where)
+    step, values, where = str(manifest.get("step")), manifest.get("config", {}), recordings / MANIFEST_NAME
+    kind = step.removeprefix("record_")
+    if step == "record":
+        kind, values = next((kind, config) for kind, config in values.items() if config is not None)
+    if kind == "policies":
+        compared = validate(RecordPoliciesConfig, values, where=where)
         # A manifest sorts by name, and what each policy draws depends on its number.
         numbers = {row.source: row.candidate for row in EpisodeSet.open(recordings).rows}
         policies = {name: compared.policies[name] for name in sorted(numbers, key=lambda name: numbers[name] or 0)}
@@ -197,8 +200,8 @@ def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
             return layout, spec.scene, compared.camera_draws(spec), motions[row.source].action[0]
 
         return of_policies
-    if step == "record_episodes":
-        config = validate(RecordConfig, manifest["config"], where=where)
+    if kind == "episodes":
+        config = validate(RecordConfig, values, where=where)
         jobs = {job.episode_id: job for job in plan_jobs(config)}
 
         def of_episodes(recorder: EpisodeRecorder, row: EpisodeRow) -> Drawn:
@@ -210,6 +213,6 @@ def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
         return of_episodes
     raise DataError(
         "The manifest does not say where things stood in these recordings", where=where,
-        expected="a manifest of `worldline record` (record_episodes or record_policies)", got=step,
+        expected="recorded episodes or policies", got=step,
         next_step="record the starts with `worldline record`",
     )  # fmt: skip

@@ -79,6 +79,25 @@ def bootstrap_mean(
     return Interval(float((sample * weight).sum() / weight.sum()), float(low), float(high), int(sample.size))
 
 
+def crossed_bootstrap(
+    by_seed: Sequence[Mapping[str, float]], *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
+) -> Interval:
+    """Mean over trainings of several seeds, each measured on the same trajectories, and its percentile interval.
+
+    Seeds and trajectories (those that all seeds have) are both resampled: an interval over trajectories alone says nothing
+    about another training, and the other way round.
+    """
+    common = sorted(set.intersection(*(set(values) for values in by_seed)))
+    sample = np.array([[values[name] for name in common] for values in by_seed], dtype=np.float64)
+    generator = np.random.default_rng(seed)
+    seeds = generator.integers(0, sample.shape[0], size=(resamples, sample.shape[0]))
+    trajectories = generator.integers(0, sample.shape[1], size=(resamples, sample.shape[1]))
+    means = [sample[np.ix_(rows, columns)].mean() for rows, columns in zip(seeds, trajectories, strict=True)]
+    tail = (1.0 - confidence) / 2.0
+    low, high = np.quantile(means, [tail, 1.0 - tail])
+    return Interval(float(sample.mean()), float(low), float(high), len(common))
+
+
 def paired_difference(
     first: Mapping[str, float], second: Mapping[str, float], *, resamples: int = 2000, seed: int = 0
 ) -> Interval | None:

@@ -7,12 +7,13 @@ same key in the store.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import cast
 
 from worldline_core.config import validate
 from worldline_core.errors import ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun
-from worldline_core.report.ablation_table import Variant, load_variants
+from worldline_core.report.ablation_table import VARIANTS_FILE, Variant, load_variants
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.training.training_config import StageConfig
 
@@ -22,22 +23,31 @@ type LoadConfig = Callable[[Sequence[str]], PipelineConfig]
 """Loads the run's configuration with some more ``a.b=value`` overrides."""
 
 
-def choose_variants(names: Sequence[str] | None = None) -> dict[str, Variant]:
-    """The full model's row and those of ``names`` (default: all five). Raises ConfigError for an unknown name."""
-    variants = load_variants()
+def choose_variants(names: Sequence[str] | None = None, file: Path | None = None) -> dict[str, Variant]:
+    """The full model's row and those of ``names`` (default: all), of the paper's variants or a file of others.
+
+    Raises: ConfigError for an unknown name.
+    """
+    variants = load_variants(file or VARIANTS_FILE)
     if unknown := sorted(set(names or ()) - set(variants)):
         raise ConfigError("Unknown ablation", expected=f"some of {', '.join(variants)}", got=unknown)
     return {name: row for name, row in variants.items() if name == FULL or names is None or name in names}
 
 
-def variant_config(load: LoadConfig, variant: Variant) -> PipelineConfig:
+def variant_config(load: LoadConfig, variant: Variant, seed: int | None = None) -> PipelineConfig:
     """The configuration of a variant, with the rollouts and evaluations of its row of the table alone.
+
+    Args:
+        seed: of its trainings; None: as configured.
 
     Raises:
         ConfigError: the run has no rollout of its Stage II model, or no base model.
     """
     full = _with_row(load([]))
     changes = [change for change in variant.changes if _section(full, change) is not None]
+    if seed is not None:
+        stages = ("train_stage1", "train_stage2")
+        changes += [f"{stage}.trainer.seed={seed}" for stage in stages if getattr(full, stage) is not None]
     # Its rollouts are not rows of the table, and a variant may train no Stage I.
     changes += [f"rollouts.{name}=null" for name, run in load([]).rollouts.items() if run.checkpoint == "stage1"]
     if variant.matched_compute:

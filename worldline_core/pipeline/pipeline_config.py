@@ -13,22 +13,28 @@ from worldline_core.config import StrictModel, load_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import UnavailableError
-from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEvaluationConfig, VideoEvaluationConfig
+from worldline_core.evaluation.evaluation_config import (
+    PlanningConfig,
+    PolicyEvaluationConfig,
+    SegmenterConfig,
+    VideoEvaluationConfig,
+)
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.model.world_model_config import ImportBackboneConfig
+from worldline_core.recorder.recording import RecordingConfig
 from worldline_core.report.context import ReportConfig
 from worldline_core.rollout.rollout_config import ImportRolloutsConfig, RolloutConfig
 from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote
 from worldline_core.training.clip_config import EncodeLatentsConfig, FrameInput
-from worldline_core.training.training_config import Stage1Config, Stage2Config, StageConfig
+from worldline_core.training.training_config import Stage1Config, Stage2Config, StageConfig, TokenizerConfig
 
 
 class ModelPaths(StrictModel):
     """Folders of the weights that a run starts from or compares with (relative to the project)."""
 
-    tokenizer: Path
+    tokenizer: Path | None = None
     base: Path | None = None
     teacher: Path | None = None
     segmenter: Path | None = None
@@ -62,11 +68,17 @@ class PipelineConfig(StrictModel):
 
     models: ModelPaths
     import_backbone: ImportBackboneConfig | None = Field(default=None, description="only for `task import_backbone`")
+    record: dict[str, RecordingConfig] = Field(
+        default={},
+        description="recordings that this run makes; a source `{kind: recording, recording: NAME}` reads one",
+    )
     curate: CurateConfig
     curate_banks: CurateConfig | None = None
     filter: FilterConfig
     render_actions: RenderActionsConfig
     encode_latents: EncodeLatentsConfig
+    train_tokenizer: TokenizerConfig | None = Field(default=None, description="null: models.tokenizer is used")
+    train_segmenter: SegmenterConfig | None = Field(default=None, description="null: models.segmenter is used")
     train_stage1: Stage1Config | None = Field(description="null: Stage II starts from models.base")
     train_stage2: Stage2Config
     distill: DistillConfig
@@ -92,15 +104,34 @@ class PipelineConfig(StrictModel):
         stages = (self.train_stage1, self.train_stage2, self.distill)
         return any(stage is not None and not isinstance(stage.input, FrameInput) for stage in stages)
 
-    def clips_of[T](self, stage: StageConfig | DistillConfig, made: Mapping[str, T]) -> dict[str, T | Path]:
+    def recordings(self) -> list[tuple[str, RecordingConfig]]:
+        """Names and settings of the recordings that the run's sources read."""
+        curated = [config for config in (self.curate, self.curate_banks) if config is not None]
+        names = {name for config in curated for name in config.recordings.values()}
+        return [(name, config) for name, config in self.record.items() if name in names]
+
+    def sources_of[T](self, curated: CurateConfig, recorded: Mapping[str, T]) -> dict[str, T | Path]:
+        """Folders or object-store locations of the sources, numbered in the order of the configuration.
+
+        They are inputs of curation's cache key: a changed recording means new work.
+        """
+        return source_folders(curated) | {str(n): recorded[name] for n, name in curated.recordings.items()}
+
+    def clips_of[T](self, stage: StageConfig | DistillConfig, made: Mapping[str, T]) -> dict[str, T]:
         """The input that gives a training its clips: cached latents, or the tokenizer that encodes the videos."""
         if isinstance(stage.input, FrameInput):
-            return {"tokenizer": self.model_folders()["tokenizer"]}
+            return {"tokenizer": made["tokenizer"]}
         return {"latents": made["encode_latents"]}
 
-    def rollouts_of(self, *, banks: bool) -> list[tuple[str, RolloutRun]]:
-        """Names and settings of the rollouts on recordings, or on candidate banks."""
-        return [(name, run) for name, run in self.rollouts.items() if (run.episodes == "banks") == banks]
+    def rollouts_of[T](self, predicted: Mapping[str, T], *, banks: bool) -> dict[str, T]:
+        """Those of the predicted rollouts that are of recordings, or of candidate banks."""
+        return {name: made for name, made in predicted.items() if (self.rollouts[name].episodes == "banks") == banks}
+
+    def checkpoints[T](self, trained: Mapping[str, T]) -> dict[str | None, T | Path | None]:
+        """What rollouts may name: checkpoints that this run trained or is given, and None."""
+        own = {"stage1": "train_stage1", "stage2": "train_stage2", "causal": "distill"}
+        made: dict[str | None, T | Path | None] = {name: trained[step] for name, step in own.items() if step in trained}
+        return {None: None, **self.shipped_checkpoints(), **made}
 
     def model_folders(self) -> dict[str, Path]:
         """Folders of the weights that the run starts from or compares with, those that it names."""
@@ -119,6 +150,12 @@ class PipelineConfig(StrictModel):
 
     @model_validator(mode="after")
     def _references_exist(self) -> PipelineConfig:
+        if self.models.tokenizer is None and self.train_tokenizer is None:
+            raise ValueError("models.tokenizer or train_tokenizer: one of the two is needed")
+        for config in (self.curate, self.curate_banks):
+            for number, name in ({} if config is None else config.recordings).items():
+                if name not in self.record:
+                    raise ValueError(f"sources[{number}] reads the recording {name}: record has {sorted(self.record)}")
         for name, run in self.rollouts.items():
             if run.episodes == "banks" and self.curate_banks is None:
                 raise ValueError(f"rollouts.{name} needs curate_banks")
@@ -213,7 +250,9 @@ def check_recordings(config: PipelineConfig, project: Path) -> None:
         f"{section}.sources[{number}].path: {source.path}"
         for section, curate in (("curate", config.curate), ("curate_banks", config.curate_banks))
         for number, source in enumerate(() if curate is None else curate.sources)
-        if not is_remote(source.path) and not project_path(project, source.path).exists()
+        if number not in curate.recordings  # pyright: ignore[reportOptionalMemberAccess]
+        and not is_remote(source.path)
+        and not project_path(project, source.path).exists()
     ]
     if missing:
         raise UnavailableError(
@@ -225,11 +264,9 @@ def check_recordings(config: PipelineConfig, project: Path) -> None:
 
 
 def source_folders(config: CurateConfig) -> dict[str, Path]:
-    """Folders or object-store locations of the recordings, numbered in the order of the configuration.
-
-    They are inputs of curation's cache key: a changed recording means new work.
-    """
+    """Folders or object-store locations of the sources that are not recordings of the run itself, by their numbers."""
     return {
-        f"{number}": source.path if is_remote(source.path) else project_path(Path.cwd(), source.path)
+        str(number): source.path if is_remote(source.path) else project_path(Path.cwd(), source.path)
         for number, source in enumerate(config.sources)
+        if number not in config.recordings
     }

@@ -6,7 +6,6 @@ bytes. Needs the optional dependency MuJoCo and an OpenGL library for off-screen
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import multiprocessing
 from collections import Counter
@@ -28,9 +27,7 @@ from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene import TASKS, Family
 from worldline_core.recorder.simulate import EpisodeRecorder, Job
 from worldline_core.scale.process import end_with_pool
-from worldline_core.store.artifact_files import MANIFEST_NAME, write_manifest
-from worldline_core.store.atomic import remove_unfinished, write_json_atomic
-from worldline_core.store.store import describe_environment, folder_lock
+from worldline_core.store.atomic import write_json_atomic
 
 
 def _one_of(names: Collection[str]) -> AfterValidator:
@@ -257,30 +254,3 @@ def check_recorded(output: Path, planned: Collection[str]) -> EpisodeSet:
             next_step="record into a new folder",
         )  # fmt: skip
     return episodes
-
-
-def record_with_manifest[C: StrictModel](
-    step: str, run: Callable[[C, Path], dict[str, Any]], config: C, output: Path
-) -> dict[str, Any]:
-    """The metrics of ``run(config, output)``, which continues a killed recording; the manifest is written last.
-
-    Args:
-        step: ``record_episodes``, ``record_banks`` or ``record_policies``.
-        config: has a ``seed``.
-
-    Raises:
-        DataError: the folder holds a finished recording.
-        ArtifactError: another command is recording into it.
-        WorldLineError: raised by ``run``.
-    """
-    with folder_lock(output):
-        if (output / MANIFEST_NAME).exists():
-            raise DataError("Folder already holds a recording", where=output, next_step="record into a new folder")
-        remove_unfinished(output)
-        counts = run(config, output)
-        environment = describe_environment()
-        environment["packages"]["mujoco"] = importlib.metadata.version("mujoco")
-        values = config.model_dump(mode="json")
-        facts = {"step": step, "version": 1, "config": values, "seeds": {"seed": values["seed"]}, "metrics": counts}
-        write_manifest(output, {**facts, "environment": environment})
-        return counts

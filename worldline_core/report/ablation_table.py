@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 from pydantic import Field
 
 from worldline_core.config import StrictModel, read_yaml, validate
-from worldline_core.errors import ArtifactError
+from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.paired import collect_metrics, read_scores
-from worldline_core.evaluation.scores import SUMMARY_FILE, Interval, paired_difference
+from worldline_core.evaluation.scores import SUMMARY_FILE, Interval, crossed_bootstrap
 from worldline_core.store.artifact_files import read_json, row_schema
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic
 
@@ -27,6 +27,7 @@ FULL = "full"
 COLUMNS = {
     "held_out_lpips": "held out: LPIPS ↓",
     "held_out_robot_iou": "held out: robot IoU ↑",
+    "held_out_object_iou": "held out: object IoU ↑",
     "ood_lpips": "out of domain: LPIPS ↓",
     "ood_robot_iou": "out of domain: robot IoU ↑",
     "success": "planning: success [%] ↑",
@@ -35,13 +36,14 @@ COLUMNS = {
 VIDEO_COLUMNS = {
     "held_out_lpips": ("test", "lpips"),
     "held_out_robot_iou": ("test", "robot_iou"),
+    "held_out_object_iou": ("test", "object_iou_exact"),
     "ood_lpips": ("ood_test", "lpips"),
     "ood_robot_iou": ("ood_test", "robot_iou"),
 }
 """Splits that stand for the paper's AgiBotWorld (held out) and DROID (out of domain), and their metrics."""
 POLICIES = {"pi05": "π0.5", "lingbot": "LingBot-VLA"}
 NOTE = (
-    "Mean [95 % interval] of n trajectories (planning: banks); in brackets the paper's number on its own data"
+    "Mean [95 % interval over seeds and trajectories] of n trajectories (planning: banks); in brackets the paper's number on its own data"
     " (AgiBotWorld, DROID; planning on RoboTwin with the policies " + " / ".join(POLICIES.values()) + ")."
 )
 
@@ -63,15 +65,28 @@ class Variant(StrictModel):
     paper: dict[str, float] = Field(default_factory=dict)
 
 
-def load_variants() -> dict[str, Variant]:
-    """The paper's variants by name, the full model first."""
-    return {name: validate(Variant, values, where=VARIANTS_FILE) for name, values in read_yaml(VARIANTS_FILE).items()}
+def load_variants(file: Path = VARIANTS_FILE) -> dict[str, Variant]:
+    """Variants by name, the full model first.
+
+    Args:
+        file: other variants than the paper's.
+
+    Raises:
+        ConfigError: a variant has unknown fields, or the full model is not the first one.
+    """
+    variants = {name: validate(Variant, values, where=file) for name, values in read_yaml(file).items()}
+    if next(iter(variants), None) != FULL:
+        raise ConfigError(
+            "Variants are compared with the full model", where=file, expected=f"{FULL}: first", got=list(variants)
+        )
+    return variants
 
 
 class AblationTableConfig(StrictModel):
-    """``method``: the method of the rows; in planning it is ``banks_<method>``."""
+    """``method``: the method of the rows; in planning it is ``banks_<method>``. ``seeds``: of the trainings of each variant."""
 
     method: str = "stage2"
+    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
     variants: dict[str, Variant] = Field(default_factory=load_variants)
     resamples: int = Field(default=2000, ge=100)
     seed: int = Field(default=42, ge=0)
@@ -104,24 +119,26 @@ class _Measured(NamedTuple):
 
 
 def ablation_table(config: AblationTableConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    """Put the evaluations ``evaluate_video.<variant>`` and ``evaluate_planning.<variant>`` into one table.
+    """Put the evaluations ``evaluate_video.<variant>.<seed>`` and ``evaluate_planning.<variant>.<seed>`` into one table.
 
     Raises:
         ArtifactError: a variant has no video evaluation, or none of the method; an evaluation is of no variant.
     """
     named = {name.partition(".")[2] for name in inputs}
-    missing = [name for name in config.variants if f"evaluate_video.{name}" not in inputs]
-    if missing or not named <= config.variants.keys():
+    wanted = [f"{name}.{seed}" for name in config.variants for seed in config.seeds]
+    if not named <= set(wanted) or any(f"evaluate_video.{name}" not in inputs for name in wanted):
         raise ArtifactError(
             "The evaluations are not those of the variants",
-            expected=[f"evaluate_video.{name}" for name in config.variants],
+            expected=[f"evaluate_video.{name}" for name in wanted],
             got=sorted(inputs),
             next_step="run `worldline ablations` with the same preset",
         )
-    measured = {name: _read(name, config.method, inputs) for name in config.variants}
-    full = measured[FULL].values if FULL in measured else {}
+    measured = {
+        name: [_read(f"{name}.{seed}", config.method, inputs) for seed in config.seeds] for name in config.variants
+    }
+    full = measured.get(FULL, [])
     cells = {
-        name: [_cell(config, name, column, measured[name], {} if name == FULL else full) for column in COLUMNS]
+        name: [_cell(config, name, column, measured[name], [] if name == FULL else full) for column in COLUMNS]
         for name in config.variants
     }
     rows = [asdict(cell) for row in cells.values() for cell in row]
@@ -161,18 +178,21 @@ def _read(name: str, method: str, inputs: Mapping[str, Path]) -> _Measured:
 
 
 def _cell(
-    config: AblationTableConfig, name: str, column: str, own: _Measured, full: Mapping[str, Mapping[str, float]]
+    config: AblationTableConfig, name: str, column: str, own: Sequence[_Measured], full: Sequence[_Measured]
 ) -> Cell:
     variant = config.variants[name]
     numbers = [variant.paper.get(column), *(variant.paper.get(f"{column}_{policy}") for policy in POLICIES)]
     paper = " / ".join(f"{value:g}" for value in numbers if value is not None)
     if any(column.endswith(metric) for metric in variant.without):
         return Cell(name, variant.label, column, paper=paper, reason="does not compare with the other rows")
-    if column not in own.intervals:
-        return Cell(name, variant.label, column, paper=paper, reason=own.reasons[column])
-    found, apart = own.intervals[column], None
-    if column in full:
-        apart = paired_difference(own.values[column], full[column], resamples=config.resamples, seed=config.seed)
+    if any(column not in one.intervals for one in own):
+        return Cell(name, variant.label, column, paper=paper, reason=own[0].reasons[column])
+    options = {"resamples": config.resamples, "seed": config.seed}
+    values, of_full = ([one.values[column] for one in side if column in one.values] for side in (own, full))
+    found = own[0].intervals[column] if len(own) == 1 else crossed_bootstrap(values, **options)
+    pairs = [(first, second) for first, second in zip(values, of_full, strict=False) if first.keys() & second.keys()]
+    differences = [{key: first[key] - second[key] for key in first.keys() & second.keys()} for first, second in pairs]
+    apart = crossed_bootstrap(differences, **options) if differences else None
     bounds = (None, None, None) if apart is None else (apart.mean, apart.low, apart.high)
     return Cell(name, variant.label, column, found.mean, found.low, found.high, found.count, paper, *bounds)
 

@@ -29,6 +29,7 @@ from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_config import ReadingConfig
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
 from worldline_core.training.clip_source import ClipSource, ResidentLatents, ResidentTracks
+from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.processes import processes
 
 logger = logging.getLogger(__name__)
@@ -200,6 +201,7 @@ class ClipLoader:
         tracks: controls; the maps get the width that the tracks were made for.
         native_size: of the control vectors that are given instead of maps, where the model takes these.
         action_frames: control frames whose maps a latent frame takes.
+        object_weights: loss weights of clips; None: all places count alike.
         frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
             rate.
     """
@@ -214,6 +216,7 @@ class ClipLoader:
         frame_rates: Mapping[str, float] | None = None,
         native_size: int | None = None,
         action_frames: int = 1,
+        object_weights: ObjectWeights | None = None,
         device: str = "cpu",
     ) -> None:
         self.source = source
@@ -223,6 +226,7 @@ class ClipLoader:
         self.frame_rates = frame_rates or {}
         self.native_size = native_size
         self.action_frames = action_frames
+        self.object_weights = object_weights
         self.device = device
         self._tracks: dict[str, EpisodeTracks] = {}
         self._resident: ResidentTracks | None = None
@@ -300,7 +304,14 @@ class ClipLoader:
             ids, mask = ids.to(self.device), mask.to(self.device)
         rates = [self._rate(clip) for clip in clips] if self.frame_rates else None
         fps = None if rates is None else torch.tensor(rates, device=self.device)
-        return Batch(clips, views, latents, maps, ids, mask, frames, fps)
+        weights = None
+        if self.object_weights is not None:
+            weights = self.object_weights(clips, [self._recorded(batch, clip) for clip in clips]).to(self.device)
+        return Batch(clips, views, latents, maps, ids, mask, frames, fps, weights)
+
+    def _recorded(self, batch: ClipBatch, clip: Clip) -> tuple[str, ...]:
+        """The recorded views that fill a clip's slots: the task-facing one has a name of its own."""
+        return (self.source.row(clip.episode_id).primary_view,) if batch.view == PRIMARY else batch.slots(self.views)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
         """What a prompt may say about a clip; a stride lowers its rate."""

@@ -23,9 +23,10 @@ from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 from worldline_core.training.clip_source import ClipSource, open_source, training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
+from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.processes import BatchPlan, gathered, join_processes, place_model, processes
 from worldline_core.training.trainer import ParameterGroup, TrainingResult, batch_plan, held_out_losses, train
-from worldline_core.training.training_config import StageConfig, TrainerConfig
+from worldline_core.training.training_config import LossWeighting, StageConfig, TrainerConfig
 
 logger = logging.getLogger(__name__)
 VALIDATION_SEED = 20_000
@@ -115,6 +116,7 @@ class Stage:
             action_frames=self.model.config.action_frames,
             frame_rates={row.episode_id: row.fps for row in self.episodes.rows},
             native_size=self.model.config.native_size,
+            object_weights=weights_of(self.config.weighting, self.episodes, self.source),
             device=self.config.trainer.device,
             **conditions,
         )
@@ -183,6 +185,14 @@ class Stage:
         found, fit, kept = len(self.episodes), len(self.rows), len(self.training_rows)
         left_out = {"in other splits": fit - kept, "not fit for this stage, or without latents or tracks": found - fit}
         return {"steps": result.steps, "clips": clips, "found": found, "kept": kept, "left_out": left_out}
+
+
+def weights_of(weighting: LossWeighting, episodes: EpisodeSet, source: ClipSource) -> ObjectWeights | None:
+    """Loss weights of things, where the configuration asks for them."""
+    if not any(weighting.things):
+        return None
+    _, height, width = source.latent_shape
+    return ObjectWeights(episodes, (height, width), *weighting.things)
 
 
 def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str, Any]:

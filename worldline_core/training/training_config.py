@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -29,6 +29,9 @@ class SigmaSampling(StrictModel):
     shift: float = Field(default=1.0, gt=0)
 
 
+NonNegative = Annotated[float, Field(ge=0)]
+
+
 class LossWeighting(StrictModel):
     """How the squared velocity error is weighted.
 
@@ -37,11 +40,14 @@ class LossWeighting(StrictModel):
     ``motion``: extra weight of latent positions that differ from the clip's first frame: the weight is
     ``1 + motion * min(m / mean(m), motion_cap)`` with m the mean absolute change over channels, renormalised to
     mean one, so that a small model spends its capacity on what moves. 0 (the default) is the paper's objective.
+    ``things``: extra weight of cells full of what the task moves, and of other things; needs the exact masks of recorded
+    worlds. (0, 0) is the paper's objective.
     """
 
     kind: Literal["velocity", "sample"] = "velocity"
     motion: float = Field(default=0.0, ge=0)
     motion_cap: float = Field(default=5.0, gt=0)
+    things: tuple[NonNegative, NonNegative] = (0.0, 0.0)
 
 
 class ShardingConfig(StrictModel):

@@ -55,6 +55,12 @@ def curate(
         ConfigError when recordings for evaluation only are assigned to training; UnreachableInputError when inputs
         could not be read for a reason that passes (what is done stays, the next call does the rest).
     """
+    for number, name in config.recordings.items():
+        if f"source.{number}" not in inputs:
+            raise DataError(
+                "A source reads a recording of this run, which is not here", where=f"sources[{number}]", got=name,
+                next_step=f"run `worldline task record --name record.{name}` with the same preset first",
+            )  # fmt: skip
     mapper = mapper or SerialMapper()
     roots = tuple(str(inputs.get(f"source.{n}", source.path)) for n, source in enumerate(config.sources))
     work = CurateWork(output, config, roots)

@@ -11,7 +11,7 @@ from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.episode import Split
 from worldline_core.data.episodes.view_recording import VideoMode
 from worldline_core.data.guards.reader_process import ReaderLimits
-from worldline_core.data.sources.open import SourceConfig
+from worldline_core.data.sources.open import RecordingSourceConfig, SourceConfig
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.geometry.cameras import Fit
 
@@ -125,6 +125,11 @@ class CurateConfig(StrictModel):
         if self.fps is not None and self.stride is not None:
             raise ValueError("fps and stride both say how frames are thinned: give one of them")
         return self
+
+    @property
+    def recordings(self) -> dict[int, str]:
+        """Names of the run's own recordings, by the number of the source that reads each."""
+        return {n: s.recording for n, s in enumerate(self.sources) if isinstance(s, RecordingSourceConfig)}
 
     def for_source(self, number: int) -> CurateConfig:
         """The configuration as it holds for sources[number]: what the source says of itself goes before what is said for

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -19,7 +20,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as, with_rigid_poses
 from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode, Masks, SourceConfigBase
 from worldline_core.data.guards.rejection import RATE_TOLERANCE, RejectedInputError, check_length, check_rate
-from worldline_core.data.guards.source_paths import AnyPath, exists
+from worldline_core.data.guards.source_paths import AnyPath, SourceFolder, exists
 from worldline_core.data.sources.agibot import (
     AgibotGesimSource,
     AgibotGesimSourceConfig,
@@ -46,8 +47,21 @@ class EpisodeSetSourceConfig(SourceConfigBase):
     kind: Literal["episode_set"] = "episode_set"
 
 
+class RecordingSourceConfig(EpisodeSetSourceConfig):
+    """A recording that the run makes: one of its section ``record``."""
+
+    kind: Literal["recording"] = "recording"  # pyright: ignore[reportIncompatibleVariableOverride]
+    recording: str
+    path: SourceFolder = Path("record")
+
+    @property
+    def label(self) -> str:
+        return self.name or self.recording
+
+
 SourceConfig = Annotated[
     EpisodeSetSourceConfig
+    | RecordingSourceConfig
     | LeRobotSourceConfig
     | AgibotGesimSourceConfig
     | AgibotWorldSourceConfig
@@ -99,6 +113,7 @@ class EpisodeSetSource:
 
 _READERS: dict[type, Callable[[Any, AnyPath], EpisodeSource]] = {
     EpisodeSetSourceConfig: EpisodeSetSource,
+    RecordingSourceConfig: EpisodeSetSource,
     LeRobotSourceConfig: open_lerobot,
     AgibotGesimSourceConfig: AgibotGesimSource,
     AgibotWorldSourceConfig: AgibotWorldSource,

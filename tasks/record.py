@@ -1,0 +1,16 @@
+"""`record`: simulated robots, scenes and scripted controllers into an EpisodeSet."""
+
+from tasks.execution.artifact_task import ArtifactTask
+
+record = ArtifactTask(
+    name="record",
+    summary="simulated robots, scenes and scripted controllers into an EpisodeSet",
+    version=1,
+    function="worldline_core.recorder.recording:record_artifact",
+    config="worldline_core.recorder.recording:RecordingConfig",
+)
+
+if __name__ == "__main__":
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(record)
