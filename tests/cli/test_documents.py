@@ -98,7 +98,7 @@ def test_documented_commands_exist(page: str) -> None:
 
 SNIPPETS = {
     "captions": VideoFolderSourceConfig, "arms": LeRobotSourceConfig, "views": CalibrationFile, "policies": ServeConfig,
-    "clips": StageConfig, "input": Stage2Config, "full": Variant, "more_noise": Variant,
+    "clips": StageConfig, "input": Stage2Config,
 }  # fmt: skip
 
 
@@ -115,6 +115,8 @@ def test_documented_configurations_are_valid(page: str) -> None:
             model, given = SNIPPETS.get(key, PipelineConfig), {key: value}
             if page == "embodiments.md":
                 model = Embodiment
+            elif key in ("full", "more_noise"):
+                model, given = Variant, value
             elif key in task_names() and key not in PipelineConfig.model_fields:
                 model, given = find_task(key).load_config(), value
             try:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import sys
+import textwrap
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from prefect import flow
+from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
+import tasks
 from flows.pipeline import Inputs, chain, evaluate, predict, prepare
 from tasks.curate import curate
 from tasks.execution.artifact_task import TaskCall, find_task, task_names
 from tasks.execution.chain import find_artifacts, find_call, load_chain, outline, ready_inputs
+from tasks.execution.prefect_run import PrefectRun
 from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.store.store import ArtifactStore
 
 
@@ -99,3 +106,49 @@ def test_inputs_are_checked_where_a_task_is_called() -> None:
 
 def test_the_installed_chain_is_the_pipeline_s() -> None:
     assert load_chain() is chain
+
+
+@pytest.mark.slow
+def test_a_step_needs_a_core_function_a_task_file_and_a_line(
+    prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "counting.py").write_text(
+        textwrap.dedent("""
+        from worldline_core.config import StrictModel
+
+        class CountConfig(StrictModel):
+            factor: int = 1
+
+        def count_files(config, inputs, output):
+            (output / "count").write_text(str(config.factor * len(list(inputs["episodes"].iterdir()))))
+            return {}
+    """)
+    )
+    (tmp_path / "tasks").mkdir()
+    (tmp_path / "tasks" / "count_files.py").write_text(
+        textwrap.dedent("""
+        from tasks.execution.artifact_task import ArtifactTask
+
+        count_files = ArtifactTask(
+            name="count_files", summary="count the files", version=1,
+            function="counting:count_files", config="counting:CountConfig", inputs=("episodes",),
+        )
+    """)
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(tasks, "__path__", [*tasks.__path__, str(tmp_path / "tasks")])
+    task = find_task("count_files")
+    (tmp_path / "episodes").mkdir()
+    (tmp_path / "episodes" / "one").write_text("1")
+
+    @flow
+    def longer_chain() -> Path:
+        with PrefectRun(tmp_path / "store", RunnerConfig()) as run:
+            first = task.submit(task.load_config()(factor=7), episodes=tmp_path / "episodes")
+            task.submit(task.load_config()(), "count_files.again", episodes=first)
+        return run.artifacts["count_files"].folder
+
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
+        assert (longer_chain() / "count").read_text() == "7"
+    assert "count_files" in task_names()
+    del sys.modules["tasks.count_files"], sys.modules["counting"]
