@@ -159,9 +159,7 @@ def _ablations(arguments: argparse.Namespace) -> None:
 
     variants = None if arguments.variant is None else tuple(arguments.variant)
     overrides, seeds = tuple(arguments.overrides), tuple(arguments.seeds)
-    table = ablations(
-        preset, arguments.config, overrides, arguments.artifacts, variants, arguments.variants, seeds
-    )
+    table = ablations(preset, arguments.config, overrides, arguments.artifacts, variants, arguments.variants, seeds)
     print((Path(str(table.path)) / "table.md").read_text(), f"table: {table.path / 'table.md'}", sep="\n")
 
 
