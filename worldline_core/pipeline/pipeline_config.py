@@ -88,7 +88,7 @@ class PipelineConfig(StrictModel):
         default=None, description="none: predictions are not judged, where recordings say no outcome"
     )
     evaluate_planning: PlanningConfig | None = None
-    report: ReportConfig
+    report: ReportConfig = ReportConfig()
     runner: RunnerConfig = Field(
         default=RunnerConfig(), description="where work on many episodes runs; changes no result and no cache key"
     )
