@@ -79,7 +79,7 @@ class PipelineConfig(StrictModel):
     encode_latents: EncodeLatentsConfig
     train_tokenizer: TokenizerConfig | None = Field(default=None, description="null: models.tokenizer is used")
     train_segmenter: SegmenterConfig | None = Field(default=None, description="null: models.segmenter is used")
-    train_stage1: Stage1Config | None = Field(description="null: Stage II starts from models.base")
+    train_stage1: Stage1Config | None = Field(default=None, description="null: Stage II starts from models.base")
     train_stage2: Stage2Config
     distill: DistillConfig
     rollouts: dict[str, RolloutRun]
