@@ -115,23 +115,6 @@ def test_an_interrupted_push_leaves_what_was_published_and_continues(hub: Any, f
     assert digest_folder(tmp_path / "back") == digest_folder(folder)
 
 
-def test_a_hub_that_fails_now_and_then_is_asked_again(hub: Any, folder: Path, tmp_path: Path) -> None:
-    failed: set[str] = set()
-
-    def once(method: str, path: str) -> int | None:
-        kind = "upload" if method == "PUT" else "download" if method == "GET" and "/resolve/" in path else None
-        if kind is None or kind in failed:
-            return None
-        failed.add(kind)
-        return 503
-
-    hub.refuse = once
-    push(folder, PLACE)
-    pull(PLACE, tmp_path / "back")
-    assert failed == {"upload", "download"}
-    assert digest_folder(tmp_path / "back") == digest_folder(folder)
-
-
 def test_a_pull_continues_and_a_changed_file_is_found(hub: Any, folder: Path, tmp_path: Path) -> None:
     push(folder, PLACE)
     repository = hub.repositories["lab/toy"]
@@ -173,13 +156,15 @@ def test_a_damaged_set_is_not_pushed(hub: Any, folder: Path) -> None:
             r"forbid redistribution.*toy \(CC-BY-NC-SA-4\.0\)",
         ),
         ({"redistribution": "unknown"}, True, "do not state whether"),
+        ({"evaluation": True}, False, "for evaluation only"),
         (None, True, "do not state whether"),
     ],
 )
 def test_licences_are_kept(
     hub: Any, tmp_path: Path, declared: dict[str, Any] | None, public: bool, message: str
 ) -> None:
-    root = make_set(tmp_path / "set")
+    evaluation = declared is not None and declared.pop("evaluation", False)
+    root = make_set(tmp_path / "set", conventions={"layout": "robotwin"} if evaluation else None)
     if declared is not None:
         declare(root, **declared)
     with pytest.raises(DataError, match=f"(?s){message}.*--allow-restricted"):
@@ -187,21 +172,6 @@ def test_licences_are_kept(
     assert hub.requests == []  # nothing was sent, not even the repository made
     push(root, PLACE, public=public, allow_restricted=True)
     assert hub.repositories["lab/toy"].private is not public
-
-
-def test_evaluation_sources_are_not_handed_on(hub: Any, tmp_path: Path) -> None:
-    root = tmp_path / "set"
-    with EpisodeSetWriter(root) as writer:
-        state = np.zeros((4, 1), np.float32)
-        episode = Episode(
-            episode_id="e", source="toy", embodiment="toy", scene="s", task_family="lift", instruction="", outcome="unknown", split="test",
-            fps=8.0, state=state, action=state, timestamps=np.arange(4) / 8, conventions={"layout": "robotwin"},
-        )  # fmt: skip
-        writer.add(episode, {"head": np.zeros((4, 16, 16, 3), np.uint8)})
-    declare(root)
-    with pytest.raises(DataError, match="for evaluation only"):
-        push(root, PLACE)
-    assert hub.requests == []
 
 
 def test_visibility_rights_tokens_and_names(hub: Any, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,27 +36,32 @@ class ClientPayloadError(Exception):
 
 
 @pytest.mark.parametrize(
-    ("error", "expected"),
+    "error",
     [
-        (ConnectionResetError("reset"), True),
-        (TimeoutError("slow"), True),
-        (OSError(errno.EIO, "I/O error"), True),
-        (OSError(errno.ESTALE, "stale handle"), True),
-        (ClientError(503), True),
-        (ClientError(429), True),
-        (ClientPayloadError("cut"), True),
-        (UnreachableInputError("away"), True),
-        (ClientError(404), False),
-        (ClientError(403), False),
-        (FileNotFoundError(errno.ENOENT, "none"), False),
-        (PermissionError(errno.EACCES, "no"), False),
-        (OSError("file signature not found"), False),  # h5py, of a damaged file
-        (RejectedInputError("truncated_video", "cut"), False),
-        (ValueError("bad"), False),
+        ConnectionResetError(), TimeoutError(), OSError(errno.EIO, "I/O error"), OSError(errno.ESTALE, "stale"), ClientError(503),
+        ClientError(429), ClientPayloadError("cut"), UnreachableInputError("away"),
     ],
-)
-def test_only_what_passes_is_tried_again(error: Exception, expected: bool) -> None:
-    assert is_transient(error) is expected
+)  # fmt: skip
+def test_what_passes_is_tried_again_and_ends_no_run(error: Exception) -> None:
+    assert is_transient(error)
+    assert not ends_the_run(error)
+
+
+@pytest.mark.parametrize(
+    ("error", "ends"),
+    [
+        (ClientError(404), False), (ClientError(403), False), (FileNotFoundError(errno.ENOENT, "none"), False),
+        (PermissionError(errno.EACCES, "no"), False), (RejectedInputError("truncated_video", "cut"), False),
+        (OSError("file signature not found"), False),  # h5py, of a damaged file
+        (DataError("bad"), False), (MemoryError(), False), (ConfigError("wrong"), True), (UnavailableError("h5py"), True),
+        (OSError(errno.ENOSPC, "full"), True),
+    ],
+)  # fmt: skip
+def test_bad_data_is_not_tried_again_and_what_every_episode_would_meet_ends_the_run(
+    error: Exception, ends: bool
+) -> None:
+    assert not is_transient(error)
+    assert ends_the_run(error) is ends
 
 
 def test_a_readers_own_words_do_not_hide_the_network() -> None:
@@ -95,21 +100,6 @@ def test_attempts_are_counted_and_bad_data_gets_one(monkeypatch: pytest.MonkeyPa
     with pytest.raises(ValueError, match="bad"):
         with_retries(fails(ValueError("bad"), 99), "a file")
     assert len(calls) == 1
-
-
-@pytest.mark.parametrize(
-    ("error", "expected"),
-    [
-        (ConfigError("wrong"), True),
-        (UnavailableError("h5py"), True),
-        (OSError(errno.ENOSPC, "full"), True),
-        (UnreachableInputError("away"), False),
-        (DataError("bad"), False),
-        (MemoryError(), False),
-    ],
-)
-def test_what_ends_a_run(error: Exception, expected: bool) -> None:
-    assert ends_the_run(error) is expected
 
 
 def rows(*statuses: Literal["kept", "quarantined"]) -> list[InputRow]:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import errno
-import os
 import stat
-import tempfile
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +21,6 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import inside, local_file, parse_location
 from worldline_core.scale.account import read_account
 from worldline_core.scale.mapping import RunnerConfig, SerialMapper
-from worldline_core.store import remote
 from worldline_core.store.artifact_files import digest_folder
 from worldline_core.store.remote import RemoteCache, UnreachableInputError, list_files
 from worldline_core.store.store import ArtifactStore
@@ -141,20 +138,6 @@ def test_copies_stay_within_their_bound_in_a_private_folder(tmp_path: Path, stor
         assert sum(path.stat().st_size for path in cache.folder.rglob("*") if path.is_file()) <= 2500
     asked = [path for method, path in store.requests if method == "GET" and "/bound/" in path]
     assert len(asked) == 7  # 0 was asked for three times: once it was still there
-
-
-def test_caches_of_killed_processes_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    alive, dead, young = RemoteCache(), tmp_path / "worldline-remote-dead", tmp_path / "worldline-remote-young"
-    (tmp_path / "worldline-remote-link").symlink_to(tmp_path.parent, target_is_directory=True)
-    for folder in (dead, young):
-        folder.mkdir()
-        (folder / "copy").touch()
-    for folder in (alive.folder, dead):
-        os.utime(folder, (0, 0))
-    remote._remove_leftovers()
-    assert {path.name for path in tmp_path.iterdir()} == {alive.folder.name, young.name, "worldline-remote-link"}
-    assert tmp_path.parent.is_dir()
 
 
 def test_a_cut_download_is_noticed(tmp_path: Path, store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:

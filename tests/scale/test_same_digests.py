@@ -102,37 +102,6 @@ def test_other_runners(recordings: Path, undisturbed: tuple[str, str], tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
-def test_in_a_flow_the_shards_are_tasks_with_names(
-    recordings: Path, undisturbed: tuple[str, str], tmp_path: Path
-) -> None:
-    from prefect import flow
-    from prefect.client.orchestration import get_client
-    from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterName
-
-    from tasks.curate import curate as curate_task
-    from tasks.execution.prefect_run import ArtifactReference, PrefectRun
-    from worldline_core.pipeline.pipeline_config import source_folders
-
-    configured, settings = config(recordings), runner("processes", workers=1, episodes_per_shard=4)
-
-    @flow(flow_run_name=str(tmp_path))
-    def one_step() -> ArtifactReference:
-        with PrefectRun(tmp_path / "artifacts", settings) as run:
-            curate_task.submit(configured, source=source_folders(configured))
-        return run.artifacts["curate"]
-
-    assert one_step().digest == undisturbed[0]
-    wanted = {"curate", *(f"curate shard {number}" for number in range(3))}
-    deadline = time.monotonic() + 60
-    with get_client(sync_client=True) as client:
-        runs = FlowRunFilter(name=FlowRunFilterName(any_=[str(tmp_path)]))
-        while wanted != (found := {run.name for run in client.read_task_runs(flow_run_filter=runs)}):
-            assert time.monotonic() < deadline, found
-            time.sleep(0.5)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("prefect_server")
 def test_killed_in_the_middle_and_resumed_elsewhere(
     recordings: Path, undisturbed: tuple[str, str], tmp_path: Path
 ) -> None:

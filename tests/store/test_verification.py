@@ -12,7 +12,6 @@ import pytest
 
 from flows.command_line import main
 from flows.pipeline import chain
-from tasks.execution.artifact_task import TaskCall
 from tasks.execution.chain import outline, ready_inputs
 from worldline_core.config import StrictModel, load_config
 from worldline_core.errors import ArtifactError
@@ -20,8 +19,6 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.store import artifact_files
 from worldline_core.store.artifact_files import VerifyMode, check_artifacts, find_damage, folder_files, write_manifest
 from worldline_core.store.store import Artifact, ArtifactStore
-
-KINDS = ("curate", "filter", "render_actions", "encode_latents", "rollout.copy_first_frame", "train_stage1")
 
 
 class WriteConfig(StrictModel):
@@ -54,32 +51,19 @@ def flipped(path: Path, position: int, bit: int) -> Iterator[None]:
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
-class Run(dict[str, Path]):
-    """Finished artifacts of two recordings, each made when it is asked for, after those that it may need."""
-
-    def __init__(self, calls: dict[str, TaskCall], store: ArtifactStore) -> None:
-        self.calls, self.store = calls, store
-
-    def __missing__(self, kind: str) -> Path:
-        for name in [name for name in KINDS[: KINDS.index(kind) + 1] if name not in self]:
-            call = self.calls[name]
-            self[name] = call.task.run(self.store, call.config, ready_inputs(call, self.calls, self.store)).path
-        return self[kind]
-
-
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> Run:
+def run(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> dict[str, Path]:
+    """A curated and a filtered set of two recordings."""
     recordings = 'curate.sources=[{kind: episode_set, path: artifacts/shipped/recordings, name: shipped, include: ["viperx_pearl-train-s1-00001", "ur5e_silver-test-s1-00000"]}]'  # fmt: skip
-    small = [
-        "encode_latents.splits=[train]",
-        "train_stage1.trainer.steps=1",
-        "train_stage1.trainer.validation_batches=0",
-    ]
-    settings = load_config(PipelineConfig, preset="smoke", overrides=[recordings, *small])
-    return Run(outline(chain, settings), ArtifactStore(tmp_path_factory.mktemp("store")))
+    calls = outline(chain, load_config(PipelineConfig, preset="smoke", overrides=[recordings]))
+    store = ArtifactStore(tmp_path_factory.mktemp("store"))
+    made = {}
+    for call in (calls["curate"], calls["filter"]):
+        made[call.name] = call.task.run(store, call.config, ready_inputs(call, calls, store)).path
+    return made
 
 
-@pytest.mark.parametrize("kind", [*KINDS[:-1], pytest.param(KINDS[-1], marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["curate", "filter"])
 def test_a_flipped_byte_is_named_before_it_is_used(run: dict[str, Path], kind: str, tmp_path: Path) -> None:
     folder = run[kind]
     for path in [*folder_files(folder), folder / "manifest.json"]:
@@ -89,7 +73,6 @@ def test_a_flipped_byte_is_named_before_it_is_used(run: dict[str, Path], kind: s
                 with pytest.raises(ArtifactError, match="damaged") as error:
                     next_step(tmp_path, folder)
                 assert path.relative_to(folder).as_posix() in str(error.value)
-                assert f"delete {folder}" in str(error.value)
                 assert f"worldline task {folder.parent.name}" in str(error.value)
     assert not next_step(tmp_path, folder).cached
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -17,7 +14,7 @@ from PIL import Image
 from prefect import flow
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowFilter, FlowFilterName
-from prefect.settings import PREFECT_API_URL, PREFECT_LOCAL_STORAGE_PATH, temporary_settings
+from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from flows.pipeline import prepare
 from tasks.execution.artifact_task import variant
@@ -172,73 +169,3 @@ def task_runs(flow_name: str, count: int) -> list[Any]:
 
 
 # The pool's processes import this file, so that the line a minute is a line a step in them too.
-SIDE_BY_SIDE = """
-import sys
-from pathlib import Path
-from types import ModuleType
-from tasks.execution.artifact_task import ArtifactTask
-from worldline_core import progress
-from worldline_core.config import StrictModel
-
-class CountConfig(StrictModel):
-    last: int
-
-def count_up(config, inputs, output):
-    if config.last > 4:
-        raise ValueError("this task breaks")
-    return {"last": list(progress.with_progress(range(config.last), "counting", "number"))}
-
-count = ArtifactTask("count", "", 1, "tasks.count:count_up", "tasks.count:CountConfig", optional_inputs=("before",))
-module = sys.modules["tasks.count"] = ModuleType("tasks.count")
-module.count, module.count_up, module.CountConfig = count, count_up, CountConfig
-progress.LINE_SECONDS = 0.0
-
-if __name__ == "__main__":
-    from prefect import flow
-    from tasks.execution.prefect_run import PrefectRun
-    from worldline_core.scale.mapping import RunnerConfig
-
-    @flow
-    def both():
-        with PrefectRun(Path(sys.argv[1]), RunnerConfig(steps_at_once=2)):
-            count.submit(CountConfig(last=3))
-            more = count.submit(CountConfig(last=int(sys.argv[2])), "count.more")
-            count.submit(CountConfig(last=1), "count.last", before=more)
-
-    both()
-"""
-
-
-def side_by_side(folder: Path, project_root: Path, last: int) -> subprocess.CompletedProcess[str]:
-    (folder / "both.py").write_text(SIDE_BY_SIDE)
-    return subprocess.run(
-        [sys.executable, folder / "both.py", folder / "store", f"{last}"], cwd=project_root, stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT, text=True, check=False, timeout=250,
-        env={**os.environ, "PYTHONPATH": str(project_root), "PREFECT_API_URL": PREFECT_API_URL.value() or ""},
-    )  # fmt: skip
-
-
-@pytest.mark.slow
-def test_steps_side_by_side_write_each_line_once_with_the_name_of_the_call(
-    prefect_server: None, project_root: Path, tmp_path: Path
-) -> None:
-    process = side_by_side(tmp_path, project_root, 4)
-    assert process.returncode == 0, process.stdout[-2000:]
-    assert "\r" not in process.stdout
-    assert "█" not in process.stdout
-    shown = [
-        line.partition(" - ")[2].partition(" numbers")[0] for line in process.stdout.splitlines() if "number" in line
-    ]
-    counted = {"count": 3, "count.more": 4, "count.last": 1}
-    expected = [f"{name}: counting: {n} of {last}" for name, last in counted.items() for n in range(1, last + 1)]
-    assert sorted(shown) == sorted(expected)
-
-
-@pytest.mark.slow
-def test_a_step_that_breaks_ends_the_run_with_its_own_error(
-    prefect_server: None, project_root: Path, tmp_path: Path
-) -> None:
-    process = side_by_side(tmp_path, project_root, 5)
-    assert process.returncode != 0
-    assert process.stdout.strip().splitlines()[-1] == "ValueError: this task breaks"
-    assert "count.last: counting" not in process.stdout

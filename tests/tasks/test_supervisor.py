@@ -45,36 +45,39 @@ def wait_until_gone(pid: int) -> None:
     assert not Path(f"/proc/{pid}").exists()
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_from_the_terminal_stops_everything(project_root: Path, number: int, status: int) -> None:
-    process, helper = start(project_root, "time.sleep(60)")
+SLEEP = "time.sleep(60)"
+DEAF = pytest.param(
+    f"signal.signal(signal.SIGTERM, signal.SIG_IGN); {SLEEP}", signal.SIGINT, 130, marks=pytest.mark.slow
+)
+
+
+@pytest.mark.parametrize(
+    ("body", "number", "status"), [(SLEEP, signal.SIGINT, 130), (SLEEP, signal.SIGTERM, 143), DEAF]
+)
+def test_a_signal_from_the_terminal_stops_everything(project_root: Path, body: str, number: int, status: int) -> None:
+    process, helper = start(project_root, body)
     os.killpg(process.pid, number)
     _, error = process.communicate(timeout=20)
     assert (process.returncode, error) == (status, "stopped; the same command continues\n")
     wait_until_gone(helper)
 
 
-@pytest.mark.slow
-def test_work_that_does_not_listen_is_killed(project_root: Path) -> None:
-    process, helper = start(project_root, "signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)")
-    process.send_signal(signal.SIGINT)
+@pytest.mark.parametrize(
+    ("body", "status", "said"),
+    [
+        ("helper.kill(); raise SystemExit(7)", 7, ""),
+        (
+            "signal.raise_signal(signal.SIGKILL)",
+            137,
+            "ended by SIGKILL, perhaps for its memory; the same command continues",
+        ),
+    ],
+)
+def test_the_command_ends_with_the_status_of_the_work(project_root: Path, body: str, status: int, said: str) -> None:
+    process, helper = start(project_root, body)
     _, error = process.communicate(timeout=20)
-    assert (process.returncode, error) == (130, "stopped; the same command continues\n")
-    wait_until_gone(helper)
-
-
-def test_the_command_ends_with_the_status_of_the_work(project_root: Path) -> None:
-    process, helper = start(project_root, "helper.kill(); raise SystemExit(7)")
-    process.communicate(timeout=20)
-    assert process.returncode == 7
-    wait_until_gone(helper)
-
-
-def test_work_that_is_killed_is_reported(project_root: Path) -> None:
-    process, helper = start(project_root, "signal.raise_signal(signal.SIGKILL)")
-    _, error = process.communicate(timeout=20)
-    assert process.returncode == 137
-    assert "ended by SIGKILL, perhaps for its memory; the same command continues" in error
+    assert process.returncode == status
+    assert said in error
     wait_until_gone(helper)
 
 
