@@ -13,7 +13,6 @@ from worldline_core.geometry.cameras import CameraPose, project_points
 from worldline_core.geometry.transforms import (
     MAX_ROTATION_DEVIATION,
     mean_pose,
-    nearest_rotation,
     repair_rotations,
     rotation_deviation,
 )
@@ -54,15 +53,6 @@ def test_all_four_conventions_of_one_camera_project_alike() -> None:
         np.testing.assert_allclose(uv, expected[:, 0], rtol=1e-8, atol=1e-7)
     track = CameraTrack.from_pose("head", K, made[1], width=640, height=480)
     np.testing.assert_allclose(track.T_base_camera, T_base_camera, atol=1e-12)
-
-
-def test_opengl_axes_look_along_minus_z() -> None:
-    # A camera at the origin that looks along the base's -z with y up, as OpenGL says: identity.
-    pose = CameraPose.of(np.eye(4), extrinsics="camera_to_base", axes="opengl", where="head")
-    _, depth = project_points(np.array([[0.0, 0.0, -2.0]]), K, pose.T_base_camera)
-    (uv,), _ = project_points(np.array([[0.0, 0.5, -2.0]]), K, pose.T_base_camera)
-    assert depth[0] == pytest.approx(2.0)
-    assert uv[1] < K[1, 2]  # what is up lies higher in the image
 
 
 @pytest.mark.parametrize("deviation", [2e-6, 1e-4, 0.99e-3])
@@ -111,17 +101,6 @@ def test_what_is_beyond_repair_is_refused(kind: str) -> None:
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(CalibrationError, match=r"wrong shape[\s\S]*\(3, 4\)"):
         CameraPose.of(np.eye(4)[:3], extrinsics="camera_to_base", axes="opencv", where="head")
-
-
-def test_the_nearest_rotation_is_a_rotation_and_the_nearest() -> None:
-    rng = np.random.default_rng(2)
-    noisy = poses(40)[:, :3, :3] + 0.2 * rng.normal(size=(40, 3, 3))
-    found = nearest_rotation(noisy)
-    assert rotation_deviation(found).max() < 1e-13
-    best = np.linalg.norm(found - noisy, axis=(1, 2))
-    for seed in range(20):  # turning it any way only leads further away
-        turn = Rotation.from_rotvec(0.05 * np.random.default_rng(seed).normal(size=3)).as_matrix()
-        assert (np.linalg.norm(found @ turn - noisy, axis=(1, 2)) > best).all()
 
 
 def test_the_mean_pose_is_that_of_scipy() -> None:

@@ -6,14 +6,13 @@ import importlib.util
 import os
 import re
 
-import numpy as np
 import pytest
 
 from flows.command_line import main
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.geometry import kinematics
 from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
-from worldline_core.geometry.embodiment_report import check_embodiment, random_states
+from worldline_core.geometry.embodiment_report import check_embodiment
 
 has_mujoco = pytest.mark.skipif(
     importlib.util.find_spec("mujoco") is None, reason="the independent kinematics are MuJoCo's"
@@ -46,16 +45,6 @@ def test_agibot_equals_mujoco(shared_data):
     check = check_embodiment(load_embodiment("agibot_g1", urdf), samples=1000)
     assert check["passed"]
     assert max(error["position_m"] for error in check["errors"]) <= 1e-9
-
-
-def test_random_states_stay_within_limits_and_turn_where_there_are_none():
-    embodiment = load_embodiment("kinova_gen3")
-    states = random_states(embodiment, 500)
-    assert not embodiment.outside_limits(states, tolerance_rad=0.0).any()
-    assert np.isfinite(states).all()
-    assert np.abs(states[:, 0]).max() == pytest.approx(np.pi, rel=0.02)
-    assert (states[:, 7] >= 0).all()
-    assert (states[:, 7] <= 1).all()
 
 
 def break_the_reader(monkeypatch: pytest.MonkeyPatch, metres: float) -> None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from worldline_core.actions.action_tracks import project_tools
 from worldline_core.geometry.cameras import inside_image, project_points
-from worldline_core.geometry.tensor_transforms import invert, is_rigid, rot6d_from_rotation, transform_points
+from worldline_core.geometry.tensor_transforms import invert, rot6d_from_rotation, transform_points
 from worldline_core.geometry.transforms import (
     euler_fixed_xyz_from_rotation,
     pose_from_quaternion_wxyz,
@@ -170,18 +170,6 @@ def test_gradients_in_float64():
         return seen.uv, seen.depth, seen.rot6d
 
     assert torch.autograd.gradcheck(projected, tools)
-
-
-def test_functions_broadcast_keep_dtype_and_run_where_their_input_is():
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    camera = torch.from_numpy(pose((0.9, 0.1, -0.2, 0.3), (0.1, 0.2, -2.0))).float().to(device)
-    points = torch.zeros(5, 7, 3, device=device)
-    moved = transform_points(invert(camera).expand(7, 4, 4), points)
-    assert moved.shape == (5, 7, 3)
-    assert moved.dtype == torch.float32
-    assert moved.device == points.device
-    assert is_rigid(camera.expand(5, 7, 4, 4)).shape == (5, 7)
-    assert rot6d_from_rotation(camera[:3, :3].expand(5, 7, 3, 3)).shape == (5, 7, 6)
 
 
 def test_image_border_lies_half_a_pixel_outside_the_outer_centres():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import pytorch_kinematics as pk
 import torch
 
 from worldline_core.errors import DataError
@@ -67,19 +66,6 @@ def test_reader_equals_mujoco():
         for name in names:
             np.testing.assert_allclose(poses[name][n, :3, 3], data.body(name).xpos, atol=1e-12)
             np.testing.assert_allclose(poses[name][n, :3, :3], data.body(name).xmat.reshape(3, 3), atol=1e-12)
-
-
-def test_reader_equals_the_parser_of_pytorch_kinematics():
-    text = TOY.replace("drake:acceleration", "acceleration").replace(
-        '<child link="hand"/>',
-        '<child link="hand"/><axis xyz="1 0 0"/>',  # its default is z, URDF's is x
-    )
-    text = text.replace('<transmission name="t"/>', "")
-    theirs = pk.build_chain_from_urdf(text.encode()).to(dtype=torch.float64)
-    expected = theirs.forward_kinematics_tensor(torch.from_numpy(VALUES))
-    _, poses = ours(["finger", "camera"])
-    for name, pose in poses.items():
-        np.testing.assert_allclose(pose, expected[theirs.frame_to_idx[name]].numpy(), atol=2e-6)
 
 
 def robot(body: str) -> str:

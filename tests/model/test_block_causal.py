@@ -10,8 +10,6 @@ import torch
 from worldline_core.errors import DataError
 from worldline_core.model.block_causal_attention import (
     CachedAttention,
-    CachedBlock,
-    CacheWindow,
     KVCache,
     TeacherForcingAttention,
     block_bounds,
@@ -64,19 +62,6 @@ def one_block_at_a_time(
         found = torch.softmax(scores / queries.shape[-1] ** 0.5, dim=-1) @ values[..., seen, :]
         mixed.append(found.transpose(1, 2).flatten(2))
     return torch.cat(mixed, dim=1)
-
-
-def test_blocks_of_a_clip() -> None:
-    assert block_bounds(9, 4) == [(0, 1), (1, 5), (5, 9)]
-    with pytest.raises(DataError, match="does not divide into blocks"):
-        block_bounds(8, 4)
-
-
-def test_the_window_keeps_the_sink_and_the_recent_blocks() -> None:
-    cache = KVCache(sink_blocks=1, recent_blocks=3)
-    for number, kept in enumerate(([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], [0, 2, 3, 4], [0, 3, 4, 5])):
-        cache.append(CachedBlock(10**number, {}), torch.zeros(1, 1, 1, 1, 1, 1))
-        assert cache.frames == sum(10**block for block in kept)
 
 
 @pytest.mark.parametrize("window", WINDOWS)
@@ -205,25 +190,6 @@ def test_the_window_keeps_the_sink_and_the_recent_blocks_and_never_leaves_the_tr
     first = KVCache(1, 2)
     model.write_block(torch.zeros(1, 3, 4, 1, 4, 4), first)
     assert torch.equal(cache.window.blocks[0].layers[0][0], first.window.blocks[0].layers[0][0])
-
-
-def test_a_long_rollout_with_the_window_equals_a_fresh_cache_with_the_same_blocks(model: WorldModel) -> None:
-    """After eviction the rest is read exactly as if the evicted block had never been there."""
-    rolled, fresh = KVCache(1, 1), KVCache(1, 1)
-    _, clean, _, sigma = clip()
-    for start, stop in ((0, 1), (1, 3), (3, 5)):
-        model.write_block(frames_of(clean, start, stop), rolled)
-    fresh.window, fresh.reference = CacheWindow(rolled.window.blocks), rolled.reference
-    block = frames_of(clean, 5, 7)
-    assert torch.equal(model.forward_block(block, sigma[:, 0], rolled), model.forward_block(block, sigma[:, 0], fresh))
-
-
-def test_copies_of_a_cache_go_on_separately(model: WorldModel) -> None:
-    cache = KVCache(1, 3)
-    model.write_block(torch.zeros(1, 3, 4, 1, 4, 4), cache)
-    other = cache.select([0])
-    model.write_block(torch.ones(1, 3, 4, BLOCK, 4, 4), other)
-    assert (cache.frames, other.frames) == (1, 1 + BLOCK)
 
 
 @pytest.mark.usefixtures("unchecked_shapes")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -141,16 +140,6 @@ def test_clips_of_two_rates_in_one_batch_stand_where_diffusers_puts_each(diffuse
     torch.testing.assert_close(ours, torch.cat(expected), rtol=1e-5, atol=1e-5)
     at_config_rate = model(*given, text=context, views=("head",)).velocity[:, 0]
     assert bool((at_config_rate - ours).abs().amax(dim=(1, 2, 3, 4)).min() > 1e-3)
-
-
-@torch.no_grad()
-def test_a_model_without_a_rate_counts_latent_frames_whatever_the_clips_rate(
-    make_model: Callable[..., WorldModel],
-) -> None:
-    model = make_model()
-    latents = torch.randn(2, 3, 4, 3, 4, 4, generator=torch.Generator().manual_seed(5))
-    sigma = torch.tensor([0.5, 0.7])
-    assert torch.equal(model(latents, sigma).velocity, model(latents, sigma, fps=torch.tensor([8.0, 30.0])).velocity)
 
 
 @torch.no_grad()

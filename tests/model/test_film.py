@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
 
-from worldline_core.errors import DataError
 from worldline_core.model.block_causal_attention import KVCache
-from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import ActionContract, CausalSpec
+from worldline_core.model.world_model_config import CausalSpec
 
 SIZE = 5
 Build = Callable[..., WorldModel]
@@ -66,17 +63,3 @@ def test_vectors_matter_in_every_pass_and_the_passes_agree(build: Build, make_sp
     model.write_block(latents[:, :, :, :1], cache, action_maps=vectors[:, :, :, :1])
     first = model.forward_block(latents[:, :, :, 1:3], sigma, cache, action_maps=vectors[:, :, :, 1:3])
     torch.testing.assert_close(first, whole[:, :, :, 1:3], atol=1e-4, rtol=1e-4)
-
-
-def test_maps_are_refused(build: Build) -> None:
-    latents, _, sigma = sample()
-    with pytest.raises(DataError, match=r"(?s)Action maps have the wrong shape.*\(2, 3, 5, 3, 1, 1\)"):
-        build()(latents, sigma, action_maps=torch.zeros(2, 3, 9, 3, 4, 6))
-
-
-def test_it_is_saved(build: Build, make_contract: Callable[..., ActionContract], tmp_path: Path) -> None:
-    save_checkpoint(tmp_path, build(), kind="stage2", action_contract=make_contract())
-    model, info = load_checkpoint(tmp_path)
-    assert info.config.native_size == SIZE
-    latents, vectors, sigma = sample()
-    assert model(latents, sigma, action_maps=vectors).velocity.shape == latents.shape

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -20,7 +19,6 @@ from worldline_core.model.tokenizers import (
     fit_patch_tokenizer,
 )
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
-from worldline_core.training import train_tokenizer
 from worldline_core.training.clip_source import LoadedView
 from worldline_core.training.train_tokenizer import train_small_decoder
 from worldline_core.training.training_config import TokenizerConfig
@@ -116,27 +114,6 @@ def test_training_lowers_the_error_and_leaves_the_encoder_as_it_is(
         for name, value in tokenizer.state_dict().items():
             assert torch.equal(value, before[name]), name
         assert not any(parameter.requires_grad for parameter in [*tokenizer.parameters(), *decoder.parameters()])
-
-
-def test_interrupted_training_ends_with_the_same_weights(
-    patch: PatchTokenizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole, cut, resumed = (of(patch) for _ in range(3))
-    train_small_decoder(whole, patch, views(1, count=3), CONFIG, tmp_path / "whole")
-    batch = train_tokenizer.decoder_batch
-
-    def failing(*arguments: Any, **options: Any) -> object:
-        if arguments[-1] == 2:
-            raise KeyboardInterrupt("stopped at step 2")
-        return batch(*arguments, **options)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(train_tokenizer, "decoder_batch", failing)
-        with pytest.raises(KeyboardInterrupt, match="stopped at step 2"):
-            train_small_decoder(cut, patch, views(1, count=3), CONFIG, tmp_path / "cut")
-    train_small_decoder(resumed, patch, views(1, count=3), CONFIG, tmp_path / "cut")
-    for key, value in whole.state_dict().items():
-        assert torch.equal(value, resumed.state_dict()[key]), key
 
 
 def test_a_decoder_of_another_tokenizer_or_a_damaged_one_is_refused(patch: PatchTokenizer, tmp_path: Path) -> None:

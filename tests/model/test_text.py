@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
-from worldline_core.model.text import VISION_START, ClipFacts, Cosmos3Text, video_prompt
+from worldline_core.model.text import VISION_START, ClipFacts, Cosmos3Text
 from worldline_core.rehearsal.outside_models import write_qwen2_tokenizer
 
 CLIP = ClipFacts(num_frames=129, fps=24.0, image_size=(480, 640))
@@ -18,23 +18,6 @@ CLIP = ClipFacts(num_frames=129, fps=24.0, image_size=(480, 640))
 def folder(tmp_path: Path) -> Path:
     write_qwen2_tokenizer(tmp_path / "tokenizer")
     return tmp_path / "tokenizer"
-
-
-def test_prompt_carries_duration_and_resolution() -> None:
-    facts = "The video is 5.4 seconds long and is of 24 FPS. This video is of 480x640 resolution."
-    assert video_prompt("Lift the cube.", CLIP) == f"Lift the cube. {facts}"
-    assert video_prompt(" ", CLIP) == facts
-
-
-def test_ids_follow_the_chat_template_and_end_with_the_start_of_vision(folder: Path) -> None:
-    text = Cosmos3Text(folder)
-    decoded = text.tokenizer.decode(text.ids("lift the red cube", CLIP))
-    assert decoded.startswith("<|im_start|>system\nYou are a helpful assistant")
-    assert "<|im_start|>user\nlift the red cube" in decoded
-    assert decoded.endswith("<|im_start|>assistant\n<|im_end|><|vision_start|>")
-    ids, mask = text(["lift the red cube", "lift the red cube put it down"], [CLIP, CLIP])
-    assert mask.sum(dim=1).tolist() == [len(text.ids("lift the red cube", CLIP)), ids.shape[1]]
-    assert ids[0, mask[0]].tolist() == text.ids("lift the red cube", CLIP)
 
 
 def test_ids_are_those_of_diffusers(folder: Path) -> None:

@@ -112,12 +112,6 @@ def test_encoding_and_decoding_are_causal(fitted: PatchTokenizer) -> None:
     assert torch.equal(fitted.decode(before)[:, :, :5], fitted.decode(after)[:, :, :5])
 
 
-def test_blocks_decode_as_they_arrive(fitted: PatchTokenizer) -> None:
-    latents = fitted.encode(scenes(seed=9))
-    block = fitted.decode(latents[:, :, [0, 2]])
-    torch.testing.assert_close(block[:, :, 1:], fitted.decode(latents)[:, :, 5:], rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_a_short_training_improves_on_the_linear_decode_by_using_the_reference(tmp_path: Path) -> None:
     videos = views(2)

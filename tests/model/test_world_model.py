@@ -54,11 +54,6 @@ def test_sigma_is_not_read_on_clean_frames(build: Build) -> None:
     assert not torch.allclose(model(latents, per_frame).velocity, model(latents, other).velocity)
 
 
-def test_a_block_after_a_cache_has_no_clean_frame(build: Build) -> None:
-    latents, _, sigma = sample()
-    assert bool((build().forward_block(latents, sigma, KVCache(1, 3))[:, :, :, 0] != 0).any())
-
-
 def test_first_frame_residual_adds_the_clean_first_frame(build: Build) -> None:
     latents, _, sigma = sample()
     emitted = build(prediction="velocity")(latents, sigma).velocity + latents[:, :, :, :1]
@@ -100,21 +95,6 @@ def test_view_offsets_in_pixels_are_divided_by_the_pixels_of_a_patch() -> None:
 def test_fps_modulation_stretches_time() -> None:
     positions = video_positions(cosmos3_nano_config(fps=12.0), torch.arange(3), (1, 1), ("head",), temporal_offset=5.0)
     assert positions[0].tolist() == [5.0, 7.0, 9.0]
-
-
-def test_views_attend_to_each_other(build: Build) -> None:
-    latents, _, sigma = sample()
-    model = build()
-    changed = latents.clone()
-    changed[:, 0, :, 1] += 1.0
-    difference = (model(latents, sigma).velocity - model(changed, sigma).velocity).abs()
-    assert bool(difference[:, 1].amax() > 0)
-    assert bool(difference[:, 2].amax() > 0)
-
-
-def test_one_view_runs_alone(build: Build) -> None:
-    latents, _, sigma = sample()
-    assert build()(latents[:, :1], sigma, views=("head",)).velocity.shape == (2, 1, 4, 3, 4, 6)
 
 
 def test_features_come_from_the_layer_asked_for(build: Build) -> None:
@@ -181,10 +161,3 @@ def test_shapes_that_do_not_fit_are_refused(build: Build) -> None:
         model(latents, sigma, action_maps=maps[:, :, :, :2])
     with pytest.raises(ConfigError, match="Unknown or repeated view"):
         model(latents, sigma, views=("head", "left_wrist", "tail"))
-
-
-def test_config_that_contradicts_itself_is_refused(build: Build) -> None:
-    with pytest.raises(ValueError, match="must add up to head_dim / 2"):
-        build(rope_sections=(3, 2, 2))
-    with pytest.raises(ValueError, match="must be a multiple of num_kv_heads"):
-        build(num_kv_heads=3)

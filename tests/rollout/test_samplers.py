@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import pytest
@@ -16,7 +15,6 @@ from worldline_core.rollout.samplers import (
     FULL_STEPS,
     BlockCausalSimulator,
     Noise,
-    euler_step,
     rollout_full_clip,
     shifted_sigmas,
     sigmas_causal,
@@ -49,14 +47,6 @@ def test_nodes_of_the_samplers() -> None:
         CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, sigmas=(1.0, 0.5, 0.5, 0.0))
 
 
-def test_euler_reaches_the_sample_of_a_constant_velocity() -> None:
-    clean, noise = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(0))
-    latents = noise
-    for sigma, next_sigma in itertools.pairwise(CAUSAL_SIGMAS):
-        latents = euler_step(latents, noise - clean, sigma, next_sigma)
-    torch.testing.assert_close(latents, clean)
-
-
 class Oracle(torch.nn.Module):
     """Emits the exact velocity towards known latents."""
 
@@ -76,20 +66,6 @@ def test_whole_clip_sampler_finds_what_the_velocity_points_to() -> None:
     clean[:, :, :, 0] = first
     predicted = rollout_full_clip(Oracle(clean), first, maps, noise=Noise([42, 43]), steps=5)  # type: ignore[arg-type]
     torch.testing.assert_close(predicted, clean, rtol=1e-4, atol=1e-4)
-
-
-def test_shifted_steps_stand_at_higher_noise(model: WorldModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    first, maps = observation(1)
-    seen: list[float] = []
-    forward = model.forward
-
-    def watched(state: torch.Tensor, sigma: torch.Tensor, **given: object) -> WorldModelOutput:
-        seen.append(float(sigma[0]))
-        return forward(state, sigma, **given)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(model, "forward", watched)
-    rollout_full_clip(model, first, maps, noise=Noise([42]), steps=4, shift=5.0)
-    assert seen == pytest.approx([1.0, 15 / 16, 5 / 6, 5 / 8])
 
 
 def test_a_clip_is_predicted_alike_alone_and_in_a_batch(model: WorldModel) -> None:
@@ -148,19 +124,6 @@ def test_rollouts_stand_in_time_by_the_rate_they_are_given(make_model: Callable[
     assert torch.equal(*blocks)
 
 
-def test_long_rollouts_keep_a_window_of_constant_size(model: WorldModel) -> None:
-    first, maps = observation(batch=1, frames=1 + 4 * 7)
-    simulator = BlockCausalSimulator(
-        model, SPEC.model_copy(update={"sigmas": (1.0, 0.0), "recent_blocks": 2}), noise=Noise([42])
-    )
-    simulator.start(first, maps[:, :, :, :1])
-    sizes = []
-    for start in range(1, maps.shape[3], 4):
-        simulator.step(maps[:, :, :, start : start + 4])
-        sizes.append(simulator.cache.frames)
-    assert sizes == [1, 5, 9, 9, 9, 9, 9]
-
-
 def test_forks_go_on_separately_and_repeat_the_original(model: WorldModel) -> None:
     first, maps = observation(frames=13)
     simulator = BlockCausalSimulator(model, SPEC, noise=Noise([42, 43]))
@@ -172,16 +135,6 @@ def test_forks_go_on_separately_and_repeat_the_original(model: WorldModel) -> No
     whole = roll(BlockCausalSimulator(model, SPEC, noise=Noise([42, 43])), first, maps)
     assert torch.equal(continued, whole[1])
     assert not torch.allclose(other, continued, atol=1e-3)
-
-
-def test_a_simulator_starts_again_from_nothing(model: WorldModel) -> None:
-    first, maps = observation()
-    simulator = BlockCausalSimulator(model, SPEC, noise=Noise([42, 43]))
-    roll(simulator, first, maps)
-    simulator.noise = Noise([42, 43])
-    again = roll(simulator, first, maps)
-    fresh = roll(BlockCausalSimulator(model, SPEC, noise=Noise([42, 43])), first, maps)
-    assert torch.equal(again[1], fresh[1])
 
 
 def test_misuse_is_refused(model: WorldModel) -> None:

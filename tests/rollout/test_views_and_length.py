@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +11,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from tests.rollout.conftest import SIZE, digests, write_recordings  # pyright: ignore[reportMissingImports]
+from tests.rollout.conftest import SIZE, write_recordings  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import read_quarantine
@@ -40,7 +38,6 @@ EPISODES = (
     ("short", "test", 9, VIEWS, VIEWS),
 )
 CONFIG = RolloutConfig(method="causal", batch_size=8, bfloat16=False)
-STAGE2 = RolloutConfig(method="chained", sampler=FullClipConfig(steps=2), bfloat16=False)
 
 
 @pytest.fixture(scope="module")
@@ -179,20 +176,6 @@ def test_stage2_goes_on_where_its_last_clip_ended(mixed: dict[str, Path], inputs
         FullClipConfig(clip_frames=16)
 
 
-def test_chained_rollouts_lie_in_the_set_like_others(
-    inputs: dict[str, Path], mixed: dict[str, Path], tmp_path: Path
-) -> None:
-    given = mixed | {"checkpoint": inputs["checkpoint"].parent / "stage2"}
-    chained = STAGE2.model_copy(update={"num_frames": "whole", "sampler": FullClipConfig(steps=2, clip_frames=33)})
-    summary = rollout(chained, given, tmp_path / "a")
-    counts = {row.episode_id: row.num_frames for row in RolloutSet.open(tmp_path / "a").rows}
-    assert counts["long"] == 70
-    assert counts["short"] == 9  # shorter than a clip: one clip of its own length
-    assert summary["cut_frames"] == 97 - 70
-    rollout(chained, given, tmp_path / "b")
-    assert digests(tmp_path / "a") == digests(tmp_path / "b")
-
-
 def test_strides_are_those_of_the_training(inputs: dict[str, Path], mixed: dict[str, Path], tmp_path: Path) -> None:
     strided = CONFIG.model_copy(update={"stride": 2, "num_frames": "whole"})
     with pytest.raises(CheckpointError, match=r"(?s)not trained at this stride.*\(1,\).*got: 2"):
@@ -238,36 +221,3 @@ def test_recordings_of_another_rate_are_left_out(mixed: dict[str, Path]) -> None
     planned, left_out = plan_predictions(CONFIG, episodes, tracks, chosen, Any3(), 8.0)
     assert [item.episode_id for item in planned] == ["three"]
     assert Counter(row.reason for row in left_out) == {"wrong_fps": 1}
-
-
-PEAK = """
-import sys
-from pathlib import Path
-from worldline_core.rollout.rollout import rollout
-from worldline_core.rollout.rollout_config import RolloutConfig
-root, frames = Path(sys.argv[1]), int(sys.argv[2])
-config = RolloutConfig.model_validate({"num_frames": frames, "batch_size": 1, "bfloat16": False, "sampler":
-    {"kind": sys.argv[3], **({"clip_frames": 33, "steps": 1} if sys.argv[3] == "full_clip" else {})}})
-names = dict(part.split("=") for part in sys.argv[4:])
-rollout(config, {name: Path(path) for name, path in names.items()}, root / f"{sys.argv[3]}-{frames}")
-# Not ru_maxrss: a process begins with that of the one that started it.
-(peak,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
-print(peak.split()[1])
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("sampler", "kind"), [("block_causal", "causal"), ("full_clip", "stage2")])
-def test_memory_does_not_grow_with_the_length(inputs: dict[str, Path], tmp_path: Path, sampler: str, kind: str) -> None:
-    """Four times the length takes less than 5 % (and less than its decoded frames would take) more memory at the peak."""
-    made = write_recordings(tmp_path, [("long", "test", 1 + 16 * 96, VIEWS, VIEWS)])
-    given = {**made, "tokenizer": inputs["tokenizer"], "checkpoint": inputs["checkpoint"].parent / kind}
-    peaks = []
-    for frames in (1 + 16 * 24, 1 + 16 * 96):
-        named = [f"{name}={path}" for name, path in given.items()]
-        command = [sys.executable, "-c", PEAK, str(tmp_path), str(frames), sampler, *named]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-        peaks.append(int(done.stdout.split()[-1]) / 1024)
-    frames_mb = (16 * 72) * 3 * SIZE[0] * SIZE[1] * 3 / 2**20
-    assert peaks[1] < 1.05 * peaks[0], peaks
-    assert peaks[1] - peaks[0] < frames_mb, (peaks, frames_mb)
