@@ -19,8 +19,8 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.actions.render_actions import render_actions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine, write_index
-from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
+from worldline_core.data.episodes.episode_set_writer import part_name
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, EpisodeDescription
+from worldline_core.data.episodes.episode import ARRAYS, EpisodeDescription
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.sidecar import Sidecar
@@ -206,24 +206,6 @@ def test_what_does_not_belong_together_is_refused(tmp_path: Path, sample: Make) 
         replace(episode, outcome="maybe")
     with pytest.raises(DataError, match="No episode was kept"):
         writer.close()
-
-
-def test_intrinsics_follow_a_resize() -> None:
-    rng = np.random.default_rng(0)
-    camera = CameraTrack(
-        "head", np.array([[50.0, 1.0, 30.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]), np.eye(4)[None], 64, 48
-    )
-    small = camera.resized(16, 24)
-    points = rng.uniform(0.5, 2.0, (20, 3))
-
-    def pixels(K: np.ndarray) -> np.ndarray:
-        homogeneous = points @ K.T
-        return homogeneous[:, :2] / homogeneous[:, 2:]
-
-    # The corner of the image, half a pixel outside of the first centre, stays the corner.
-    expected = (pixels(camera.K) + 0.5) * [16 / 64, 24 / 48] - 0.5
-    assert np.abs(pixels(small.K) - expected).max() < 1e-9
-    assert (small.width, small.height) == (16, 24)
 
 
 def test_the_record_of_an_episode_is_stored_whole(sample: Make, tmp_path: Path) -> None:

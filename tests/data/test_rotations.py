@@ -17,43 +17,9 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.recorded_poses import camera_pose, with_rigid_poses
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.errors import CalibrationError
-from worldline_core.geometry.transforms import (
-    pose_from_euler_fixed_xyz,
-    pose_from_quaternion_wxyz,
-    pose_from_quaternion_xyzw,
-    quaternion_wxyz_from_rotation,
-    reread_as_moving,
-    reread_as_wxyz,
-    rotation_deviation,
-    rotation_from_euler_moving_xyz,
-    rotation_from_quaternion_wxyz,
-)
+from worldline_core.geometry.transforms import reread_as_moving, reread_as_wxyz, rotation_deviation
 
 Make = Callable[..., tuple]
-
-
-def test_conventions_agree_with_scipy() -> None:
-    rng = np.random.default_rng(0)
-    angles, position = rng.uniform(-3, 3, (50, 3)), rng.normal(size=(50, 3))
-    poses = pose_from_euler_fixed_xyz(position, angles)
-    assert np.abs(poses[:, :3, :3] - Rotation.from_euler("xyz", angles).as_matrix()).max() < 1e-12
-    assert np.array_equal(poses[:, :3, 3], position)
-    moving = rotation_from_euler_moving_xyz(angles)
-    assert np.abs(moving - Rotation.from_euler("XYZ", angles).as_matrix()).max() < 1e-12
-    quaternions = rng.normal(size=(50, 4))
-    expected = Rotation.from_quat(quaternions).as_matrix()
-    assert np.abs(pose_from_quaternion_xyzw(position, quaternions)[:, :3, :3] - expected).max() < 1e-12
-    wxyz = pose_from_quaternion_wxyz(position, np.roll(quaternions, 1, axis=1))
-    assert np.abs(wxyz[:, :3, :3] - expected).max() < 1e-12
-
-
-def test_quaternions_invert_even_at_half_turns() -> None:
-    rotations = Rotation.random(200, random_state=1).as_matrix()
-    half_turns = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()
-    for rotation in (rotations, half_turns, np.eye(3)[None]):
-        back = rotation_from_quaternion_wxyz(quaternion_wxyz_from_rotation(rotation))
-        assert np.abs(back - rotation).max() < 1e-12
 
 
 def test_a_wrong_reading_and_its_repair_cancel() -> None:
@@ -66,14 +32,6 @@ def test_a_wrong_reading_and_its_repair_cancel() -> None:
     xyzw = Rotation.from_matrix(rotations).as_quat()
     expected = Rotation.from_quat(np.roll(xyzw, 1, axis=1)).as_matrix()
     assert np.abs(written_as_wxyz(rotations) - expected).max() < 1e-9
-
-
-@pytest.mark.parametrize("bad", [0.0, np.nan])
-def test_a_quaternion_without_direction_is_refused(bad: float) -> None:
-    quaternions = np.tile([1.0, 0, 0, 0], (3, 2, 1))
-    quaternions[2, 1] = bad
-    with pytest.raises(CalibrationError, match=r"no direction[\s\S]*entry 2, 1[\s\S]*1 of 6"):
-        rotation_from_quaternion_wxyz(quaternions)
 
 
 def sheared(poses: np.ndarray, frame: int, deviation: float) -> np.ndarray:

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_quarantine
-from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.episode_set_writer import part_name
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig

@@ -25,8 +25,8 @@ from worldline_core.actions.episode_tracks import (
 from worldline_core.actions.overlays import OverlayStyle, overlay_sheet
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.episode_index import QuarantineRow, nothing_kept, write_quarantine
-from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
+from worldline_core.data.episodes.episode_set_writer import part_name
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures import evenly_spaced, png_bytes

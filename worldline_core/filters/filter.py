@@ -32,8 +32,8 @@ from worldline_core.data.episodes.episode_index import (
     write_index,
     write_quarantine,
 )
-from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWork
+from worldline_core.data.episodes.episode_set_writer import part_name
 from worldline_core.filters.calibration import find_calibration_faults, find_lags, find_mistake, find_projection
 from worldline_core.filters.detectors import find_base_motion, find_joint_faults, find_picture_faults, find_static
 from worldline_core.filters.filter_config import FilterConfig

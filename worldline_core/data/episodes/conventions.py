@@ -263,12 +263,9 @@ def source_offset(episode: Episode) -> float:
 
 def scale_joints(episode: Episode, scale: float) -> Episode:
     """The state's columns except grippers, scaled."""
-    grippers = {block[-1] for block in arm_blocks(episode)}
-    joints = [i for i in range(episode.state.shape[1]) if i not in grippers]
-    state, action = episode.state.copy(), episode.action.copy()
-    state[:, joints] *= scale
-    action[:, joints] *= scale
-    return replace(episode, state=state, action=action)
+    factors = np.full(episode.state.shape[1], scale, episode.state.dtype)
+    factors[[block[-1] for block in arm_blocks(episode)]] = 1
+    return replace(episode, state=episode.state * factors, action=episode.action * factors)
 
 
 def exchange_arms(episode: Episode) -> Episode:

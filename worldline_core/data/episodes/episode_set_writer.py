@@ -13,9 +13,11 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -23,7 +25,10 @@ from worldline_core.data.episodes.episode import (
     ARRAYS,
     LABELS,
     NO_EMBODIMENT,
+    VIEWS,
+    CameraTrack,
     Episode,
+    EpisodeDescription,
 )
 from worldline_core.data.episodes.episode_index import (
     INDEX_FILE,
@@ -33,10 +38,9 @@ from worldline_core.data.episodes.episode_index import (
     write_index,
     write_quarantine,
 )
-from worldline_core.data.episodes.episode_parts import Part, part_name, read_parts
 from worldline_core.data.episodes.fingerprint import fingerprint
 from worldline_core.data.episodes.lerobot_writer import EpisodeVideo, write_dataset
-from worldline_core.data.episodes.sidecar import write_sidecar
+from worldline_core.data.episodes.sidecar import Packed, write_sidecar
 from worldline_core.data.episodes.view_recording import (
     RECORDED_SIZE,
     RecordedView,
@@ -55,6 +59,67 @@ from worldline_core.store.atomic import write_json_atomic
 
 VIDEOS_FILE = "videos.json"
 """How many of the set's videos were copied as they were recorded, how many encoded, and in which codecs they are."""
+
+
+def part_name(episode_id: str) -> str:
+    """Folder name of an episode: any id is allowed, the name is safe and unique."""
+    return sha256(episode_id.encode()).hexdigest()[:32]
+
+
+class Part:
+    """One waiting episode. Its description is read at once (`part["split"]`, `part["fingerprint"]`), its arrays when asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.description: dict[str, Any] = json.loads((folder / "part.json").read_text())
+
+    def __getitem__(self, key: str) -> Any:
+        return self.description[key]
+
+    @cached_property
+    def _arrays(self) -> dict[str, np.ndarray]:
+        with np.load(self.folder / "arrays.npz", allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+
+    @cached_property
+    def episode(self) -> Episode:
+        """The episode as the set stores it: its times follow from its rate."""
+        arrays: dict[str, Any] = self._arrays
+        cameras = {
+            view: CameraTrack(view, arrays[f"K.{view}"], arrays[f"pose.{view}"], width, height)
+            for view, (width, height) in self["cameras"].items()
+        }
+        return Episode(
+            **EpisodeDescription.arguments(self.description),
+            **{name: arrays[name] for name in ARRAYS if name in arrays},
+            timestamps=np.arange(self["num_frames"]) / self["fps"],
+            cameras=cameras,
+            video_frames=self["video_frames"],
+        )
+
+    @cached_property
+    def videos(self) -> dict[str, EpisodeVideo]:
+        """By view: first the project's own in their order, then any others by name."""
+        found = self["videos"]
+        return {
+            view: EpisodeVideo(
+                path=self.folder / f"{view}.mp4",
+                histogram=self._arrays[f"histogram.{view}"],
+                **found[view] | {"size": tuple(found[view]["size"])},
+            )
+            for view in sorted(found, key=lambda view: (VIEWS.index(view) if view in VIEWS else len(VIEWS), view))
+        }
+
+    def packed(self, kind: Literal["masks", "things"]) -> Packed:
+        return {view: (shape, self._arrays[f"{kind}.{view}"].tobytes()) for view, shape in self[kind].items()}
+
+    @property
+    def signature(self) -> tuple[Any, ...]:
+        """Episodes with equal signatures fit into one LeRobot dataset."""
+        episode = self.episode
+        videos = tuple((view, video.size, video.codec, video.pixel_format) for view, video in self.videos.items())
+        columns = episode.state.shape[1]
+        return episode.embodiment, episode.fps, videos, columns, episode.state_names, episode.state_kind
 
 
 class EpisodeSetWriter:
@@ -125,7 +190,7 @@ class EpisodeSetWriter:
             thing_labels: by view, uint8 (N, H, W): 1 what the task moves, 2 where it goes, 3.. other things, 0 none.
 
         Raises: DataError when frames, masks, cameras and states do not belong together; RejectedInputError for
-            recordings that cannot be read.
+            recordings that cannot be read or do not belong to the states.
         """
         where = f"episode {episode.episode_id}"
         if not frames:
@@ -137,7 +202,58 @@ class EpisodeSetWriter:
             if isinstance(images, np.ndarray):
                 _check_images(images, episode, f"{where}, view {view}")
             views[view] = RecordedView.of(images) if isinstance(images, np.ndarray) else images
-        write_part(self._parts, episode, views, robot_masks or {}, self.video, described, thing_labels or {})
+        robot_masks, thing_labels = robot_masks or {}, thing_labels or {}
+        final = self._parts / part_name(episode.episode_id)
+        working = self._parts / f".{final.name}.{os.getpid()}"
+        shutil.rmtree(working, ignore_errors=True)
+        working.mkdir(parents=True)
+        try:
+            stored: dict[str, EpisodeVideo] = {}
+            thumbnails: dict[str, ViewThumbnails] = {}
+            enlarged: dict[str, str] = {}
+            for view, recorded in views.items():
+                path, before = working / f"{view}.mp4", recorded_size(episode.conventions, view)
+                stored[view], thumbnails[view], size = store_view(recorded, path, episode.fps, self.video, before)
+                if size != stored[view].size:
+                    enlarged[f"{RECORDED_SIZE}{view}"] = f"{size[0]}x{size[1]}"
+            _check_sizes(episode, stored, robot_masks, thing_labels)
+            if described is not None:
+                episode = described(thumbnails)
+            others = {name: value for name, value in episode.conventions.items() if not name.startswith(RECORDED_SIZE)}
+            episode = replace(episode, conventions=others | enlarged)
+            arrays = {name: values.astype(ARRAYS[name].dtype) for name, values in episode.arrays().items()}
+            for view, camera in episode.cameras.items():
+                arrays[f"K.{view}"] = camera.K.astype(np.float64)
+                arrays[f"pose.{view}"] = camera.T_base_camera.astype(np.float64)
+            arrays |= {f"masks.{view}": packed_images(masks, bool, 9) for view, masks in robot_masks.items()}
+            arrays |= {f"things.{view}": packed_images(labels, np.uint8, 6) for view, labels in thing_labels.items()}
+            arrays |= {f"histogram.{view}": kept.histogram for view, kept in stored.items()}
+            with (working / "arrays.npz").open("wb") as stream:
+                np.savez(stream, allow_pickle=False, **arrays)
+            description = {
+                **episode.described(),
+                "fps": float(episode.fps),
+                "num_frames": episode.num_frames,
+                "video_frames": episode.num_video_frames,
+                "videos": {
+                    view: {
+                        "size": kept.size,
+                        "codec": kept.codec,
+                        "pixel_format": kept.pixel_format,
+                        "copied": kept.copied,
+                    }
+                    for view, kept in stored.items()
+                },
+                "cameras": {view: [camera.width, camera.height] for view, camera in episode.cameras.items()},
+                "masks": {view: list(mask.shape) for view, mask in robot_masks.items()},
+                "things": {view: list(labels.shape) for view, labels in thing_labels.items()},
+                "fingerprint": fingerprint(episode, thumbnails),
+            }
+            (working / "part.json").write_text(json.dumps(description, sort_keys=True))
+            shutil.rmtree(final, ignore_errors=True)
+            working.rename(final)
+        finally:
+            shutil.rmtree(working, ignore_errors=True)
 
     def quarantine(
         self, episode_id: str, source: str, reason: str, detail: str, evidence: Mapping[str, Any] | None = None
@@ -156,7 +272,8 @@ class EpisodeSetWriter:
 
     def kept(self) -> list[Part]:
         """Episodes added so far, by id."""
-        return read_parts(self._parts)
+        found = [Part(path) for path in self._parts.iterdir() if not path.name.startswith(".")]
+        return sorted(found, key=lambda part: part["episode_id"])
 
     def rejected(self) -> list[QuarantineRow]:
         """Inputs quarantined so far, by id."""
@@ -190,7 +307,9 @@ class EpisodeSetWriter:
             # LeRobot has no frames without images: the sidecar holds the states that go on after them.
             filmed = [part.episode.cut(0, part.episode.num_video_frames) for part in members]
             write_dataset(dataset, filmed, [part.videos for part in members])
-            write_sidecar(dataset, members)
+            masks, things = ([part.packed(kind) for part in members] for kind in ("masks", "things"))
+            sizes = {view: video.size for view, video in members[0].videos.items()}
+            write_sidecar(dataset, [part.episode for part in members], masks, things, sizes)
             rows += [_row(part, f"datasets/{name}", index) for index, part in enumerate(members)]
         write_json_atomic(self.root / VIDEOS_FILE, _count_videos(parts))
         write_quarantine(self.root, rejected)
@@ -239,71 +358,6 @@ def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:
         stage2_reason=reason,
         conventions=json.dumps(dict(episode.conventions), sort_keys=True),
     )
-
-
-def write_part(
-    folder: Path,
-    episode: Episode,
-    views: Mapping[str, RecordedView],
-    robot_masks: Mapping[str, Frames],
-    video: VideoSettings,
-    described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None,
-    thing_labels: Mapping[str, Frames],
-) -> None:
-    """Write one episode below `folder`, its videos as they are decoded; the part appears whole or not at all.
-
-    Args:
-        described: gives the episode as it is stored, where its description depends on what its views show.
-
-    Raises: RejectedInputError where the recordings cannot be read or do not belong to the states; DataError where images,
-        cameras and masks do not fit each other.
-    """
-    final = folder / part_name(episode.episode_id)
-    working = folder / f".{final.name}.{os.getpid()}"
-    shutil.rmtree(working, ignore_errors=True)
-    working.mkdir(parents=True)
-    try:
-        stored: dict[str, EpisodeVideo] = {}
-        thumbnails: dict[str, ViewThumbnails] = {}
-        enlarged: dict[str, str] = {}
-        for view, recorded in views.items():
-            path, before = working / f"{view}.mp4", recorded_size(episode.conventions, view)
-            stored[view], thumbnails[view], size = store_view(recorded, path, episode.fps, video, before)
-            if size != stored[view].size:
-                enlarged[f"{RECORDED_SIZE}{view}"] = f"{size[0]}x{size[1]}"
-        _check_sizes(episode, stored, robot_masks, thing_labels)
-        if described is not None:
-            episode = described(thumbnails)
-        others = {name: value for name, value in episode.conventions.items() if not name.startswith(RECORDED_SIZE)}
-        episode = replace(episode, conventions=others | enlarged)
-        arrays = {name: values.astype(ARRAYS[name].dtype) for name, values in episode.arrays().items()}
-        for view, camera in episode.cameras.items():
-            arrays[f"K.{view}"] = camera.K.astype(np.float64)
-            arrays[f"pose.{view}"] = camera.T_base_camera.astype(np.float64)
-        arrays |= {f"masks.{view}": packed_images(masks, bool, 9) for view, masks in robot_masks.items()}
-        arrays |= {f"things.{view}": packed_images(labels, np.uint8, 6) for view, labels in thing_labels.items()}
-        arrays |= {f"histogram.{view}": kept.histogram for view, kept in stored.items()}
-        with (working / "arrays.npz").open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
-        description = {
-            **episode.described(),
-            "fps": float(episode.fps),
-            "num_frames": episode.num_frames,
-            "video_frames": episode.num_video_frames,
-            "videos": {
-                view: {"size": kept.size, "codec": kept.codec, "pixel_format": kept.pixel_format, "copied": kept.copied}
-                for view, kept in stored.items()
-            },
-            "cameras": {view: [camera.width, camera.height] for view, camera in episode.cameras.items()},
-            "masks": {view: list(mask.shape) for view, mask in robot_masks.items()},
-            "things": {view: list(labels.shape) for view, labels in thing_labels.items()},
-            "fingerprint": fingerprint(episode, thumbnails),
-        }
-        (working / "part.json").write_text(json.dumps(description, sort_keys=True))
-        shutil.rmtree(final, ignore_errors=True)
-        working.rename(final)
-    finally:
-        shutil.rmtree(working, ignore_errors=True)
 
 
 def _check_sizes(

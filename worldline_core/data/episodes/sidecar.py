@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from worldline_core.data.episodes.episode import ARRAYS, CameraTrack
+from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, Episode
 from worldline_core.data.guards.plain_files import expect_layout, read_json, read_table
 from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
 from worldline_core.data.guards.source_paths import is_file
 from worldline_core.data.video.frames import PACKED, MadeFrames, unpacked_images
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
-
-if TYPE_CHECKING:
-    from worldline_core.data.episodes.episode_parts import Part
 
 FOLDER = Path("meta") / "worldline"
 
@@ -50,12 +47,21 @@ _TRAJECTORIES = pa.schema(
 )
 
 
-def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
-    """Write the sidecar of a dataset whose episode i is parts[i]."""
+type Packed = Mapping[str, tuple[Sequence[int], bytes]]
+"""By view the shape (N, H, W) of its masks or labels, and themselves as `packed_images`."""
+
+
+def write_sidecar(
+    root: Path,
+    episodes: Sequence[Episode],
+    masks: Sequence[Packed],
+    things: Sequence[Packed],
+    sizes: Mapping[str, tuple[int, int]],
+) -> None:
+    """Write the sidecar of a dataset: of each episode robot masks and labels of things; by view (height, width)."""
     folder = root / FOLDER
-    cameras, masks, things, trajectories = [], [], [], []
-    for index, part in enumerate(parts):
-        episode = part.episode
+    cameras, trajectories = [], []
+    for index, episode in enumerate(episodes):
         for view, camera in episode.cameras.items():
             cameras.append(
                 {
@@ -68,31 +74,31 @@ def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
                     "T_base_camera": camera.T_base_camera.reshape(-1).tolist(),
                 }
             )
-        for rows, packed in ((masks, part.packed("masks")), (things, part.packed("things"))):
-            for view, (shape, bits) in packed.items():
-                rows.append({"episode_index": index, "view": view, "shape": shape, "bits": bits})
         arms = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
         if arms or episode.num_video_frames != episode.num_frames:
             values = {name: array.reshape(-1).tolist() for name, array in episode.arrays().items()}
             trajectories.append({"episode_index": index, "num_frames": episode.num_frames, "num_arms": arms, **values})
     write_table_atomic(folder / "cameras.parquet", pa.Table.from_pylist(cameras, schema=_CAMERAS))
-    if masks:
-        write_table_atomic(folder / "robot_masks.parquet", pa.Table.from_pylist(masks, schema=_MASKS))
-    if things:
-        write_table_atomic(folder / "thing_labels.parquet", pa.Table.from_pylist(things, schema=_MASKS))
+    for name, packed in (("robot_masks.parquet", masks), ("thing_labels.parquet", things)):
+        rows = [
+            {"episode_index": index, "view": view, "shape": shape, "bits": bits}
+            for index, views in enumerate(packed)
+            for view, (shape, bits) in views.items()
+        ]
+        if rows:
+            write_table_atomic(folder / name, pa.Table.from_pylist(rows, schema=_MASKS))
     if trajectories:
         write_table_atomic(folder / "trajectories.parquet", pa.Table.from_pylist(trajectories, schema=_TRAJECTORIES))
-    write_json_atomic(folder / "contract.json", contract(parts[0]))
+    write_json_atomic(folder / "contract.json", contract(episodes[0], sizes))
 
 
-def contract(part: Part) -> dict[str, Any]:
+def contract(episode: Episode, sizes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
     """Units and conventions of a dataset, stated once."""
-    episode = part.episode
     return {
         "version": 1,
         "embodiment": episode.embodiment,
         "fps": episode.fps,
-        "views": {view: {"height": video.size[0], "width": video.size[1]} for view, video in part.videos.items()},
+        "views": {view: {"height": height, "width": width} for view, (height, width) in sizes.items()},
         "state_kind": episode.state_kind,
         "state_names": episode.state_names,
         "action": "none" if episode.state_kind == "none" else "commanded targets, same layout as the state",

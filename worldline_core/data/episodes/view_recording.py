@@ -8,7 +8,7 @@ Otherwise its pictures are encoded. Either way few pictures are in memory at a t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
@@ -187,25 +187,8 @@ def _pictures(recorded: RecordedView) -> Iterator[tuple[np.ndarray, bool, Callab
 
 COPIED_CODECS = ("h264", "hevc", "av1", "vp9")
 """Codecs that mp4 holds and that the usual readers of datasets (torchcodec, PyAV, LeRobot) decode."""
-# A clip that is larger than this is read from the file twice rather than held in memory.
-_HELD_BYTES = 64 << 20
 # Codecs store a frame at most this many frames before or after the place where it is shown (H.264 and HEVC: 16).
 _REORDERED = 32
-
-
-@dataclass(frozen=True)
-class _Selection:
-    """Which packets of a file, counted in the order of decoding from `start_time`'s key frame, make up a clip.
-
-    Attributes:
-        first: number of the first packet; the others follow without a gap.
-        shown_at: (n,) for each packet, the place of its frame in the order of presentation.
-        packets: the packets themselves, None where they are too many to hold.
-    """
-
-    first: int
-    shown_at: np.ndarray
-    packets: list[Packet] | None
 
 
 def copy_clip(
@@ -226,22 +209,23 @@ def copy_clip(
     if "mp4" not in container.format.name or stream.codec_context.codec.canonical_name not in COPIED_CODECS:
         return None
     selection = _select(clip, container, stream)
-    return (
-        None
-        if selection is None
-        else _write_copy(clip, container, stream, selection, target, frame_rate(fps or clip.fps))
-    )
+    if selection is None:
+        return None
+    return _write_copy(clip, container, stream, *selection, target, frame_rate(fps or clip.fps))
 
 
 def _write_copy(
-    clip: VideoClip, container: InputContainer, stream: VideoStream, selection: _Selection, target: Path, rate: Fraction
+    clip: VideoClip,
+    container: InputContainer,
+    stream: VideoStream,
+    first: int,
+    shown_at: np.ndarray,
+    target: Path,
+    rate: Fraction,
 ) -> Iterator[Picture]:
     # Frames by which decoding must run ahead of showing.
-    delay = int((np.arange(clip.num_frames) - selection.shown_at).max())
-    packets: Iterable[Packet] | None = selection.packets
-    if packets is None:
-        every = _packets_from(clip, container, stream)
-        packets = islice(every, selection.first, selection.first + clip.num_frames)
+    delay = int((np.arange(clip.num_frames) - shown_at).max())
+    packets = islice(_packets_from(clip, container, stream), first, first + clip.num_frames)
     size = stream.height, stream.width  # as the container says it: a damaged packet may change the stream's
     found = 0
     tick = 1 / rate
@@ -258,7 +242,7 @@ def _write_copy(
             if packet is not None:
                 packet = length_prefixed(packet, stream)
                 packet.time_base = tick
-                packet.pts = int(selection.shown_at[number])
+                packet.pts = int(shown_at[number])
                 packet.dts = number - delay
                 packet.duration = 1
                 packet.stream = written
@@ -276,11 +260,12 @@ def _packets_from(clip: VideoClip, container: InputContainer, stream: VideoStrea
     return (packet for packet in container.demux(stream) if packet.size)
 
 
-def _select(clip: VideoClip, container: InputContainer, stream: VideoStream) -> _Selection | None:
+def _select(clip: VideoClip, container: InputContainer, stream: VideoStream) -> tuple[int, np.ndarray] | None:
+    """Which packets of a file make up a clip: the number of the first one, counted in the order of decoding from
+    `start_time`'s key frame (the others follow without a gap), and for each its frame's place in the order of presentation.
+    """
     times: list[int] = []
     keys: list[bool] = []
-    held: list[Packet] | None = []
-    held_bytes = 0
     time_base = stream.time_base or Fraction(1, 1000)
     seconds = float(time_base)
     until = math.inf if clip.from_time is None else clip.start_time + (clip.num_frames + _REORDERED) / clip.fps
@@ -291,10 +276,6 @@ def _select(clip: VideoClip, container: InputContainer, stream: VideoStream) -> 
             break
         times.append(packet.pts)
         keys.append(packet.is_keyframe)
-        held_bytes += packet.size
-        if held is not None:
-            held.append(packet)
-            held = held if held_bytes <= _HELD_BYTES else None
     numbers = _frame_numbers(clip, np.asarray(times, dtype=np.int64), time_base)
     if numbers is None:
         return None
@@ -304,7 +285,7 @@ def _select(clip: VideoClip, container: InputContainer, stream: VideoStream) -> 
     first, shown_at = int(inside[0]), numbers[inside]
     if not keys[first] or shown_at[0] != 0 or len(np.unique(shown_at)) != len(shown_at):
         return None
-    return _Selection(first, shown_at, None if held is None else held[first : first + len(shown_at)])
+    return first, shown_at
 
 
 def _frame_numbers(clip: VideoClip, times: np.ndarray, time_base: Fraction) -> np.ndarray | None:
