@@ -107,9 +107,9 @@ def replay(commands: np.ndarray) -> Act:
 class Starts:
     """The starts of recordings, in the order of the environments, and what each recorded policy did at them."""
 
-    def __init__(self, recordings: Path, env: MujocoEnv) -> None:
+    def __init__(self, recordings: Path, env: MujocoEnv, count: int | None) -> None:
         self.episodes = EpisodeSet.open(recordings)
-        self.names = [row.bank or row.episode_id for row in env.starts.rows]
+        self.names = [row.bank or row.episode_id for row in env.starts.rows[:count]]
         self.recorded: dict[str, dict[str, int]] = {}
         for position, row in enumerate(self.episodes.rows):
             if row.bank in self.names:
@@ -134,14 +134,16 @@ class Worlds:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.inside = WorldLineVectorEnv(
-            options.batch, model=options.model, recordings=options.recordings,
+            options.batch, model=options.model, recordings=options.recordings, embodiment=options.embodiment,
             episode_frames=FRAMES, observe_every=options.observe_every, autoreset=False,
             steps=options.steps,
         )  # fmt: skip
         self.size = self.inside.world.image_size
-        world = MujocoEnv(options.recordings, image_size=self.size, episode_frames=FRAMES)
+        world = MujocoEnv(
+            options.recordings, embodiment=options.embodiment, image_size=self.size, episode_frames=FRAMES
+        )
         self.physics = SyncVectorEnv([lambda: world], autoreset_mode=AutoresetMode.DISABLED)
-        self.starts = Starts(options.recordings, world)
+        self.starts = Starts(options.recordings, world, options.starts)
         self._target, self._instruction = world.target, lambda number: world.starts[number].instruction
         self._judge = measured_success()
 
@@ -216,6 +218,8 @@ def main() -> None:
     parser.add_argument(
         "--recordings", type=Path, required=True, help="of one robot, by `worldline record` with policies"
     )
+    parser.add_argument("--embodiment", help="of the starts, where recordings are of several robots")
+    parser.add_argument("--starts", type=int, help="only so many, the first ones")
     parser.add_argument("--policies", type=Path, nargs="*", default=[], help="folders of LeRobot checkpoints")
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--model", type=Path, help="Stage II or causal checkpoint; by default the shipped causal one")

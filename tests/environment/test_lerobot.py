@@ -255,13 +255,3 @@ def test_lerobot_rollout_drives_a_policy_as_on_a_robot(
     for view, carried in kinematics.wrist_cameras_of(kinematics.link_poses(np.array(episode.state))).items():
         np.testing.assert_allclose(episode.cameras[view].T_base_camera, carried, atol=2e-3)
     assert not episode.cameras["head"].moving
-
-
-@pytest.mark.slow
-def test_lerobot_teleoperate_drives_the_simulator(lerobot: Callable[..., str], tmp_path: Path) -> None:
-    said = lerobot(
-        tmp_path, "lerobot_teleoperate", "--robot.type=worldline", "--robot.views=[head]", "--teleop.type=worldline_replay",
-        "--teleop.views=[head]", "--fps=60", "--teleop_time_s=2",
-    )  # fmt: skip
-    assert "Teleop loop time" in said
-    assert "Commands come at" in said

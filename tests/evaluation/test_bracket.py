@@ -73,18 +73,6 @@ def test_smaller_budgets_are_prefixes():
     assert picks == {2: 1, 4: 1, 8: 6}
 
 
-def test_labels_are_letters_and_say_nothing_of_the_identity():
-    labels = []
-
-    class Spy(PerfectSelector):
-        def compare(self, instruction, candidates, select_count):
-            labels.extend(candidates)
-            return super().compare(instruction, candidates, select_count)
-
-    choose(Spy(np.arange(8)), "t", range(8), load, scene="s", seed=0)
-    assert labels == list("ABCD") * 2
-
-
 def test_answers_that_name_nobody_are_counted_and_filled_up():
     class Silent(PerfectSelector):
         def compare(self, instruction, candidates, select_count):

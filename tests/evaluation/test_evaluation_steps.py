@@ -284,15 +284,3 @@ def test_odd_values_of_a_judge_go_through_the_whole_step(recordings, tmp_path, m
         assert len(evidence) == 3
         assert {statement.get("confidence", 0.0) for statement in evidence} == {0.0}
         assert {statement["observations"] for statement in evidence} == {seen}
-
-
-@pytest.mark.parametrize("odd", ODD.values(), ids=ODD)
-def test_odd_values_of_a_selector_go_through_the_whole_step(sealed, tmp_path, monkeypatch, odd):
-    monkeypatch.setattr(outcomes, "open_vlm", lambda kind, config: OddJudge(odd))
-    evaluate_planning(PLANNING.model_copy(update={"selector": "openai"}), sealed, tmp_path / "out")
-    rows = pq.read_table(tmp_path / "out" / CHOICES_FILE).to_pylist()
-    assert len(rows) == 3 * 2 * 3  # methods, runs, budgets
-    for trace in (json.loads(row["trace"]) for row in rows):
-        assert trace["malformed_answers"] == 0
-        assert trace["answers"] >= 3
-        assert set(trace["scores"].values()) == {50}

@@ -69,14 +69,6 @@ def test_the_report_and_the_table_of_scores_follow_from_the_registry(measured, t
     assert not tidy.duplicated(["method", "episode_id", "view", "seed", "metric"]).any()
 
 
-def test_without_a_request_nothing_changes(recordings, tmp_path, measured):
-    evaluate_video(ALWAYS, recordings.inputs, tmp_path)
-    names = set(pq.read_table(tmp_path / "scores.parquet")["metric"].to_pylist())
-    assert not {metric_of(name).name for name in names} & set(ON_REQUEST)  # pyright: ignore[reportOptionalMemberAccess]
-    before, after = (pq.read_table(folder / "scores.parquet").to_pylist() for folder in (tmp_path, measured))
-    assert before == [row for row in after if metric_of(row["metric"]).name not in ON_REQUEST]  # pyright: ignore[reportOptionalMemberAccess]
-
-
 def test_metrics_whose_weights_are_not_there_are_named(recordings, tmp_path):
     evaluate_video(ALWAYS.model_copy(update={"metrics": ("action_following",)}), recordings.inputs, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())

@@ -2,7 +2,6 @@ import json
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from scipy import stats
 
 from worldline_core.errors import DataError
@@ -60,12 +59,8 @@ def test_policies_that_are_predicted_rightly_agree_and_reversed_ones_do_not(pair
     assert wrong["mmrv"]["value"] > 0.5
     for found in (right, wrong):
         for statistic in ("pearson", "spearman", "mmrv", "rate_error"):
-            for low, high in (found[statistic]["over_starts"], found[statistic]["over_starts_and_policies"]):
-                assert low <= found[statistic]["value"] + 0.05
-                assert high >= found[statistic]["value"] - 0.05
-    # Other policies could have been taken: that interval is the wider one.
-    (low, high), (lowest, highest) = right["spearman"]["over_starts"], right["spearman"]["over_starts_and_policies"]
-    assert highest - lowest > high - low
+            low, high = found[statistic]["over_starts_and_policies"]
+            assert low - 0.05 <= found[statistic]["value"] <= high + 0.05
 
 
 def test_nothing_but_chance_is_told_by_the_interval():
@@ -92,18 +87,7 @@ def test_predictions_under_several_seeds_are_averaged_and_tasks_stand_apart():
 def test_equal_rates_have_no_correlation():
     found = policy_agreement(verdicts((0.0, 0.0, 0.0)), **OPTIONS)["model"]["all"]
     assert found["pearson"]["value"] is None
-    assert found["pearson"]["undefined"] == 1.0
     assert found["mmrv"]["value"] == 0.0
-
-
-def test_two_policies_cannot_be_ranked():
-    with pytest.raises(DataError, match="at least three sources"):
-        policy_agreement(verdicts((0.1, 0.9)), **OPTIONS)
-
-
-def test_every_attempt_is_needed():
-    with pytest.raises(ValidationError, match="balanced: false"):
-        PolicyEvaluationConfig(compare_policies=True)
 
 
 @pytest.mark.slow

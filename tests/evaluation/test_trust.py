@@ -21,8 +21,6 @@ from worldline_core.evaluation.policy.trust import (
     setup_vectors,
     trust_verdicts,
 )
-from worldline_core.pages.page import render
-from worldline_core.report.results import policy_evaluation
 
 OPTIONS = {"resamples": 200, "seed": 3}
 
@@ -104,13 +102,6 @@ def test_verdicts_that_are_all_right_or_all_wrong_cannot_be_calibrated(right):
     assert "5 of each are needed" in methods["model"]["reason"]
     assert {row["trust"] for row in trusted} == {None}
     assert trusted[0]["do_not_trust"] == "new controls"  # the mark needs no calibration
-
-
-def test_one_start_leaves_a_half_empty():
-    rows, _ = verdicts(1, policies=40)
-    assert (
-        "of the 1 starts, one half has 0 right" in trust_verdicts(rows, TrustConfig(), **OPTIONS)[1]["model"]["reason"]
-    )
 
 
 def test_without_any_signal_there_is_a_reason():
@@ -264,31 +255,3 @@ def test_trust_needs_tracks_and_training_recordings(recordings, trained, tmp_pat
 )
 def test_evidence_says_what_went_wrong(family, stated, kind):
     assert failure_kind(family, stated) == kind
-
-
-def test_the_page_shows_the_mark_the_calibration_and_what_went_wrong(known):
-    trusted, found, _ = known
-    interval = {"mean": 0.8, "low": 0.7, "high": 0.9, "count": 9}
-    evidence = [{"pass": "first_pass", "head_view_confirms_target_displacement": False}]
-    shown = [
-        {
-            **row,
-            "instruction": f"{verb} it",
-            "evidence_family": "lift",
-            "evidence": json.dumps(evidence),
-            "method": method,
-        }
-        for row, verb in zip(trusted[:60], ["lift", "press"] * 30, strict=True)
-        for method in ("true", "model")
-    ]
-    summary = {
-        "methods": {"true": {"all": {"accuracy": interval}}, "model": {"all": {"accuracy": interval}}},
-        "trust": {"settings": TrustConfig().model_dump(), "training_recordings": 600, "methods": {"model": found}},
-    }
-    page = str(render("report/policy.html", evaluations=[policy_evaluation(summary, shown)]))
-    for text in ("Wrong among marked", "AUROC", "600 training", "What is seen in videos of model"):
-        assert text in page
-    summary["trust"]["methods"]["model"] = {"available": False, "reason": "all are right", "marked": 0}
-    page = str(render("report/policy.html", evaluations=[policy_evaluation(summary)]))
-    assert "Not available for videos of" in page
-    assert "all are right" in page

@@ -5,11 +5,9 @@ import json
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames, pieces
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig, VideoEvaluationConfig
-from worldline_core.evaluation.planning.evaluate_planning import candidate_loader
 from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
 from worldline_core.evaluation.video import episode_measurement
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
@@ -65,18 +63,6 @@ def test_strided_predictions_are_compared_with_every_second_frame(recordings, tm
     wrong = inputs | rewritten(recordings, tmp_path / "wrong", "good", fps=3.0)
     with pytest.raises(DataError, match=r"(?s)another frame rate than their recording.*8 frames per second"):
         evaluate_video(VIDEO, wrong, tmp_path / "refused")
-
-
-def test_a_selector_is_told_the_rate_of_the_prediction(bank, tmp_path):
-    rewritten(bank, tmp_path / "strided", "good", stride=2, fps=4.0)
-    banks = EpisodeSet.open(bank.inputs["banks"])
-
-    def shown(method, folder):
-        return candidate_loader(("head",), banks, None, RolloutSet.open(folder), method, banks.rows)(0)
-
-    strided, whole = shown("strided", tmp_path / "strided"), shown("good", bank.inputs["rollouts.good"])
-    assert (strided.fps, strided.total_frames) == (4.0, 9)
-    assert (whole.fps, whole.total_frames) == (8.0, 17)
 
 
 def test_the_pieces_that_videos_are_read_in_change_no_value(recordings, tmp_path, monkeypatch):

@@ -51,11 +51,10 @@ def bootstrap_mean(
     values: Sequence[float] | np.ndarray,
     *,
     weights: Sequence[float] | np.ndarray | None = None,
-    confidence: float = 0.95,
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """Mean and percentile interval of the mean, resampling ``values`` (n,) with replacement.
+    """Mean and 95 % percentile interval of the mean, resampling ``values`` (n,) with replacement.
 
     ``weights`` (n,) count how many trajectory-view pairs a value stands for, so that the mean equals the mean over
     pairs. One value alone has an interval of width zero.
@@ -74,8 +73,7 @@ def bootstrap_mean(
     generator = np.random.default_rng(seed)
     chosen = generator.integers(0, sample.size, size=(resamples, sample.size))
     means = (sample * weight)[chosen].sum(axis=1) / weight[chosen].sum(axis=1)
-    tail = (1.0 - confidence) / 2.0
-    low, high = np.quantile(means, [tail, 1.0 - tail])
+    low, high = np.quantile(means, [0.025, 0.975])
     return Interval(float((sample * weight).sum() / weight.sum()), float(low), float(high), int(sample.size))
 
 

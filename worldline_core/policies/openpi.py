@@ -58,16 +58,13 @@ class OpenpiPolicy(MessageSocket):
             DataError: the observation cannot be sent, or the reply has no finite numbers as actions.
         """
         reply = self.request(observation, deadline_s=deadline_s)
-        actions = reply.get("actions")
-        numbers = isinstance(actions, np.ndarray) and actions.dtype.kind in "fiu"
-        if not numbers or actions.ndim != 2 or not actions.size:
-            got = f"{actions.dtype} {actions.shape}" if isinstance(actions, np.ndarray) else type(actions).__name__
+        actions: Any = reply.get("actions")
+        array = isinstance(actions, np.ndarray)
+        if not array or actions.dtype.kind not in "fiu" or actions.ndim != 2 or not actions.size:
             raise DataError(
-                "The policy's actions are no chunk",
-                where=self.url,
-                expected="numbers (horizon >= 1, size >= 1)",
-                got=got,
-            )
+                "The policy's actions are no chunk", where=self.url, expected="numbers (horizon >= 1, size >= 1)",
+                got=f"{actions.dtype} {actions.shape}" if array else type(actions).__name__,
+            )  # fmt: skip
         actions = actions.astype(np.float64)
         if not np.isfinite(actions).all():
             step, column = np.argwhere(~np.isfinite(actions))[0]

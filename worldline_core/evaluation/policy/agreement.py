@@ -72,8 +72,8 @@ def policy_agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed:
             are averaged.
 
     Returns:
-        {method: {task: {"policies": {name: {"recorded", "predicted", "attempts"}}, statistic: {"value", "over_starts": [low, high],
-        "over_starts_and_policies": [low, high], "undefined": share of resamples}}}}; tasks are "all" and each.
+        {method: {task: {"policies": {name: {"recorded", "predicted", "attempts"}}, statistic: {"value",
+        "over_starts_and_policies": [low, high]}}}}; tasks are "all" and each.
 
     Raises:
         DataError: fewer than three policies.
@@ -94,9 +94,8 @@ def _agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) 
     for row in rows:
         cells[row["policy"], row["start"]].append((row["outcome"] == "success", row["predicted"] == "success"))
     policies, starts = (sorted({key[side] for key in cells}) for side in (0, 1))
-    success = np.full(
-        (2, len(policies), len(starts)), np.nan
-    )  # recorded and predicted; NaN where a policy did not try a start
+    # Recorded and predicted; NaN where a policy did not try a start.
+    success = np.full((2, len(policies), len(starts)), np.nan)
     for (policy, start), ends in cells.items():
         success[:, policies.index(policy), starts.index(start)] = np.mean(ends, axis=0)
     tried = np.isfinite(success[0])
@@ -106,7 +105,7 @@ def _agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) 
     over_starts = _resampled_rates(success, tried, resamples, random)
     drawn = random.integers(0, len(policies), (resamples, len(policies)))
     over_both = np.stack([np.take_along_axis(side, drawn, axis=1) for side in over_starts])
-    intervals = _statistics(*over_starts), _statistics(*over_both)
+    intervals = _statistics(*over_both)
     facts = {
         name: {"recorded": float(r), "predicted": float(s), "attempts": int(n)}
         for name, r, s, n in zip(policies, *rates, tried.sum(-1), strict=True)
@@ -114,9 +113,7 @@ def _agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) 
     return {"policies": facts} | {
         name: {
             "value": float(values[name]) if np.isfinite(values[name]) else None,
-            "over_starts": _bounds(intervals[0][name]),
-            "over_starts_and_policies": _bounds(intervals[1][name]),
-            "undefined": float(np.isnan(intervals[1][name]).mean()),
+            "over_starts_and_policies": _bounds(intervals[name]),
         }
         for name in STATISTICS
     }

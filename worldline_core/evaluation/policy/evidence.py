@@ -126,14 +126,9 @@ def establishes_success(evidence: Evidence) -> bool:
     return evidence.required_final_state_visible is True
 
 
-def reconciliation_establishes_success(reconciliation: Reconciliation, evidence: Evidence) -> bool:
-    """P4 may turn an unsuccessful state change, but not against a wrong object or a drop that was seen."""
-    return reconciliation.observations_prove_completion is True and evidence.wrong_object_or_drop is not True
-
-
-def motion_establishes_success(motion: MotionEvidence, evidence: Evidence) -> bool:
-    """P5 may turn an unsuccessful lift or state change, but not against a wrong object or a drop that was seen."""
-    return motion.task_effect_completed is True and evidence.wrong_object_or_drop is not True
+def overturns(done: Fact, evidence: Evidence) -> bool:
+    """P4 or P5 turns an unsuccessful verdict, but not against a wrong object or a drop that was seen."""
+    return done is True and evidence.wrong_object_or_drop is not True
 
 
 def failure_kind(family: EvidenceFamily, stated: Mapping[str, Any]) -> str:

@@ -21,8 +21,7 @@ from worldline_core.evaluation.policy.evidence import (
     MotionEvidence,
     Reconciliation,
     establishes_success,
-    motion_establishes_success,
-    reconciliation_establishes_success,
+    overturns,
     route,
 )
 from worldline_core.evaluation.recordings import Trajectory
@@ -148,12 +147,12 @@ def judge_trajectory(judge: Judge, trajectory: Trajectory) -> Judgement:
 
     if family == "state_change":
         answer = judge.reconcile(trajectory, selected.observations, first.observations, verification)
-        if reconciliation_establishes_success(take("reconciliation", answer), selected):
+        if overturns(take("reconciliation", answer).observations_prove_completion, selected):
             return done(True)
 
     if family in ("lift", "state_change"):
         answer = judge.inspect_motion(trajectory, motion_indices(count), selected.observations)
-        return done(motion_establishes_success(take("motion", answer), selected))
+        return done(overturns(take("motion", answer).task_effect_completed, selected))
     return done(False)
 
 

@@ -1,14 +1,11 @@
-"""Trust in verdicts on predicted videos: how likely each one is right, and how new its recording is to the model.
+"""Trust in the verdicts of a finished evaluation: how likely each one is right, and how new its recording is to the model.
 
-`assess_trust` works on the tables of a finished evaluation. Signals of a verdict are the judge's doubt (averaged over the seeds of an
-episode), the disagreement of verdicts on another model's predictions, and the novelty of the controls and of the setup (body and head
-camera). A logistic model whose weights are never positive turns them into a probability. Starts are halved and each half is calibrated
-with the other one.
+Signals are the judge's doubt (averaged over the seeds of an episode), the disagreement of verdicts on another model's predictions, and the
+novelty of controls and setup (body and head camera). A logistic model whose weights are never positive turns them into a probability:
+starts are halved, and each half is calibrated with the other one. Novelty is the distance to the nearest training recording, of the
+farthest window, in units of what a share ``1 - level`` of these stay within among themselves (Laxhammar and Falkman 2010).
 
-Novelty is the distance to the nearest training recording, of the farthest window, in units of what a share ``1 - level`` of the
-training recordings stay within among themselves (conformal anomaly detection, Laxhammar and Falkman 2010).
-
-Axis legend: n verdicts, s signals, r recordings, w windows, f features, a arms.
+Axis legend: n verdicts, s signals, r recordings, w windows, f features.
 """
 
 from __future__ import annotations
@@ -55,10 +52,7 @@ class KnownRecordings:
 
     @classmethod
     def of(cls, recordings: Iterable[tuple[str, Float[np.ndarray, "w f"]]], level: float = 0.05) -> KnownRecordings:
-        """Collect recordings, each a kind and its vectors; a share ``level`` of them has a novelty above 1.
-
-        Raises: DataError when no kind has five recordings.
-        """
+        """Collect recordings, each a kind and its vectors; a share ``level`` of them has a novelty above 1."""
         by_kind: dict[str, list[np.ndarray]] = defaultdict(list)
         for kind, vectors in recordings:
             by_kind[kind].append(vectors)
@@ -72,9 +66,8 @@ class KnownRecordings:
                     row[: len(vectors)] = vectors[:windows]
         if not kinds:
             raise DataError(
-                "Too few training recordings to measure novelty", got={k: len(v) for k, v in by_kind.items()},
-                expected=f"{LEAST_RECORDINGS} with as many arms, and {LEAST_RECORDINGS} of one embodiment with a head camera",
-                next_step="add recordings of the training splits to the episodes, or leave evaluate_policy.trust out",
+                "Too few training recordings to measure novelty", expected=f"{LEAST_RECORDINGS} of a kind",
+                got={k: len(v) for k, v in by_kind.items()}, next_step="add recordings of the training splits to the episodes",
             )  # fmt: skip
         return cls(kinds, level)
 
@@ -84,18 +77,16 @@ class KnownRecordings:
         found = {}
         for kind, known in self.kinds.items():
             own = np.stack([_nearest(window, window, others=True) for window in known.swapaxes(0, 1)])
-            there = np.isfinite(own)
             scale = np.array([max(float(np.median(row[row < np.inf])), 1e-6) for row in own])
-            farthest = np.where(there, own / scale[:, None], 0.0).max(axis=0)
+            farthest = np.where(np.isfinite(own), own / scale[:, None], 0.0).max(axis=0)
             found[kind] = scale, max(float(np.quantile(farthest, 1.0 - self.level)), 1e-6)
         return found
 
     def novelty(self, kind: str, vectors: Float[np.ndarray, "w f"]) -> float:
-        """Novelty of a recording; infinite for a kind that training does not have."""
+        """Infinite for a kind that training does not have."""
         if kind not in self.kinds:
             return float("inf")
-        scale, limit = self._scales[kind]
-        known = self.kinds[kind]
+        known, (scale, limit) = self.kinds[kind], self._scales[kind]
         return max(_nearest(v[None], known[:, w])[0] / scale[w] for w, v in enumerate(vectors[: len(scale)])) / limit
 
 
@@ -117,7 +108,7 @@ def control_vectors(tracks: EpisodeTracks) -> tuple[str, Float[np.ndarray, "w f"
     opening = np.asarray(tracks.gripper[:, 0], dtype=np.float64)[::TEMPORAL_FACTOR] / OPENING
     if len(place) < 2:
         raise DataError(
-            "Too few frames to compare their controls", expected=f"more than {TEMPORAL_FACTOR}", got=tracks.num_frames
+            "Too few frames to compare controls", expected=f"more than {TEMPORAL_FACTOR}", got=tracks.num_frames
         )
     away, way = (place - place[:1]) / PLACE_M, np.diff(place, axis=0, prepend=place[:1]) / SPEED_M
     rows = np.concatenate([away.reshape(len(place), -1), opening, way.reshape(len(place), -1)], axis=1)
@@ -137,9 +128,7 @@ def assess_trust(
     folder: Path, config: TrustConfig, episodes: EpisodeSet, tracks: ActionTracks, *, resamples: int, seed: int
 ) -> None:
     """Add TRUST_COLUMNS to the decisions of a finished evaluation (None on recorded videos), and ``trust`` to its summary.
-
-    Args:
-        episodes, tracks: of the judged recordings and of the training recordings that novelty is measured against.
+    Novelty is measured against the training splits of ``episodes``.
     """
     training = [
         tracks.tracks(row.episode_id)
@@ -150,18 +139,14 @@ def assess_trust(
     setups = KnownRecordings.of(map(setup_vectors, filter(_has_head_camera, training)), config.novelty_level)
     rows = read_rows(folder / DECISIONS_FILE)
     predicted = [row for row in rows if row["method"] != TRUE_METHOD]
-    news: dict[str, dict[str, float | None]] = {}
-    for name in {row["episode_id"] for row in predicted}:
-        found = tracks.tracks(name) if name in tracks else None
-        news[name] = {
-            "new_controls": None if found is None else controls.novelty(*control_vectors(found)),
-            "new_setup": None
-            if found is None or not _has_head_camera(found)
-            else setups.novelty(*setup_vectors(found)),
-        }
-    trusted, methods = trust_verdicts(
-        [{**row, **news[row["episode_id"]]} for row in predicted], config, resamples=resamples, seed=seed
-    )
+    news: dict[str, dict[str, float | None]] = defaultdict(lambda: {"new_controls": None, "new_setup": None})
+    for name in {row["episode_id"] for row in predicted if row["episode_id"] in tracks}:
+        found = tracks.tracks(name)
+        news[name]["new_controls"] = controls.novelty(*control_vectors(found))
+        if _has_head_camera(found):
+            news[name]["new_setup"] = setups.novelty(*setup_vectors(found))
+    rows_with_news = [{**row, **news[row["episode_id"]]} for row in predicted]
+    trusted, methods = trust_verdicts(rows_with_news, config, resamples=resamples, seed=seed)
     trusted += [{**dict.fromkeys(TRUST_COLUMNS), **row} for row in rows if row["method"] == TRUE_METHOD]
     trusted.sort(key=lambda row: (row["method"], row["episode_id"], row["seed"]))
     write_table(folder / DECISIONS_FILE, trusted, tuple(trusted[0]))
@@ -179,12 +164,9 @@ def trust_verdicts(
     """Verdicts with their signals, trust and marks, and by method how reliable trust is, or the ``reason`` why there is none.
 
     Args:
-        rows: verdicts on predicted videos with method, episode_id, start, outcome, predicted, confidence (None where the judge stated
-            none) and novelties.
+        rows: verdicts on predicted videos with their novelties, and confidence None where the judge stated none.
 
-    Raises:
-        ConfigError: ``compare_with`` names a method without verdicts.
-        DataError: a signal is NaN.
+    Raises: ConfigError: ``compare_with`` names a method without verdicts.
     """
     by_method: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in sorted(rows, key=lambda row: row["method"]):
@@ -222,7 +204,7 @@ def _add_doubt(name: str, rows: Sequence[dict[str, Any]], others: Sequence[Mappi
 
 
 def _signals(rows: Sequence[Mapping[str, Any]]) -> tuple[Float[np.ndarray, "n s"], list[str]]:
-    """Signals on scales on which the log odds may be linear, and the names of those that all rows have."""
+    """Signals on scales of the log odds, and the names of those that all rows have."""
     known = [name for name in SIGNALS if all(row[name] is not None for row in rows)]
     columns = np.array([[row[name] for name in known] for row in rows], dtype=np.float64)
     if np.isnan(columns).any():
@@ -237,12 +219,8 @@ def _signals(rows: Sequence[Mapping[str, Any]]) -> tuple[Float[np.ndarray, "n s"
     return columns, known
 
 
-def _right(rows: Sequence[Mapping[str, Any]]) -> Bool[np.ndarray, " n"]:
-    return np.array([row["predicted"] == row["outcome"] for row in rows])
-
-
 def halves(starts: Sequence[str], seed: int) -> np.ndarray:
-    """0 or 1 for each verdict: the half that its start was drawn into."""
+    """0 or 1 for each verdict, the half of its start."""
     names, index = np.unique(starts, return_inverse=True)
     half = np.empty(len(names), dtype=int)
     half[np.random.default_rng(seed).permutation(len(names))] = np.arange(len(names)) % 2
@@ -253,17 +231,13 @@ def _cross_calibrated(rows: Sequence[Mapping[str, Any]], seed: int) -> Float[np.
     """Probability of each verdict to be right by the calibration of the other half, or the reason why there is none."""
     signals, known = _signals(rows)
     if not known:
-        return (
-            "no signal is known: the judge states no confidence, and there are no training recordings to compare with"
-        )
-    right, half = _right(rows), halves([row["start"] for row in rows], seed)
+        return "no signal is known: the judge states no confidence, and no training recording is to compare with"
+    right = np.array([row["predicted"] == row["outcome"] for row in rows])
+    half = halves([row["start"] for row in rows], seed)
     counts = [(int(right[half == h].sum()), int((~right[half == h]).sum())) for h in (0, 1)]
     fewest = min(counts, key=min)
     if min(fewest) < LEAST_OF_EACH:
-        return (
-            f"of the {len({row['start'] for row in rows})} starts, one half has {fewest[0]} right and {fewest[1]} wrong"
-            f" verdicts; {LEAST_OF_EACH} of each are needed to calibrate with"
-        )
+        return f"one half of the starts has {fewest[0]} right and {fewest[1]} wrong verdicts; {LEAST_OF_EACH} of each are needed"
     trust = np.zeros(len(rows))
     for h in (0, 1):
         trust[half == h] = probability(fit_right(signals[half != h], right[half != h]), signals[half == h])
@@ -283,13 +257,14 @@ def fit_right(signals: Float[np.ndarray, "n s"], right: Bool[np.ndarray, " n"]) 
 
 
 def probability(weights: np.ndarray, signals: Float[np.ndarray, "n s"]) -> Float[np.ndarray, " n"]:
-    """The probability that a verdict with these signals is right."""
+    """Probability of a right verdict."""
     return 1.0 / (1.0 + np.exp(-np.clip(weights[0] + signals @ weights[1:], -60, 60)))
 
 
 def _reliability(rows: Sequence[Mapping[str, Any]], resamples: int, seed: int) -> dict[str, Any]:
     """Calibration of trust and its detection of errors, with 95 % bootstrap intervals over starts."""
-    right, marked = _right(rows), np.array([bool(row["do_not_trust"]) for row in rows])
+    right = np.array([row["predicted"] == row["outcome"] for row in rows])
+    marked = np.array([bool(row["do_not_trust"]) for row in rows])
     trust = np.array([row["trust"] for row in rows])
     starts, start = np.unique([row["start"] for row in rows], return_inverse=True)
     chance = np.full(len(starts), 1.0 / len(starts))
@@ -298,7 +273,6 @@ def _reliability(rows: Sequence[Mapping[str, Any]], resamples: int, seed: int) -
     drawn = [np.repeat(everything, count[start]) for count in counts]
 
     def interval(statistic: Callable[[np.ndarray], float]) -> dict[str, float | None]:
-        """Value and interval of a statistic of the numbers of verdicts; None where it is not defined."""
         value, *others = (float(statistic(numbers)) for numbers in (everything, *drawn))
         defined = [other for other in others if np.isfinite(other)]
         low, high = np.quantile(defined, [0.025, 0.975]).tolist() if defined else (None, None)

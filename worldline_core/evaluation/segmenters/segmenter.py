@@ -73,10 +73,9 @@ def open_segmenter(name: SegmenterName, *, learned: Path | None, sam3: Path | No
 
     if learned is None:
         raise ArtifactError(
-            "The learned segmenter has no weights",
-            expected="an input named segmenter",
+            "The learned segmenter has no weights", expected="an input named segmenter",
             next_step="give artifacts/shipped/models/segmenter, run train_segmenter, or choose segmenters: [colour]",
-        )
+        )  # fmt: skip
     return LearnedSegmenter.load(learned)
 
 
@@ -93,13 +92,7 @@ class Sam3Segmenter:
     follows = True
     description = "SAM 3 video tracker, started from the projected tool centres of the first frame"
 
-    def __init__(
-        self,
-        model: Any,
-        processor: Any,
-        *,
-        device: torch.device | str = "cpu",
-    ) -> None:
+    def __init__(self, model: Any, processor: Any, *, device: torch.device | str = "cpu") -> None:
         self.device = torch.device(device)
         self.dtype = torch.bfloat16 if self.device.type == "cuda" else torch.float32
         self.model = model.to(self.device, self.dtype).eval()
@@ -113,11 +106,9 @@ class Sam3Segmenter:
         """
         if not (folder / "config.json").is_file():
             raise UnavailableError(
-                "SAM 3 weights not found",
-                where=folder,
-                expected="a downloaded facebook/sam3 folder with config.json",
+                "SAM 3 weights not found", where=folder, expected="a downloaded facebook/sam3 folder with config.json",
                 next_step="accept the licence and download facebook/sam3, or choose another segmenter",
-            )
+            )  # fmt: skip
         from transformers.models.sam3_tracker_video import Sam3TrackerVideoModel, Sam3TrackerVideoProcessor
 
         try:
@@ -128,14 +119,11 @@ class Sam3Segmenter:
         return cls(model, processor, device=device or ("cuda" if torch.cuda.is_available() else "cpu"))
 
     def segment(self, video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
-        """Bool masks (n, h, w) of uint8 frames (n, h, w, 3).
-
-        Without a valid point in the first frame there is nothing to track: all masks are empty.
-        """
+        """Empty masks where no point of the first frame is valid."""
         return self.stream()(video, points)
 
     def stream(self) -> Callable[[np.ndarray, np.ndarray | None], np.ndarray]:
-        """Masks of a video that comes piece by piece; of its frames only what the tracker looks back at is kept."""
+        """Keeps of the frames only what the tracker looks back at."""
         session: Any = None
         done = 0
 
@@ -167,20 +155,13 @@ class Sam3Segmenter:
         if len(start) == 0:
             return None
         session = self.processor.init_video_session(
-            video=list(video),
-            inference_device=self.device,
-            inference_state_device="cpu",
-            processing_device="cpu",
-            video_storage_device="cpu",
-            dtype=self.dtype,
-        )
+            video=list(video), inference_device=self.device, inference_state_device="cpu", processing_device="cpu",
+            video_storage_device="cpu", dtype=self.dtype,
+        )  # fmt: skip
         self.processor.add_inputs_to_inference_session(
-            inference_session=session,
-            frame_idx=0,
-            obj_ids=list(range(1, len(start) + 1)),
-            input_points=[[[[float(u), float(v)]] for u, v in start]],
-            input_labels=[[[1] for _ in start]],
-        )
+            inference_session=session, frame_idx=0, obj_ids=list(range(1, len(start) + 1)),
+            input_points=[[[[float(u), float(v)]] for u, v in start]], input_labels=[[[1] for _ in start]],
+        )  # fmt: skip
         return session
 
     def _tracked(self, session: Any, frame: int, size: Sequence[int]) -> np.ndarray:
@@ -215,14 +196,11 @@ class ColourSegmenter:
         self.iterations = iterations
 
     def segment(self, video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
-        """Bool masks (n, h, w) of uint8 frames (n, h, w, 3).
-
-        Without a valid point in the first frame nothing can be started: all masks are empty.
-        """
+        """Empty masks where no point of the first frame is valid."""
         return self.stream()(video, points)
 
     def stream(self) -> Callable[[np.ndarray, np.ndarray | None], np.ndarray]:
-        """Masks of a video that comes piece by piece; the points of its first frame alone are used."""
+        """Uses the points of the first frame alone."""
         following: _Following | None = None
 
         def masks_of(video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
