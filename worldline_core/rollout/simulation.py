@@ -286,7 +286,7 @@ class Simulation:
     @property
     def tracks(self) -> list[EpisodeTracks]:
         """Controls of each clip as drawn into the maps of the last step's frames: for overlays."""
-        return [tracks.clip(range(2, tracks.num_frames), start=0) for tracks in self._tracks]
+        return [tracks.clip(range(2, tracks.num_frames)) for tracks in self._tracks]
 
     @property
     def tool_poses(self) -> np.ndarray:

@@ -81,7 +81,7 @@ class Teleoperation:
             self._start.cameras, image_size(self._start.images, self._start.cameras), self._kinematics,
             controls=np.concatenate((self._start.state[None], rows)), fps=self._fps,
         )  # fmt: skip
-        return tracks.clip(range(1, tracks.num_frames), start=0)
+        return tracks.clip(range(1, tracks.num_frames))
 
     def take_over(self, command: np.ndarray) -> None:
         """Go on from another command: after a policy, or at another moment."""
