@@ -93,7 +93,7 @@ def train(c: PipelineConfig, data: Inputs, models: Inputs) -> Inputs:
 def predict(c: PipelineConfig, data: Inputs, banks: Inputs, models: Inputs, trained: Inputs) -> Inputs:
     """Videos of every rollout whose checkpoint exists: this run's own, a shipped one, or none (baselines, imports)."""
     checkpoints, predicted = c.checkpoints(trained), {}
-    for name, run in c.rollouts.items():
+    for name, run in c.rollouts_in_order():
         episodes, tracks = ((banks if run.episodes == "banks" else data)[key] for key in ("episodes", "tracks"))
         if run.imported is not None:
             videos = c.videos_folder(run)

@@ -123,6 +123,10 @@ class PipelineConfig(StrictModel):
             return {"tokenizer": made["tokenizer"]}
         return {"latents": made["encode_latents"]}
 
+    def rollouts_in_order(self) -> list[tuple[str, RolloutRun]]:
+        """Names and settings of the rollouts, first those that wait for no training: Prefect starts tasks in this order."""
+        return sorted(self.rollouts.items(), key=lambda item: item[1].checkpoint in ("stage1", "stage2", "causal"))
+
     def rollouts_of[T](self, predicted: Mapping[str, T], *, banks: bool) -> dict[str, T]:
         """Those of the predicted rollouts that are of recordings, or of candidate banks."""
         return {name: made for name, made in predicted.items() if (self.rollouts[name].episodes == "banks") == banks}
