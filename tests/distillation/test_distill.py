@@ -335,9 +335,9 @@ def test_trajectories_are_read_as_written_and_refused_when_other(tmp_path: Path)
     store = TrajectoryStore.open(tmp_path)
     assert len(store) == 4
     assert store.clips([3, 0]) == (Clip("b", 1, 17, 1), Clip("a", 0, 17, 1))
-    torch.testing.assert_close(store.nodes([3, 0]), torch.stack((nodes[1] + 1, nodes[0])), rtol=2e-3, atol=2e-3)
-    assert store.masks([1]).dtype == torch.float32
+    torch.testing.assert_close(store.read("nodes", [3, 0]), torch.stack((nodes[1] + 1, nodes[0])), rtol=2e-3, atol=2e-3)
+    assert store.read("mask", [1]).dtype == torch.float32
     with pytest.raises(ArtifactError, match=r"(?s)lacks a tensor.*shard-00000.*latents"):
-        store.latents([1])
+        store.read("latents", [1])
     with pytest.raises(ArtifactError, match="other settings"):
         write_trajectories(tmp_path, 2, make, {"seed": 2})

@@ -228,7 +228,7 @@ def test_tensors_of_a_shard_that_do_not_fit_its_clips_are_refused(
 def test_trajectories_that_are_no_numbers_are_refused(trajectories: Path) -> None:
     write_shard(trajectories / "shard-00000.safetensors", nodes=torch.full((1, 2, 1, 1, 1, 2, 2), float("nan")).half())
     with pytest.raises(ArtifactError, match="not finite"):
-        TrajectoryStore.open(trajectories).nodes([0])
+        TrajectoryStore.open(trajectories).read("nodes", [0])
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,8 +47,8 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_sampler import ClipRow, ClipSampler
-from worldline_core.training.clip_source import ClipSource, open_source, training_rows
+from worldline_core.training.clip_sampler import ClipSampler
+from worldline_core.training.clip_source import open_source, training_rows
 from worldline_core.training.processes import (
     ALONE,
     BatchPlan,
@@ -62,8 +61,6 @@ from worldline_core.training.processes import (
 from worldline_core.training.stage import input_facts, validation_function, weights_of
 from worldline_core.training.trainer import ParameterGroup, batch_plan, train
 from worldline_core.training.training_config import TrainerConfig
-
-__all__ = ["DistillConfig", "distill"]
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +80,7 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
         TrainingError: a loss or gradient is not finite.
     """
     torch.manual_seed(config.teacher_forcing.trainer.seed)
-    run = DistillationRun.open(config, inputs, output)
+    run = DistillationRun(config, inputs, output)
     metrics = {**run.teacher_forcing(), **run.trajectory_regression(), **run.distribution_matching()}
     kept = sum(row.split in config.splits for row in run.rows)
     return {
@@ -97,69 +94,41 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
     }
 
 
-@dataclass(frozen=True)
 class DistillationRun:
-    """Clips, teacher, training and saving, shared by the three steps."""
+    """Clips, teacher, training and saving, shared by the three steps.
 
-    config: DistillConfig
-    stage2: Path
-    stage2_info: CheckpointInfo
-    episodes: EpisodeSet
-    store: ClipSource
-    loader: ClipLoader
-    rows: list[ClipRow]
-    output: Path
-    perceptual: PerceptualDistance | None
+    Raises:
+        CheckpointError: the checkpoint's action maps and latents are not those given here.
+    """
 
-    @classmethod
-    def open(cls, config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> DistillationRun:
-        """Open every input and check that they belong together.
-
-        Raises:
-            CheckpointError: the checkpoint's action maps and latents are not those given here.
-        """
-        output.mkdir(parents=True, exist_ok=True)
+    def __init__(self, config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> None:
         device = config.teacher_forcing.trainer.device
         join_processes(device)
-        info = read_checkpoint_info(Path(inputs["stage2"]))
-        native = info.config.native_size
-        episodes = EpisodeSet.open(Path(inputs["episodes"]))
-        store = open_source(config.input, inputs, episodes, device)
-        tracks = ActionTracks.open(Path(inputs["tracks"]), None if native is None else episodes)
-        contract = info.contract
+        self.config, self.output, self.stage2 = config, output, Path(inputs["stage2"])
+        self.info = info = read_checkpoint_info(self.stage2)
         if not set(config.views) <= set(info.views):
             raise CheckpointError(
                 "A causal model is distilled in views that its Stage II model was trained on",
-                where=f"{inputs['stage2']}: distill.views",
+                where=f"{self.stage2}: distill.views",
                 expected=info.views,
                 got=config.views,
             )
-        found = {"tokenizer": store.description["tokenizer"], "grid_size": store.latent_shape[1:]}
-        contract.require(where=store.root, **found)
+        native = info.config.native_size
+        self.episodes = episodes = EpisodeSet.open(Path(inputs["episodes"]))
+        tracks = ActionTracks.open(Path(inputs["tracks"]), None if native is None else episodes)
+        self.source = open_source(config.input, inputs, episodes, device)
+        found = {"tokenizer": self.source.description["tokenizer"], "grid_size": self.source.latent_shape[1:]}
+        info.contract.require(where=self.source.root, **found)
         needed = config.clips.needed_views(config.views)
-        rows = training_rows(store, episodes, stage=2, needed=needed, tracks=tracks)
-        contract.require_tracks((row.episode_id for row in rows), tracks)
-        loader = ClipLoader(
-            store, views=tuple(config.views), tracks=tracks,
+        self.rows = training_rows(self.source, episodes, stage=2, needed=needed, tracks=tracks)
+        info.contract.require_tracks((row.episode_id for row in self.rows), tracks)
+        self.loader = ClipLoader(
+            self.source, views=tuple(config.views), tracks=tracks,
             action_frames=info.config.action_frames, frame_rates={row.episode_id: row.fps for row in episodes.rows},
             native_size=native, device=device,
         )  # fmt: skip
-        return cls(
-            config=config,
-            stage2=Path(inputs["stage2"]),
-            stage2_info=info,
-            episodes=episodes,
-            store=store,
-            loader=loader,
-            rows=rows,
-            output=output,
-            perceptual=_perceptual(config, Path(inputs["tokenizer"]), device),
-        )
-
-    @property
-    def lpips(self) -> str:
-        """State of the perceptual term, in words."""
-        return "on" if self.perceptual is not None else LPIPS_OFF
+        self.perceptual = _perceptual(config, Path(inputs["tokenizer"]), device)
+        self.lpips = "on" if self.perceptual is not None else LPIPS_OFF
 
     def folder(self, step: str) -> Path:
         """Folder of a step's checkpoint; the last step's is the result itself."""
@@ -167,24 +136,23 @@ class DistillationRun:
 
     def teacher_forcing(self) -> dict[str, float]:
         """Step 1, from the Stage II model."""
-        settings = self.config.teacher_forcing
+        settings, work = self.config.teacher_forcing, self._work(STEPS[0])
         model, info = self._model(self.stage2, settings.trainer, expect_kind="stage2")
         views = {"view_weights": settings.view_weights, "single_view_factor": settings.single_view_factor}
-        clips = ClipSampling.model_validate(self.config.clips.model_dump() | views)
-        plan = batch_plan(settings.trainer, self._work(STEPS[0]))
-        sampler = self._sampler(settings.trainer.batch_size, settings.trainer.seed, clips, plan)
+        plan = batch_plan(settings.trainer, work)
+        sampler = self._sampler(settings.trainer, self.config.clips.model_copy(update=views), plan)
         teacher = self._model(self.stage2, settings.trainer)[0] if settings.teacher_share else None
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
         stop = settings.trainer.steps and settings.trainer.steps * plan.accumulation
         loader = copy(self.loader)
-        loader.object_weights = weights_of(settings.weighting, self.episodes, self.store)
-        load = loader.batches(sampler, self.config.input, self._work(STEPS[0]), stop)
+        loader.object_weights = weights_of(settings.weighting, self.episodes, self.source)
+        load = loader.batches(sampler, self.config.input, work, stop)
         return self._train(STEPS[0], settings.trainer, objective, load, info)
 
     def trajectory_regression(self) -> dict[str, float]:
         """Step 2, from step 1's model, on trajectories that this model makes."""
         settings = self.config.trajectory_regression
-        self._make_trajectories(read_checkpoint_info(self.folder(STEPS[0])))
+        self._make_trajectories()
         student, info = self._model(self.folder(STEPS[0]), settings.trainer, expect_kind="causal")
         objective = TrajectoryObjective(student.train(), self.config, self.perceptual)
         return self._train(STEPS[1], settings.trainer, objective, self._load_trajectories(STEPS[1]), info)
@@ -195,7 +163,8 @@ class DistillationRun:
         student, info = self._model(self.folder(STEPS[1]), settings.trainer, expect_kind="causal")
         real, fake = (self._model(self.stage2, settings.trainer)[0] for _ in range(2))
         objective = DistributionMatchingObjective(student.train(), real, fake.train(), self.config, self.perceptual)
-        other = ParameterGroup("fake", _named_parameters(fake, "fake."), settings.fake_score_rate, averaged=False)
+        parameters = {f"fake.{name}": parameter for name, parameter in fake.named_parameters()}
+        other = ParameterGroup("fake", parameters, settings.fake_score_rate, averaged=False)
         return self._train(
             STEPS[2], settings.trainer, objective, self._load_trajectories(STEPS[2]), info, (other, fake)
         )
@@ -208,39 +177,37 @@ class DistillationRun:
         model, info = load_checkpoint(folder, expect_kind=expect_kind, towers="generation", weights=first)
         return place_model(model, trainer.sharding, precision=trainer.precision, device=trainer.device), info
 
-    def _sampler(self, batch_size: int, seed: int, clips: ClipSampling, plan: BatchPlan) -> ClipSampler:
+    def _sampler(self, trainer: TrainerConfig, clips: ClipSampling, plan: BatchPlan) -> ClipSampler:
         """Clips of the training splits."""
         return ClipSampler(
-            self.rows, clips, views=self.config.views, splits=self.config.splits, start_step=self.store.start_step,
-            batch_size=batch_size, seed=seed, plan=plan,
+            self.rows, clips, views=self.config.views, splits=self.config.splits, start_step=self.source.start_step,
+            batch_size=trainer.batch_size, seed=trainer.seed, plan=plan,
         )  # fmt: skip
 
     def _work(self, step: str) -> Path:
         """Folder of a step's training state and log until it is finished, or of the offline trajectories."""
         return self.output / "run" / step
 
-    def _make_trajectories(self, teacher_info: CheckpointInfo) -> None:
+    def _make_trajectories(self) -> None:
         """The offline trajectories of the causal teacher; shards that exist are kept."""
-        settings = self.config.trajectory_regression.trajectories
-        trainer = self.config.trajectory_regression.trainer
-        folder = self._work(TRAJECTORIES)
+        config, folder = self.config, self._work(TRAJECTORIES)
+        settings, trainer = config.trajectory_regression.trajectories, config.trajectory_regression.trainer
         if not (folder / INDEX).is_file():
-            teacher, _ = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
+            teacher, info = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
             teacher.to(trainer.device).eval().requires_grad_(False)
             per_shard = min(settings.clips, settings.clips_per_shard)
-            sampler = self._sampler(per_shard, settings.seed, self.config.clips, ALONE)
+            drawn = trainer.model_copy(update={"batch_size": per_shard, "seed": settings.seed})
             # Processes take shards in turn, so none is read ahead.
-            reading = self.config.input.model_copy(update={"workers": 0})
+            reading = config.input.model_copy(update={"workers": 0})
             facts = {
-                "teacher": teacher_info.weights_sha256,
-                "causal": self.config.spec.model_dump(mode="json"),
+                "teacher": info.weights_sha256,
+                "causal": config.spec.model_dump(mode="json"),
                 "precision": trainer.precision,
-                "clips": self.config.clips.model_dump(mode="json"),
                 **settings.model_dump(mode="json"),
-                **self.config.model_dump(mode="json", include={"input"}),
+                **config.model_dump(mode="json", include={"input", "clips"}),
             }
-            load = self.loader.batches(sampler, reading, folder)
-            make = partial(trajectory_shard, config=self.config, teacher=teacher, loader=self.loader, load=load)
+            load = self.loader.batches(self._sampler(drawn, config.clips, ALONE), reading, folder)
+            make = partial(trajectory_shard, config=config, teacher=teacher, loader=self.loader, load=load)
             write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
         if processes()[0] == 0:
             write_bytes_atomic(self.output / STEPS[1] / INDEX, (folder / INDEX).read_bytes())
@@ -248,15 +215,10 @@ class DistillationRun:
 
     def _load_trajectories(self, step: str) -> Callable[[int], TrajectoryBatch]:
         trainer: TrainerConfig = getattr(self.config, step).trainer
-        loader = TrajectoryLoader(
-            TrajectoryStore.open(self._work(TRAJECTORIES)),
-            self.loader,
-            batch_size=trainer.batch_size,
-            seed=trainer.seed,
-            plan=batch_plan(trainer, self._work(step)),
-            kept_latents=isinstance(self.config.input, FrameInput),
-        )
-        return loader.load
+        store = TrajectoryStore.open(self._work(TRAJECTORIES))
+        kept_latents = isinstance(self.config.input, FrameInput)
+        plan = batch_plan(trainer, self._work(step))
+        return TrajectoryLoader(store, self.loader, trainer, plan, kept_latents=kept_latents).load
 
     def _train[BatchT: Batch](
         self,
@@ -274,7 +236,7 @@ class DistillationRun:
         config, work, model = self.config, self._work(step), objective.model
         result = train(
             trainer,
-            groups=(ParameterGroup("student", _named_parameters(model)), *(group for group, _ in others)),
+            groups=(ParameterGroup("student", dict(model.named_parameters())), *(group for group, _ in others)),
             objective=objective,
             load=load,
             validate=validation_function(
@@ -285,7 +247,7 @@ class DistillationRun:
                 "step": step,
                 "config": config.model_dump(mode="json"),
                 "parent": parent.weights_sha256,
-                "stage2": self.stage2_info.weights_sha256,
+                "stage2": self.info.weights_sha256,
                 "episodes": [row.identity() for row in self.rows],
             },
             title=step.replace("_", " "),
@@ -299,18 +261,18 @@ class DistillationRun:
                 folder,
                 model,
                 kind="causal",
-                action_contract=self.stage2_info.contract,
+                action_contract=self.info.contract,
                 causal=config.spec,
-                trained=self._sampler(1, 0, config.clips, ALONE).trained(model.config.views),
+                trained=self._sampler(trainer, config.clips, ALONE).trained(model.config.views),
                 metadata={
                     "distillation": step,
                     "step": result.steps,
                     "seed": trainer.seed,
                     "start": {"kind": parent.kind, "weights_sha256": parent.weights_sha256},
-                    "tokenizer": self.store.description["tokenizer"],
+                    "tokenizer": self.source.description["tokenizer"],
                     "lpips": self.lpips,
                     "metrics": result.metrics,
-                    **input_facts(config.input, self.store, self._work(STEPS[0]), self._work(TRAJECTORIES)),
+                    **input_facts(config.input, self.source, self._work(STEPS[0]), self._work(TRAJECTORIES)),
                 },
                 state_dict=weights,
             )
@@ -332,7 +294,3 @@ def _perceptual(config: DistillConfig, tokenizer: Path, device: str) -> Perceptu
             got=f"true, with a {type(codec).__name__}",
         )  # fmt: skip
     return PerceptualLoss(codec, network, config.perceptual.latent_frames)
-
-
-def _named_parameters(model: WorldModel, prefix: str = "") -> dict[str, torch.nn.Parameter]:
-    return {prefix + name: parameter for name, parameter in model.named_parameters()}

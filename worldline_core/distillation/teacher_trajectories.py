@@ -48,6 +48,7 @@ from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch
 from worldline_core.training.processes import BatchPlan, processes, wait_for_all
 from worldline_core.training.trainer import autocast, step_generator
+from worldline_core.training.training_config import TrainerConfig
 
 
 def substep_sigmas(start: float, stop: float, substeps: int) -> list[float]:
@@ -232,19 +233,9 @@ class TrajectoryStore:
         """The clips of some trajectories."""
         return tuple(self._clips[index][2] for index in indices)
 
-    def nodes(self, indices: Sequence[int]) -> Float[Tensor, "b k v c u h w"]:
-        """The states of some trajectories, in single precision."""
-        return self._read("nodes", indices)
-
-    def masks(self, indices: Sequence[int]) -> Float[Tensor, "b v t h w"]:
-        """The robot masks of some trajectories."""
-        return self._read("mask", indices)
-
-    def latents(self, indices: Sequence[int]) -> Float[Tensor, "b v c t h w"]:
-        """The latents of some trajectories' clips, where they are kept, in single precision."""
-        return self._read("latents", indices)
-
-    def _read(self, name: str, indices: Sequence[int]) -> Tensor:
+    def read(self, name: str, indices: Sequence[int]) -> Tensor:
+        """``nodes`` (b k v c u h w), ``mask`` (b v t h w) or, where they are kept, ``latents`` (b v c t h w) of some
+        trajectories, in single precision."""
         rows = []
         for index in indices:
             number, row, _ = self._clips[index]
@@ -307,20 +298,9 @@ class TrajectoryLoader:
     """
 
     def __init__(
-        self,
-        store: TrajectoryStore,
-        loader: ClipLoader,
-        *,
-        batch_size: int,
-        seed: int,
-        plan: BatchPlan,
-        kept_latents: bool = False,
+        self, store: TrajectoryStore, loader: ClipLoader, trainer: TrainerConfig, plan: BatchPlan, *, kept_latents: bool
     ) -> None:
-        self.store = store
-        self.loader = loader
-        self.batch_size = batch_size
-        self.seed = seed
-        self.plan = plan
+        self.store, self.loader, self.trainer, self.plan = store, loader, trainer, plan
         self.kept_latents = kept_latents
         # A batch has one shape, so its clips have one length and the same views: a group of such clips is drawn by its size,
         # then clips within it.
@@ -333,16 +313,16 @@ class TrajectoryLoader:
     def load(self, index: int) -> TrajectoryBatch:
         """The batch of this process's micro-step `index`."""
         index, part = self.plan.drawn(index)
-        random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
+        size, device = self.trainer.batch_size, self.loader.device
+        random = np.random.Generator(np.random.Philox(key=[self.trainer.seed, index]))
         number = int(random.choice(len(self._groups), p=self._shares))
         group, (_, views) = self._groups[number], self._kinds[number]
-        draws = random.integers(len(group), size=self.batch_size * self.plan.together)
-        rows = [group[int(draw)] for draw in draws[part * self.batch_size : (part + 1) * self.batch_size]]
+        draws = random.integers(len(group), size=size * self.plan.together)
+        rows = [group[int(draw)] for draw in draws[part * size : (part + 1) * size]]
         clips = ClipBatch(self.store.clips(rows), views)
         if self.kept_latents:
-            batch = self.loader.conditioned(clips, self.store.latents(rows).to(self.loader.device))
+            batch = self.loader.conditioned(clips, self.store.read("latents", rows).to(device))
         else:
             batch = self.loader.load(clips)
-        nodes = self.store.nodes(rows).to(self.loader.device)
-        mask = self.store.masks(rows).to(self.loader.device)
+        nodes, mask = (self.store.read(name, rows).to(device) for name in ("nodes", "mask"))
         return TrajectoryBatch(**vars(batch), nodes=nodes, history=batch.latents, mask=mask)
