@@ -5,7 +5,6 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from worldline_core.errors import ConfigError
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import VIEWS
 from worldline_core.training.clip_loader import Batch
@@ -116,8 +115,3 @@ def test_sigmas_are_levels_and_shift_moves_them_up(kind: str) -> None:
     )
     assert plain.min() > 0 and plain.max() <= 1
     assert shifted.mean() > plain.mean() + 0.15
-
-
-def test_wrong_sigma_shape_is_named(clip: tuple[torch.Tensor, ...]) -> None:
-    with pytest.raises(ConfigError, match="Noise levels have an unexpected shape"):
-        add_noise(clip[0], clip[1], torch.ones(2, 3, 4))

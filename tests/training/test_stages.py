@@ -172,11 +172,11 @@ def test_native_control_vectors_take_the_place_of_maps(
     assert info.config.native_size == 3
     assert all(layer.weight.abs().max() > 0 for layer in model.action_encoder.proj)  # type: ignore[union-attr]
     assert result["validation/loss"] != result["validation/loss_shuffled_actions"]
-    train_stage2(stage2(2, native_size=3, start_from="stage2"), inputs | {"stage1": tmp_path / "film"}, tmp_path / "on")
+    train_stage2(stage2(2, native_size=3), inputs | {"stage1": tmp_path / "film"}, tmp_path / "on")
     with pytest.raises(DataError, match=r"(?s)driven by control vectors.*up to 1 numbers.*got: 2"):
         train_stage2(stage2(2, native_size=1), inputs, tmp_path / "small")
     with pytest.raises(CheckpointError, match=r"(?s)native_size.*expected: 3"):
-        train_stage2(stage2(2, start_from="stage2"), inputs | {"stage1": tmp_path / "film"}, tmp_path / "maps")
+        train_stage2(stage2(2), inputs | {"stage1": tmp_path / "film"}, tmp_path / "maps")
 
 
 def test_only_episodes_of_some_outcomes_can_be_trained_on(world: Any, stage1_folder: Path, tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_stage2_goes_on_with_maps_of_the_same_meaning_only(
     other = make_contract(**({"sigma_px_ref": 60.0, "tokenizer": "synthetic"} | {name: value}))
     save_checkpoint(tmp_path / "stage2", model, kind="stage2", action_contract=other)
     with pytest.raises(CheckpointError, match=rf"(?s)action contract differs.*{name}.*{value}.*{found}"):
-        train_stage2(stage2(2, start_from="stage2"), {**world.inputs, "stage1": tmp_path / "stage2"}, tmp_path / "out")
+        train_stage2(stage2(2), {**world.inputs, "stage1": tmp_path / "stage2"}, tmp_path / "out")
 
 
 def test_controls_of_whole_intervals_reach_the_model_from_a_checkpoint_that_knew_none(
@@ -229,14 +229,12 @@ def test_controls_of_whole_intervals_reach_the_model_from_a_checkpoint_that_knew
 ) -> None:
     inputs = {**world.inputs, "stage1": stage1_folder}
     train_stage2(stage2(2), inputs, tmp_path / "own")
-    train_stage2(
-        stage2(2, start_from="stage2", action_frames=4), {**inputs, "stage1": tmp_path / "own"}, tmp_path / "all"
-    )
+    train_stage2(stage2(2, action_frames=4), {**inputs, "stage1": tmp_path / "own"}, tmp_path / "all")
     model, info = load_checkpoint(tmp_path / "all")
     assert info.config.action_frames == 4
     assert bool((model.action_encoder.proj.weight[:, model.action_encoder.proj.in_features // 4 :] != 0).any())
     with pytest.raises(CheckpointError, match=r"(?s)takes the controls of more frames.*action_frames 4"):
-        train_stage2(stage2(2, start_from="stage2"), {**inputs, "stage1": tmp_path / "all"}, tmp_path / "back")
+        train_stage2(stage2(2), {**inputs, "stage1": tmp_path / "all"}, tmp_path / "back")
 
 
 def test_wrong_checkpoint_and_missing_teacher_are_named(
@@ -252,8 +250,6 @@ def test_wrong_checkpoint_and_missing_teacher_are_named(
     save_checkpoint(tmp_path / "causal", model, kind="causal", action_contract=make_contract(), causal=make_spec())
     with pytest.raises(CheckpointError, match="wrong kind"):
         train_stage2(stage2(2), {**world.inputs, "stage1": tmp_path / "causal"}, tmp_path / "out")
-    with pytest.raises(CheckpointError, match="wrong kind"):
-        train_stage2(stage2(2, start_from="stage2"), {**world.inputs, "stage1": stage1_folder}, tmp_path / "out")
     with pytest.raises(ConfigError, match="need a teacher"):
         train_stage2(stage2(2, relational={}), {**world.inputs, "stage1": stage1_folder}, tmp_path / "out")
     with pytest.raises(CheckpointError, match="holds no relational teacher"):

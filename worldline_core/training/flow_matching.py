@@ -18,7 +18,6 @@ from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from worldline_core.errors import ConfigError
 from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.processes import any_process
@@ -42,24 +41,18 @@ def sample_sigmas(config: SigmaSampling, count: int, generator: torch.Generator)
 
 def broadcast_sigma(sigma: Tensor) -> Tensor:
     """Bring sigma of shape "b" or "b t" to a shape that broadcasts against "b v c t h w"."""
-    if sigma.ndim == 1:
-        return rearrange(sigma, "b -> b 1 1 1 1 1")
-    if sigma.ndim == 2:
-        return rearrange(sigma, "b t -> b 1 1 t 1 1")
-    raise ConfigError("Noise levels have an unexpected shape.", expected="'b' or 'b t'", got=tuple(sigma.shape))
+    return rearrange(sigma, "b -> b 1 1 1 1 1" if sigma.ndim == 1 else "b t -> b 1 1 t 1 1")
 
 
 def add_noise(
     latents: Float[Tensor, "b v c t h w"],
     noise: Float[Tensor, "b v c t h w"],
     sigma: Tensor,
-    clean_frames: Bool[Tensor, "b t"] | None = None,
 ) -> Float[Tensor, "b v c t h w"]:
-    """``(1 - sigma) z + sigma eps``; clean frames (default: the first) stay as they are."""
+    """``(1 - sigma) z + sigma eps``; the first frame stays as it is."""
     level = broadcast_sigma(sigma)
     noisy = (1 - level) * latents + level * noise
-    clean = first_frame(latents) if clean_frames is None else clean_frames
-    return torch.where(rearrange(clean, "b t -> b 1 1 t 1 1"), latents, noisy)
+    return torch.where(rearrange(first_frame(latents), "b t -> b 1 1 t 1 1"), latents, noisy)
 
 
 def velocity_target(
@@ -90,10 +83,9 @@ def flow_matching_loss(
     noise: Float[Tensor, "b v c t h w"],
     sigma: Tensor,
     weighting: LossWeighting,
-    clean_frames: Bool[Tensor, "b t"] | None = None,
     weights: Float[Tensor, "b v 1 t h w"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean squared velocity error over the noisy frames, in float32 (clean frames carry no loss).
+    """Mean squared velocity error over the noisy frames, in float32 (the first, clean one carries no loss).
 
     ``weights``: multiply the squared error, as in `Batch`.
     """
@@ -104,8 +96,7 @@ def flow_matching_loss(
         error = error * motion_weights(latents, weighting)
     if weights is not None:
         error = error * weights
-    clean = first_frame(latents) if clean_frames is None else clean_frames
-    noisy = rearrange(~clean, "b t -> b 1 1 t 1 1").to(error.dtype)
+    noisy = rearrange(~first_frame(latents), "b t -> b 1 1 t 1 1").to(error.dtype)
     per_frame_values = error.numel() / noisy.numel()
     return (error * noisy).sum() / (noisy.sum().clamp_min(1) * per_frame_values)
 

@@ -56,7 +56,6 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         ConfigError: if relational terms are asked for without a teacher.
         DataError: if no clip fits, or one cannot be read.
     """
-    kinds = ("base", "stage1") if config.start_from == "stage1" else ("stage2",)
     parent = Path(inputs["stage1"])
     native = config.native_size is not None
     tracks = ActionTracks.open(Path(inputs["tracks"]), EpisodeSet.open(Path(inputs["episodes"])) if native else None)
@@ -64,7 +63,7 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     def load_model() -> tuple[WorldModel, CheckpointInfo]:
         model, info = load_checkpoint(
             parent,
-            expect_kind=kinds,
+            expect_kind=("base", "stage1", "stage2"),
             towers="generation",
             action_frames=config.action_frames,
             weights=processes()[0] == 0,

@@ -188,7 +188,7 @@ class Stage1Config(StageConfig):
 
 
 class Stage2Config(StageConfig):
-    """``start_from``: "stage1" takes a base or Stage I checkpoint, "stage2" goes on with a Stage II checkpoint.
+    """Starts from a base or Stage I checkpoint, or goes on with a Stage II checkpoint.
 
     ``action_multiplier``: learning-rate multiplier of the zero-initialised action branch (66 at full size).
     ``action_frames``: control frames whose maps a latent frame takes: its own (1, the paper's), or all 4 of its interval,
@@ -197,7 +197,6 @@ class Stage2Config(StageConfig):
     ``native_size``: the paper's ablation: control vectors, padded to this size, by FiLM in every layer instead of maps.
     """
 
-    start_from: Literal["stage1", "stage2"] = "stage1"
     action_multiplier: float = Field(default=66.0, gt=0)
     action_dropout: float = Field(default=0.0, ge=0, lt=1)
     action_frames: Literal[1, 4] = 1
