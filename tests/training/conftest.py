@@ -34,7 +34,6 @@ TINY_MODEL = {
     "intermediate_size": 48,
     "rope_sections": (4, 2, 2),
     "vocab_size": 300,
-    "prediction": "sample",
 }
 
 

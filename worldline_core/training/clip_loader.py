@@ -69,6 +69,11 @@ class ClipDataset(Dataset[ReadBatch | WorldLineError]):
             return error
 
 
+def recorded_views(source: ClipSource, batch: ClipBatch, clip: Clip) -> tuple[str, ...]:
+    """The recorded views that fill a clip's slots: the task-facing one has a name of its own."""
+    return (source.row(clip.episode_id).primary_view,) if batch.primary else batch.views
+
+
 def read_batch(
     source: ClipSource, batch: ClipBatch, replacement: Callable[[int, int], Clip] | None = None
 ) -> ReadBatch:
@@ -86,9 +91,8 @@ def read_batch(
     skipped: list[tuple[Clip, str]] = []
     for place, clip in enumerate(batch.clips):
         for attempt in range(_ATTEMPTS):
-            views = (source.row(clip.episode_id).primary_view,) if batch.primary else batch.views
             try:
-                data.append(source.read(clip, views))
+                data.append(source.read(clip, recorded_views(source, batch, clip)))
             except DataError as error:
                 if replacement is None:
                     raise
@@ -306,12 +310,10 @@ class ClipLoader:
         fps = None if rates is None else torch.tensor(rates, device=self.device)
         weights = None
         if self.object_weights is not None:
-            weights = self.object_weights(clips, [self._recorded(batch, clip) for clip in clips]).to(self.device)
+            weights = self.object_weights(clips, [recorded_views(self.source, batch, clip) for clip in clips]).to(
+                self.device
+            )
         return Batch(clips, views, latents, maps, ids, mask, frames, fps, weights)
-
-    def _recorded(self, batch: ClipBatch, clip: Clip) -> tuple[str, ...]:
-        """The recorded views that fill a clip's slots: the task-facing one has a name of its own."""
-        return (self.source.row(clip.episode_id).primary_view,) if batch.view == PRIMARY else batch.slots(self.views)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
         """What a prompt may say about a clip; a stride lowers its rate."""
