@@ -1,10 +1,9 @@
-"""Pinhole cameras: what they see, where they are, and what becomes of K when an image is resized, cropped or padded.
+"""Pinhole cameras, and what becomes of K when an image is resized, cropped or padded.
 
 Camera frame: OpenCV (x right, y down, z forward), metres. `T_base_camera` maps camera points to base.
 Pixels: the *centre* of the top left pixel is (0, 0), so the image covers -0.5 <= u < width - 0.5, likewise v. Every
-change of the pixel grid is then an affine map of pixels, u' = s u + t (a resize by s maps u to (u + 0.5) s - 0.5), and
-the camera matrix follows it exactly, K' = A K: to transform an image and then project is to project and then transform.
-Distorted lenses are undistorted when recordings are read (`undistortion`).
+change of the pixel grid is an affine map of pixels, u' = s u + t, and the camera matrix follows it exactly, K' = A K.
+Distorted lenses are undistorted when recordings are read (`lens`).
 """
 
 from __future__ import annotations
@@ -67,10 +66,7 @@ class CameraPose:
 
     @classmethod
     def of(cls, matrices: np.ndarray, *, extrinsics: Extrinsics, axes: CameraAxes, where: object) -> CameraPose:
-        """Pose from matrices (N or 1, 4, 4) or (4, 4).
-
-        Args:
-            extrinsics: whether they map camera points to base, or base points to camera (OpenCV's rvec and tvec, COLMAP).
+        """Pose from matrices (N or 1, 4, 4) or (4, 4), which map camera points to base or (OpenCV's rvec and tvec) base to camera.
 
         Raises: CalibrationError when one is not rigid, beyond what `repair_rotations` mends.
         """

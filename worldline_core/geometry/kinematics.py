@@ -26,12 +26,7 @@ if TYPE_CHECKING:  # imports a plotting library: seconds that most commands and 
 
 
 def read_tree(embodiment: Embodiment) -> TreeBody:
-    """The tree of an embodiment's description, with its mounts.
-
-    Raises:
-        UnavailableError: the kinematic description is not there.
-        DataError: it cannot be read.
-    """
+    """The tree of an embodiment's description, with its mounts. Raises: UnavailableError, DataError: it cannot be read."""
     text, path = read_description(embodiment), embodiment.description_path
     tree = read_urdf(text, path) if embodiment.description.format == "urdf" else read_mjcf(text, path)
     mounts = embodiment.description.mounts
@@ -117,18 +112,12 @@ class ArmKinematics:
         """
         positions = self._joint_positions(state, posture)
         T_root_link = self.chain.forward_kinematics_tensor(positions)
-        if self._base_is_root:
+        root = self.tree
+        at_root = self.embodiment.base_link == root.name and not root.joints
+        if at_root and bool((root.T_parent_body == np.eye(4)).all()):
             return {name: T_root_link[self.chain.frame_to_idx[name]] for name in self.links}
         T_base_root = invert(T_root_link[self.chain.frame_to_idx[self.embodiment.base_link]])
         return {name: T_base_root @ T_root_link[self.chain.frame_to_idx[name]] for name in self.links}
-
-    @cached_property
-    def _base_is_root(self) -> bool:
-        """True where poses in the root are poses in the base."""
-        root = self.tree
-        return (
-            self.embodiment.base_link == root.name and not root.joints and bool((root.T_parent_body == np.eye(4)).all())
-        )
 
     def tool_poses(
         self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray | float] | None = None
@@ -138,11 +127,8 @@ class ArmKinematics:
 
     def tools_of(self, links: Mapping[str, Tensor]) -> Float[Tensor, "n a 4 4"]:
         """T_base_tool from what `link_poses` gave."""
-        tools = [
-            links[arm.end_effector_link] @ torch.from_numpy(arm.T_link_tool.matrix()).to(links[arm.end_effector_link])
-            for arm in self.embodiment.arms
-        ]
-        return torch.stack(tools, dim=1)
+        pairs = [(links[arm.end_effector_link], arm.T_link_tool.matrix()) for arm in self.embodiment.arms]
+        return torch.stack([link @ torch.from_numpy(offset).to(link) for link, offset in pairs], dim=1)
 
     def wrist_camera_poses(
         self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray | float] | None = None

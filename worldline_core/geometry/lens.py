@@ -5,8 +5,7 @@ Models, both of OpenCV, on the plane at depth 1 (x = X / Z, y = Y / Z, r^2 = x^2
     fisheye (`cv::fisheye`, Kannala-Brandt, ROS equidistant): coefficients k1..k4 of the angle theta = atan r; all zeros is
         the equidistant lens, not a pinhole.
 
-OpenCV distorts points. Its inverses are not used: the one of radtan need not converge, the one of fisheye ends at a
-distorted radius of 90 degrees.
+OpenCV's inverses are not used: the one of radtan need not converge, the one of fisheye ends at a distorted radius of 90 degrees.
 """
 
 from __future__ import annotations
@@ -74,9 +73,8 @@ class Distortion:
 
     @cached_property
     def turning_point(self) -> tuple[float, float]:
-        """Up to where distances from the centre grow: the ray's r (fisheye: theta [rad]) and the distorted radius there.
-
-        Beyond it two rays meet in one pixel. Infinite for a radtan lens that never turns; a fisheye ends at pi.
+        """The ray's r (fisheye: theta [rad]) up to which the distorted radius grows, and that radius; beyond, two rays meet in one
+        pixel. Infinite for a radtan lens that never turns; a fisheye ends at pi.
         """
         numerator, denominator = self._radial
         # d/dr of r N(s) / D(s) with s = r^2 is ((N + 2 s N') D - 2 s N D') / D^2, and 1 at the centre.
@@ -99,10 +97,7 @@ class Distortion:
             return distance * polynomial.polyval(s, numerator) / polynomial.polyval(s, denominator)
 
     def check_inside(self, K: np.ndarray, image_size: tuple[int, int]) -> None:
-        """Raises: CalibrationError when pixels of an image of (height, width) have no single ray under this model.
-
-        Looks at the radial part, which decides in practice; `undistort_rays` checks each pixel it is asked for.
-        """
+        """Raises: CalibrationError when pixels of an image of (height, width) have no single ray under the radial part."""
         height, width = image_size
         corners = np.array([[u, v, 1.0] for u in (0.0, width - 1.0) for v in (0.0, height - 1.0)])
         farthest = float(np.hypot(*(np.linalg.inv(K) @ corners.T)[:2]).max())

@@ -67,8 +67,7 @@ class TextToVideo:
 
     Raises:
         CheckpointError: the checkpoint is no base or Stage I model with both towers, or of another tokenizer.
-        ConfigError: neither the checkpoint nor the configuration says how text is read, or the recordings' pictures do not
-            divide into patches.
+        ConfigError: nothing states how text is read, or the recordings' pictures do not divide into patches.
     """
 
     needs_cameras = False

@@ -17,29 +17,18 @@ from worldline_core.rollout.rollout_config import RolloutConfig
 
 
 class Predictor(Protocol):
-    """A model, server or baseline, as a plan sees it.
-
-    Attributes:
-        views: that it knows; the first one must be in every prediction.
-        frames_per_unit: a prediction of a stated length has 1 + k times this many frames.
-        needs_cameras: whether controls are drawn into the views, so that their cameras must be known.
-    """
+    """A model, server or baseline; the first of its views is in every prediction, which has 1 + k ``frames_per_unit`` frames."""
 
     views: tuple[str, ...]
     frames_per_unit: int
     needs_cameras: bool
 
-    def unit(self, frames: int) -> int:
-        """Frames that a step of a prediction of ``frames`` frames adds."""
-        ...
+    def unit(self, frames: int) -> int: ...
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """One video of every view to make: of an episode, driven by the controls of one, with a seed and a length.
-
-    ``sampled``: frames up to the end of the last unit; those after ``frames`` are not kept.
-    """
+    """Videos of an episode under the controls of one; frames after ``frames``, up to ``sampled``, are not kept."""
 
     position: int
     episode_id: str
@@ -51,11 +40,7 @@ class Prediction:
 
 
 def choose_episodes(config: RolloutConfig, episodes: EpisodeSet) -> list[int]:
-    """Positions of the episodes to predict, in the order of the set.
-
-    Raises:
-        DataError: none matches.
-    """
+    """Positions of the episodes to predict, in the order of the set. Raises: DataError when none matches."""
     counts: Counter[str] = Counter()
     chosen: list[int] = []
     limit = config.max_episodes_per_embodiment

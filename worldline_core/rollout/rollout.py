@@ -48,10 +48,9 @@ World = WorldLine | TextToVideo | FirstFrameCopy | GeSim
 def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Predict episodes of ``episodes`` with ``tracks``, ``tokenizer`` and, but for copying, ``checkpoint``.
 
-    Writes a RolloutSet, video by video as it is predicted: memory does not grow with the length. Chosen episodes that
-    cannot be predicted are listed in ``quarantine.parquet``, each with its reason. Predictions already there are kept; a batch is
-    made again as a whole if one of its videos is missing, so the bytes do not depend on where an earlier call stopped.
-    The times of a call that predicts anything go to ``run/speed.json``, those of ``timed_blocks`` as ``long_rollout``.
+    Writes a RolloutSet, video by video as it is predicted. Chosen episodes that cannot be predicted are listed in
+    ``quarantine.parquet`` with a reason. Predictions already there are kept; a batch is made again as a whole if one of its videos
+    is missing, so the bytes do not depend on where an earlier call stopped. Times go to ``run/speed.json``.
 
     Returns:
         counts, frames, and the checkpoint's kind; where there are any, the episodes left out by reason (``left_out``), how
@@ -253,9 +252,7 @@ def _write_speed(
 
 @dataclass(frozen=True)
 class Elapsed:
-    """Wall seconds, and processor seconds of all threads, which a busy machine does not stretch (and which say nothing
-    about kernels on a GPU).
-    """
+    """Wall seconds, and processor seconds of all threads, which a busy machine does not stretch."""
 
     wall: float
     processor: float
@@ -277,8 +274,6 @@ def long_rollout(
     simulator: Callable[[], BlockCausalSimulator], first: Tensor, maps: Tensor, blocks: int, *, warm_up: int = 2
 ) -> dict[str, list[float]]:
     """Seconds of every block of one long rollout under constant controls; its frames are dropped.
-
-    Processor seconds are given only where the processor did the work.
 
     Args:
         first, maps: observed latents ``(b v c h w)`` and the action maps of a clip ``(b v a t h w)``.

@@ -129,7 +129,7 @@ def _rates(fps: float | None, first: Tensor) -> Tensor | None:
 
 
 class FullClipSampler:
-    """Samples one whole clip per step with a Stage II model; each clip is started anew."""
+    """Samples one whole clip per step with a Stage II model."""
 
     chained = True
 
@@ -210,11 +210,7 @@ class BlockCausalSimulator:
 
     @torch.no_grad()
     def step(self, action_maps: Float[Tensor, "b v a t #h #w"] | None) -> Float[Tensor, "b v c t h w"]:
-        """Predict the next block under these controls.
-
-        Raises:
-            DataError: the rollout was not started, or the controls are not those of one block.
-        """
+        """Predict the next block. Raises: DataError when not started, or the controls are not those of one block."""
         if action_maps is not None and action_maps.shape[3] != self.spec.block_size:
             raise DataError(
                 "Controls of one block are needed",

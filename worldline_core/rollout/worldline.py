@@ -210,11 +210,7 @@ class WorldLine:
         )
 
     def chosen_views(self, given: Iterable[str]) -> tuple[str, ...]:
-        """Given views in the model's order.
-
-        Raises:
-            DataError: one is none of the model's, or the model's first one is missing.
-        """
+        """Given views in the model's order; raises as `ordered_views`."""
         return ordered_views(self.views, given)
 
     def stream(
@@ -300,11 +296,8 @@ class WorldLine:
         views: Sequence[str],
         stride: int = 1,
     ) -> Float[Tensor, "b v a t h w"]:
-        """Maps of the controls of the latent frames at these recorded frames (or vectors, of a model with FiLM); past the
-        end of a track its last controls stay.
-
-        Args:
-            start: first frame of the clip that the frames belong to.
+        """Maps (or vectors, of a model with FiLM) of the latent frames at these recorded frames of a clip that begins at ``start``; past
+        the end of a track its last controls stay.
         """
         cut = []
         count, native = self.info.config.action_frames, self.info.config.native_size
@@ -322,11 +315,7 @@ class WorldLine:
     def simulator(
         self, seeds: Sequence[int], views: Sequence[str] | None = None, stride: int = 1
     ) -> BlockCausalSimulator:
-        """The causal model, to be driven block by block with new controls.
-
-        Raises:
-            CheckpointError: a Stage II model predicts whole clips only.
-        """
+        """The causal model, to be driven block by block. Raises: CheckpointError for a Stage II model."""
         if self.causal is None:
             raise CheckpointError("Only a causal model goes block by block", expected="causal", got=self.info.kind)
         chosen = self.views if views is None else tuple(views)
