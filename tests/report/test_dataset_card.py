@@ -16,7 +16,6 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import read_index
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
-from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.pages.page import markdown
@@ -161,8 +160,3 @@ def test_the_command_writes_beside_the_set_and_names_its_files(
     assert f"wrote {curated / 'run' / 'card' / 'README.md'}" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="1"):
         main(["card", str(tmp_path)])
-
-
-def test_a_folder_that_is_no_set_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"index\.parquet"):
-        write_card(tmp_path, tmp_path / "card")

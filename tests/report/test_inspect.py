@@ -57,10 +57,6 @@ def test_kinds(
         assert all(f'"{name}"' in page for name in pictures)
 
 
-def test_report_is_recognised(full_report: Path, tmp_path: Path) -> None:
-    assert inspect(full_report, tmp_path).kind == "Report"
-
-
 def test_the_page_goes_to_run_by_default(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     folder = tmp_path / "set"
     shutil.copytree(run_artifacts["curate"], folder)

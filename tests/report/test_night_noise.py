@@ -93,12 +93,6 @@ def test_a_loss_of_three_points_of_iou_turns_the_night_red_and_is_named(tmp_path
     assert record_night(history, "good again", world.write(tmp_path / "again")).regressions == []
 
 
-def test_ten_nights_of_pure_noise_stay_green(tmp_path: Path) -> None:
-    world, history = World(2), tmp_path / "history"
-    for number in range(10):
-        assert record_night(history, f"{number}", world.write(tmp_path / f"{number}")).regressions == []
-
-
 @pytest.mark.slow
 def test_false_alarms_are_rare_over_two_hundred_nights_of_pure_noise() -> None:
     alarms, nights = 0, 0

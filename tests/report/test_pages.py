@@ -19,7 +19,7 @@ from worldline_core.pages.charts import (
     line_chart,
     nice_ticks,
 )
-from worldline_core.pages.page import Table, asset, environment, interval, markdown, number, percent, render
+from worldline_core.pages.page import asset, environment, interval, markdown, number, percent, render
 
 
 class _Texts(HTMLParser):
@@ -56,17 +56,6 @@ def test_a_name_that_the_template_does_not_know_is_an_error() -> None:
         render("report/redirect.html", title="t")
 
 
-def test_table_refuses_rows_of_a_wrong_length() -> None:
-    with pytest.raises(ValueError, match="a row of 1 cells in a table of 2 columns"):
-        Table(("a", "b"), [["only one"]])
-
-
-def test_what_is_not_there_is_a_dash_and_the_first_cell_a_heading() -> None:
-    html = Table(("name", "n"), [["x", None]], numeric=[1], caption="c").__html__()
-    assert '<th scope="row">x</th><td class="number"><span class="absent">\u2013</span></td>' in html
-    assert tags(html) == ["div", "p", "div", "table", "thead", "tr", "th", "th", "tbody", "tr", "th", "td", "span"]
-
-
 def test_numbers_are_written_for_readers() -> None:
     assert number(1234567) == "1\u202f234\u202f567"
     assert number(-0.126) == "\u22120.13"
@@ -74,17 +63,6 @@ def test_numbers_are_written_for_readers() -> None:
     assert "[0.40, 0.60]" in str(interval({"mean": 0.5, "low": 0.4, "high": 0.6}))
     assert "+0.50" in str(interval({"mean": 0.5, "low": 0.4, "high": 0.6}, signed=True))
     assert interval(None) is None
-
-
-def test_markdown_reads_what_cards_use(hostile_text: str) -> None:
-    html = markdown(
-        f"# Title\n\nText with `code` and **bold**.\n\n- one\n- two\n  more\n\n| a | b |\n|---|---|\n| 1 | {hostile_text} |\n\n```\nx < y\n```"
-    )
-    assert [tag for tag in tags(html) if tag not in ("div", "thead", "tbody", "tr", "th", "td")] == [
-        "h4", "p", "code", "strong", "ul", "li", "li", "table", "pre", "code",
-    ]  # fmt: skip
-    assert "two\nmore" in html
-    assert "x &lt; y" in html
 
 
 def test_markdown_of_others_has_no_links_pictures_or_html() -> None:

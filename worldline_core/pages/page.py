@@ -143,10 +143,5 @@ class Table:
     caption: str = ""
     dense: bool = False
 
-    def __post_init__(self) -> None:
-        wrong = next((row for row in self.rows if len(row) != len(self.headings)), None)
-        if wrong is not None:
-            raise ValueError(f"a row of {len(wrong)} cells in a table of {len(self.headings)} columns: {list(wrong)}")
-
     def __html__(self) -> Markup:
         return render_macro("pages/parts.html", "table", shown=self, numeric=set(self.numeric))

@@ -355,7 +355,8 @@ def planning_evaluation(summary: JsonObject) -> dict[str, object]:
     series = [Series("direct execution", x, [summary["direct_execution"]["mean"]] * len(x), colour="c5", dashed=True)]
     rows: list[list[object]] = []
     for m in in_order(methods):
-        found = {int(n): values["success"] for n, values in methods[m.name]["budgets"].items()}
+        by_budget = methods[m.name]["budgets"]
+        found = {int(n): by_budget[n]["success"] for n in sorted(by_budget, key=int)}
         bounds = [[found[n][key] for n in found] for key in ("mean", "low", "high")]
         if m.kind not in MODELS:
             bounds = bounds[:1]
