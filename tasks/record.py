@@ -11,6 +11,4 @@ record = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    from tasks.execution.command_line import run_task_command
-
-    run_task_command(record)
+    record.main()
