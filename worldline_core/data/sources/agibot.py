@@ -68,6 +68,8 @@ _GRIPPER_COMMAND = GripperRange(closed=1.0, open=0.0)
 _TOOL_OFFSET_M = 0.23
 """From the arm's end link to between the fingertips, along +z."""
 _TOOL_OFFSET_V2_M = 0.15
+_POSTURE = {"head": ("head_yaw_rad", "head_pitch_rad"), "waist": ("waist_pitch_rad", "waist_lift_m")}
+"""Names of the joints outside of the state, noted at the first frame: kinematics need them (`Embodiment.noted_posture`)."""
 _IMAGES_V2 = {"head": "cur_head.png", "left_wrist": "cur_left.png", "right_wrist": "cur_right.png"}
 _STEP_OF_EPISODE = re.compile(r"(\d+)-(\d+)-(\d+)")
 """Name of a clip's folder where all clips are side by side: task, episode, step."""
@@ -155,7 +157,7 @@ class AgibotWorldSource(EpisodeFiles[AgibotWorldSourceConfig]):
             instruction=instructions[number],
             cameras=cameras.tracks,
             primary_view=config.views[0],
-            conventions={"tool_offset_m": _TOOL_OFFSET_M, **cameras.notes()},
+            conventions={"tool_offset_m": _TOOL_OFFSET_M, **fields.pop("posture", {}), **cameras.notes()},
             **fields,
         )
         clips = {view: VideoClip.whole_file(videos[view], length, config.fps) for view in sizes}
@@ -232,7 +234,7 @@ class EnerverseAcSource(EpisodeFiles[EnerverseAcSourceConfig]):
             cameras=cameras.tracks,
             video_frames=None if clips or length == 1 else 1,
             primary_view=config.views[0],
-            conventions={"tool_offset_m": _TOOL_OFFSET_M, **cameras.notes()},
+            conventions={"tool_offset_m": _TOOL_OFFSET_M, **fields.pop("posture", {}), **cameras.notes()},
             **fields,
         )
         return LoadedEpisode(episode, config.views, lambda view: [read_image(picture)], clips=clips)
@@ -303,7 +305,7 @@ def _demo(folder: AnyPath) -> Bundle:
     ends = [pose_from_euler_fixed_xyz(recorded[:, a : a + 3], recorded[:, a + 3 : a + 6]) for a in (0, 7)]
     opening, overshoot = _GRIPPER_STATE_V2.opening(joints[:, 14:16])
     action[:, [7, 15]], more = _GRIPPER_COMMAND.opening(action[:, [7, 15]])
-    task = folder / "task.txt"
+    task, posture = folder / "task.txt", (name for names in _POSTURE.values() for name in names)
     fields = {
         "layout": "agibot_gesim v2",
         "state": np.hstack([joints[:, :7], opening[:, :1], joints[:, 7:14], opening[:, 1:]]),
@@ -320,7 +322,7 @@ def _demo(folder: AnyPath) -> Bundle:
     images = {view: [folder / name] for view, name in _IMAGES_V2.items()}
     return (
         fields,
-        {"tool_offset_m": _TOOL_OFFSET_V2_M},
+        {"tool_offset_m": _TOOL_OFFSET_V2_M, **dict(zip(posture, joints[0, 16:].tolist(), strict=True))},
         images,
         dict(zip(images, K, strict=True)),
         dict(zip(images, poses, strict=True)),
@@ -349,7 +351,7 @@ def _end_poses(rows: np.ndarray, where: object) -> dict[str, Any]:
 
 
 def _proprioception(path: AnyPath, *, whole: bool) -> dict[str, Any]:
-    """Fields of an episode from its `proprio_stats.h5`.
+    """Fields of an episode from its `proprio_stats.h5`, and the joints outside of the state as `posture`.
 
     Args:
         whole: joints, commands and times must be there; otherwise the state is the end poses where they are not.
@@ -368,6 +370,12 @@ def _proprioception(path: AnyPath, *, whole: bool) -> dict[str, Any]:
             action = file.arms(_ARMS, _GRIPPER_COMMAND, track="action", length=length)
             fields |= {"state": state.values, "action": action.values, "overshoot": state.overshoot + action.overshoot}
             fields |= {"state_names": state.names, "state_kind": "joints"}
+        fields["posture"] = {
+            name: float(value)
+            for part, names in _POSTURE.items()
+            if file.has(f"state/{part}/position")
+            for name, value in zip(names, file.array(f"state/{part}/position", (length, 2))[0], strict=True)
+        }
     return fields
 
 
