@@ -18,7 +18,7 @@ import json
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +35,7 @@ from worldline_core.calibration.camera_errors import (
     moved_camera,
     significant,
 )
-from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, diagnose_source
+from worldline_core.calibration.diagnosis import Conclusion, Diagnosis
 from worldline_core.calibration.evidence import MIN_IMAGE_PAIRS
 from worldline_core.calibration.observation import Observation, observe, read, small_gray
 from worldline_core.data.episodes.conventions import RecordedConventions, applicable
@@ -48,7 +48,6 @@ from worldline_core.geometry.transforms import quaternion_xyzw_from_rotation
 LAGS = (-4, -3, -2, -1, 1, 2, 3, 4)
 OFFSETS_M = (-0.1, -0.06, -0.03, 0.03, 0.06, 0.1, 0.15)
 SCALES = (0.5, 0.67, 0.8, 1.25, 1.5, 2.0, 3.33)
-NUMBERED = ("tool_offset_z_m", "intrinsics_size", "camera_lag_frames", "image_lag_frames")
 CASES = {
     "head": (("rotation", (1, 2, 3, 5, 10)), ("focal length", (3, 5, 10, 15)), ("translation", (30, 60))),
     "wrist": (("rotation", (5, 10)), ("focal length", (15,))),
@@ -164,53 +163,29 @@ def right(name: str, conventions: RecordedConventions, found: str, value: Record
 def measure_mistakes(items: Iterator[Healthy]) -> None:
     confusion: dict[str, Counter[str]] = defaultdict(Counter)
     correct: dict[str, list[bool]] = defaultdict(list)
-    sets: dict[tuple[str, str], list[Diagnosis]] = defaultdict(list)
-    truth: dict[tuple[str, str], RecordedConventions] = {}
-    spent, count = 0.0, 0
     unobservable: Counter[str] = Counter()
+    start, count = time.process_time(), 0
     for number, episode in enumerate(items):
         for name, base, conventions in injected(episode, number):
-            start = time.process_time()
-            diagnosis = examine(episode, base, conventions)
-            spent, count = spent + time.process_time() - start, count + 1
+            diagnosis, count = examine(episode, base, conventions), count + 1
             found = named(diagnosis)
             if not observable(name, episode, diagnosis):
                 unobservable[f"{name}: {found}"] += 1
                 continue
             confusion[name][found] += 1
             correct[name].append(right(name, conventions, found, diagnosis.best.conventions))
-            if not (conventions.departures and conventions.departures[0] in NUMBERED):
-                # Numbered mistakes vary over episodes here, while a source has one value.
-                sets[name, episode.joints.embodiment].append(diagnosis)
-                truth[name, episode.joints.embodiment] = conventions
-    set_correct: dict[str, list[bool]] = defaultdict(list)
-    for (name, embodiment), diagnoses in sets.items():
-        summed = diagnose_source(embodiment, diagnoses)
-        set_correct[name].append(right(name, truth[name, embodiment], named(summed), summed.best.conventions))
     rows = []
     for name, found in confusion.items():
-        sources = f"{100 * np.mean(set_correct[name]):.0f} %" if set_correct.get(name) else ""
         accepted = {name} if not name.startswith("none") else {"consistent", "too_little_evidence"}
         others = ", ".join(f"{k} {v}" for k, v in found.most_common() if k not in accepted)
-        rows.append((name, found.total(), f"{100 * np.mean(correct[name]):.1f} %", sources, others))
-    print_table(("injected", "episodes", "right", "right over sources", "found instead"), rows)
+        rows.append((name, found.total(), f"{100 * np.mean(correct[name]):.1f} %", others))
+    print_table(("injected", "episodes", "right", "found instead"), rows)
     for case, times in unobservable.items():
         print(f"not observable in the recording, not counted: {case} ({times})")
-    print(f"{count} diagnoses, {spent / max(count, 1) * 1e3:.0f} ms of CPU each")
+    print(f"{count} diagnoses, {(time.process_time() - start) / max(count, 1) * 1e3:.0f} ms of CPU each")
 
 
 # Errors of one camera
-
-
-@dataclass
-class Tally:
-    """Results of one case: of single episodes and of sources."""
-
-    alone: list[bool] = field(default_factory=list)
-    together: list[bool] = field(default_factory=list)
-    named: Counter[str] = field(default_factory=Counter)
-    unseen_alone: list[float] = field(default_factory=list)
-    unseen_together: list[float] = field(default_factory=list)
 
 
 def spoiled(observation: Observation, view: str, theta: np.ndarray) -> Observation:
@@ -233,21 +208,6 @@ def errors(seed: int, view: str) -> Iterator[tuple[str, float, np.ndarray]]:
             yield name, size, theta
 
 
-def count(tally: Tally, kind: str, episodes: Sequence[tuple[CameraError, ...]], seed: int) -> None:
-    """Add what is found in single episodes, and in sources drawn from them."""
-    for residuals in episodes:
-        tally.alone.append(bool(significant(residuals)))
-        tally.unseen_alone += [r.bound for r in residuals if r.kind == kind]
-    random = np.random.default_rng(seed)
-    for _ in range(DRAWS):
-        drawn = random.choice(len(episodes), min(TOGETHER, len(episodes)), replace=False)
-        residuals = combine([episodes[i] for i in drawn])
-        off = significant(residuals, together=True)
-        tally.together.append(bool(off))
-        tally.named.update(residual.kind for residual in off)
-        tally.unseen_together += [r.bound for r in residuals if r.kind == kind]
-
-
 def measure_cameras(items: Sequence[Healthy], seeds: Sequence[int]) -> None:
     observations = [observe(item.joints, item.gray, item.kinematics) for item in items]
 
@@ -255,38 +215,44 @@ def measure_cameras(items: Sequence[Healthy], seeds: Sequence[int]) -> None:
         reading = read(observed, RecordedConventions())
         return () if reading is None else estimate_camera_errors(observed, reading)
 
-    start = time.process_time()
-    clean = [estimated(observed) for observed in observations]
-    print(f"{(time.process_time() - start) / len(items) * 1e3:.0f} ms of CPU an episode", flush=True)
-
     def rows() -> Iterator[tuple[str, ...]]:
+        clean = [estimated(observed) for observed in observations]
         for view in ("head", "left_wrist"):
             shown = [i for i, observed in enumerate(observations) if view in observed.gray]
             of_view = [tuple(r for r in clean[i] if r.view == view) for i in shown]
             for kind in ("rotation", "focal length"):
-                tally = Tally()
-                count(tally, kind, of_view, 0)
-                yield row(f"{view}: healthy, {kind}", tally)
-            tallies: dict[str, Tally] = defaultdict(Tally)
+                yield row(f"{view}: healthy, {kind}", kind, [of_view])
+            found: dict[tuple[str, str], list[list[tuple[CameraError, ...]]]] = defaultdict(list)
             for seed in seeds:
                 for kind, size, theta in errors(seed, view):
-                    found = [estimated(spoiled(observations[i], view, theta)) for i in shown]
-                    count(tallies[f"{view}: {kind} {size:g} {ERROR_KINDS[kind].unit}"], kind, found, seed)
-            yield from (row(name, tally) for name, tally in tallies.items())
+                    name = f"{view}: {kind} {size:g} {ERROR_KINDS[kind].unit}"
+                    found[name, kind].append([estimated(spoiled(observations[i], view, theta)) for i in shown])
+            yield from (row(name, kind, of_seeds) for (name, kind), of_seeds in found.items())
 
     columns = ("error", "found in one episode", "unseen up to", "found in 20", "unseen up to", "named")
     print_table(columns, rows())
 
 
-def row(name: str, tally: Tally) -> tuple[str, ...]:
-    kinds = ", ".join(f"{kind} {number}" for kind, number in tally.named.most_common())
+def row(name: str, kind: str, of_seeds: Sequence[Sequence[tuple[CameraError, ...]]]) -> tuple[str, ...]:
+    """Errors found in single episodes, and in sources drawn from those of each seed."""
+    single = [estimates for episodes in of_seeds for estimates in episodes]
+    sources = []
+    for seed, episodes in enumerate(of_seeds):
+        random = np.random.default_rng(seed)
+        for _ in range(DRAWS):
+            drawn = random.choice(len(episodes), min(TOGETHER, len(episodes)), replace=False)
+            sources.append(combine([episodes[i] for i in drawn]))
+    off = [significant(estimates, together=True) for estimates in sources]
+    kinds = Counter(error.kind for errors in off for error in errors)
+    alone = [bool(significant(estimates)) for estimates in single]
+    unseen = [np.median([e.bound for group in groups for e in group if e.kind == kind]) for groups in (single, sources)]
     return (
         name,
-        f"{100 * np.mean(tally.alone):.0f} % of {len(tally.alone)}",
-        f"{np.median(tally.unseen_alone):.1f}",
-        f"{100 * np.mean(tally.together):.0f} % of {len(tally.together)}",
-        f"{np.median(tally.unseen_together):.1f}",
-        kinds,
+        f"{100 * np.mean(alone):.0f} % of {len(single)}",
+        f"{unseen[0]:.1f}",
+        f"{100 * np.mean([bool(errors) for errors in off]):.0f} % of {len(off)}",
+        f"{unseen[1]:.1f}",
+        ", ".join(f"{kind} {number}" for kind, number in kinds.most_common()),
     )
 
 

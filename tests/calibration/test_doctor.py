@@ -176,8 +176,8 @@ def test_evidence_adds_up_over_the_episodes_of_a_source() -> None:
 
 @pytest.fixture(scope="module")
 def held_out() -> list:
-    """Every third recording of the test splits."""
-    return list(benchmark.healthy(benchmark.RECORDINGS, {"test", "ood_test"}, 3))
+    """Every eighth recording of the test splits."""
+    return list(benchmark.healthy(benchmark.RECORDINGS, {"test", "ood_test"}, 8))
 
 
 @pytest.mark.slow

@@ -245,7 +245,7 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path: Path, toy: Any) -> None:
         ({"primary_view": "top"}, "primary_view top is none of head, right_wrist"),
         ({"rate": 30}, "Extra inputs are not permitted"),
         ({"transforms": ["/joint_states"]}, "declared both as readings and as transforms"),
-        ({"episodes": {"by": "markers", "topic": "/x", "start": "("}}, "is no regular expression"),
+        ({"episodes": {"by": "markers", "topic": "/x", "start": "("}}, "valid regular expression"),
     ],
 )
 def test_the_configuration_is_strict(tmp_path: Path, toy: Any, changes: dict[str, Any], message: str) -> None:

@@ -62,8 +62,7 @@ class CameraError:
         estimate: (k,) in `unit` (% of the focal length, or of the image's sides).
         information: (k, k) of the estimate.
         gain: log-likelihood of the pictures with it, less that of the recording as written.
-        prior: standard deviation of each value before any evidence.
-        shared: standard deviation of the error that more episodes do not reduce.
+        prior, shared: standard deviations before any evidence, and of the error that more episodes do not reduce.
     """
 
     view: str
@@ -405,12 +404,10 @@ class ErrorKind:
     """One kind of error.
 
     Attributes:
-        parameters: its place among the PARAMETERS.
-        unit, scale: unit of a report and of all that follows, and its factor from radians, metres or shares.
+        unit, scale: unit of all that follows, and its factor from radians, metres or shares.
         prior: standard deviation of each parameter before any evidence.
         usual: typical error of a camera that was bumped or badly calibrated.
-        linear: an estimate from the fine maps is final up to this size; beyond it the equations are solved again there.
-        near: beyond this size the coarse maps are solved first.
+        linear, near: beyond `linear` the equations are solved again at the estimate, beyond `near` on coarse maps first.
         shared_still, shared_wrist: standard deviation of the error common to all episodes of a source, because the robot's
             shape is simplified and flow is measured too short.
         off_alone, off_together: smallest size to be reported, of one episode and of all episodes of a source.

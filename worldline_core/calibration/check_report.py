@@ -1,8 +1,7 @@
 """Results of a calibration check: a table for the terminal, JSON, and a page with a picture of every episode.
 
-A picture shows where the recorded calibration puts the tools, beside where a repaired reading puts them. Unlike action
-tracks, which let wrist cameras follow the kinematics, it uses the camera poses *as recorded*. The arms' outline is drawn
-into the head view (in a wrist view it would fill the picture): beside the arm it is the plainest sign of a wrong calibration.
+Unlike action tracks, which let wrist cameras follow the kinematics, pictures use the camera poses *as recorded*. The arms'
+outline is drawn into the head view: beside the arm it is the plainest sign of a wrong calibration.
 """
 
 from __future__ import annotations
@@ -52,8 +51,6 @@ TONES = {
     "consistent": "good",
 }
 COLUMNS = ("Episode", "Verdict", "Best explanation", "Score", "As recorded")
-DETAIL_LETTERS = 160
-"""Length of an error in its line of the table; the page and diagnoses.json have all of it."""
 TILE_HEIGHT, MIN_WIDTH, MOMENTS = 256, 760, 3
 SIGMA_PX_REF = 18.0
 """Wide enough to be seen at tile size, narrow enough to leave the gripper visible."""
@@ -61,13 +58,9 @@ SIGMA_PX_REF = 18.0
 
 @dataclass(frozen=True)
 class EpisodeCheck:
-    """Result for one episode: a diagnosis, or why there is none.
+    """Result for one episode: a diagnosis, or a quarantine reason code with its `detail`.
 
-    Attributes:
-        reason: quarantine reason code of an episode that cannot be read, with `detail`; None for one that can.
-        config_lines: replacement lines for the source's configuration.
-        picture: path relative to the output folder.
-        notes: of the check itself, beside the diagnosis' own.
+    `config_lines` replace those of the source's configuration; `picture` is relative to the output folder.
     """
 
     episode_id: str
@@ -134,7 +127,7 @@ def table_text(check: CalibrationCheck) -> str:
         cells = [cell.ljust(w) if i < 3 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))]
         if episode is not None and episode.diagnosis is None:
             # The reason of an unreadable episode takes the place of its scores.
-            cells[2:] = [textwrap.shorten(f"{episode.reason}: {episode.detail}", DETAIL_LETTERS, placeholder=" ...")]
+            cells[2:] = [textwrap.shorten(f"{episode.reason}: {episode.detail}", 160, placeholder=" ...")]
         lines.append("  ".join(cells).rstrip())
     lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join([*lines, "", *conclusion_lines(check)])
@@ -277,12 +270,7 @@ def diagnosis_picture(
 ) -> Picture:
     """One picture per episode: left as recorded, right as repaired, the same frames on both sides.
 
-    Args:
-        recorded: the episode as its source wrote it.
-        frames: by view, uint8 (n, H, W, 3) of the recorded episode.
-
-    Raises:
-        DataError: nothing can be drawn in any view.
+    Raises: DataError when nothing can be drawn in any view.
     """
     conventions = diagnosis.best.conventions
     repaired, offset, lag = None, 0.0, 0
@@ -318,9 +306,8 @@ def diagnosis_picture(
         if repaired is not None:
             right.append(SheetRow(view_name(view), _drawn(shown, after, view, lag, tile_height)))
     if not left:
-        raise DataError(
-            "Nothing to draw", where=f"episode {recorded.episode_id}", expected="a calibrated view with images"
-        )
+        expected = "a calibrated view with images"
+        raise DataError("Nothing to draw", where=f"episode {recorded.episode_id}", expected=expected)
     sheets = [contact_sheet(left, tile_height=tile_height, title="as recorded", min_width=MIN_WIDTH)]
     if right:
         title = f"repaired: {diagnosis.best.text if diagnosis.best.departures else verdict_text(diagnosis)}"
@@ -340,14 +327,7 @@ def diagnosis_picture(
 def recorded_tracks(
     episode: Episode, view: str, kinematics: ArmKinematics | None, tool_offset_z_m: float = 0.0
 ) -> EpisodeTracks:
-    """The state's tools in one view, with K and camera poses as the episode has them: tracks of that one view.
-
-    Args:
-        tool_offset_z_m: from the tools to draw, along their +z.
-
-    Raises:
-        DataError: the episode neither has tool poses nor kinematics for its joints.
-    """
+    """The state's tools, moved along their +z, in one view with K and camera poses as the episode has them."""
     camera = episode.cameras[view]
     if episode.T_base_ee is not None:
         tools = torch.tensor(episode.T_base_ee, dtype=torch.float64)

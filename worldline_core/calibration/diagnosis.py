@@ -139,12 +139,7 @@ class Diagnosis(Conclusion):
 
 @dataclass(frozen=True, kw_only=True)
 class SourceDiagnosis(Conclusion):
-    """Conclusion over all episodes of a source; scores are summed over them.
-
-    Attributes:
-        votes: verdicts and mistakes of the single episodes, counted.
-        config_lines: replacement lines for the source's configuration.
-    """
+    """Conclusion over a source, with summed scores; `votes`: verdicts and mistakes of its episodes, counted."""
 
     source: str
     num_episodes: int
@@ -213,9 +208,7 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
     """The reading of a source: better than the recordings as written, and healthy in most of them.
 
     One episode contributes MAX_GAIN at most for or against a reading: a few broken recordings are no habit of their
-    source. A reading that breaks episodes which fit by themselves is not believed: such a source is mixed. Numbers that
-    each episode estimates by itself (a tool offset) are replaced by their median. Mistakes that occur together are tried
-    where they explain some episode alone.
+    source. A reading that breaks episodes which fit by themselves is not believed: such a source is mixed.
     """
     listed = [d for d in diagnoses if d.verdict != "too_little_evidence"]
     count = len(listed)
@@ -261,11 +254,8 @@ _ByKey = dict[_Key, Explanation]
 class _SourceReading:
     """One reading over all episodes of a source.
 
-    Attributes:
-        tried: its explanation in each episode where it was tried.
-        gain: its score above that of the recordings as written; each episode's share is bounded by MAX_GAIN.
-        healthy: episodes that are healthy under it.
-        contradicting: episodes that fit as written, or under another reading, but not under this one.
+    `gain` is its score above that of the recordings as written, `healthy` the number of episodes that are healthy under it,
+    `contradicting` of those that fit as written, or under another reading, but not under this one.
     """
 
     def __init__(self, key: _Key, listed: list[Diagnosis], by_key: list[_ByKey]) -> None:

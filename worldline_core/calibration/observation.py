@@ -38,7 +38,7 @@ _SUBCELL = 2**_SUBCELL_BITS
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm; `T_tool_mount` is its wrist camera's pose in the tool frame, None where the embodiment has none."""
+    """One arm; `T_tool_mount` is its wrist camera's pose in the tool frame, None if unknown."""
 
     name: str
     wrist_view: str
@@ -185,10 +185,7 @@ def _motion(gray: np.ndarray) -> Motion:
 
 
 def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ...]:
-    """The arms of the embodiment; without kinematics, those of the recorded tool poses under the usual names.
-
-    Raises: DataError when the recording has another number of arms than the embodiment.
-    """
+    """The arms of the embodiment; without kinematics, those of the recorded tool poses under the usual names."""
     if kinematics is None:
         count = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
         names = {1: ("right",), 2: ("left", "right")}.get(count, tuple(f"arm_{i}" for i in range(count)))
@@ -268,10 +265,7 @@ def tool_travel(tools: np.ndarray) -> np.ndarray:
 
 
 def read(observation: Observation, conventions: RecordedConventions) -> Reading | None:
-    """The episode under these conventions; None where no tool poses are known.
-
-    Raises: RejectedInputError where the conventions do not apply.
-    """
+    """The episode under these conventions; None where no tool poses are known."""
     recorded = observation.episode
     kinematics = observation.kinematics
     episode = apply_conventions(recorded, conventions)
@@ -335,11 +329,8 @@ def _sampled(capsules: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def predict_motion(points: np.ndarray, radii: np.ndarray, camera: CameraTrack) -> np.ndarray:
-    """(n - 1, r, c, 2) [px]: in each cell of a fixed camera, the projected step of the fastest robot point that touches it.
-
-    Args:
-        points: (n, p, 3), radii: (p,) [m].
-    """
+    """(n - 1, r, c, 2) [px]: in each cell of a fixed camera, the projected step of the fastest robot point (n, p, 3) with
+    radius (p,) [m] that touches it."""
     rows, columns = camera.height // CELL_PX, camera.width // CELL_PX
     if not len(radii):
         return np.zeros((len(points) - 1, rows, columns, 2))

@@ -10,8 +10,6 @@ from pydantic import Field, model_validator
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.source import EmbodimentName, ForeignSourceConfig, GripperRange
 
-Resampling = Literal["linear", "hold"]
-
 
 class TopicReadings(StrictModel):
     """Some numbers of a topic: joints by name, or columns of an array of numbers."""
@@ -21,7 +19,9 @@ class TopicReadings(StrictModel):
     columns: tuple[int, ...] | None = Field(
         default=None, description="positions, for messages that are a list of numbers"
     )
-    resample: Resampling = Field(default="linear", description="hold: the last value counts until the next one")
+    resample: Literal["linear", "hold"] = Field(
+        default="linear", description="hold: the last value counts until the next one"
+    )
 
     @model_validator(mode="after")
     def _one_choice(self) -> TopicReadings:
@@ -120,21 +120,12 @@ class Markers(StrictModel):
 
     by: Literal["markers"] = "markers"
     topic: str
-    start: str = Field(
-        default=r"start(: *(?P<instruction>.*))?", description="pattern of the whole text that begins one"
+    start: re.Pattern[str] = Field(
+        default=re.compile(r"start(: *(?P<instruction>.*))?"), description="the whole text that begins one"
     )
-    stop: str = Field(
-        default=r"stop(: *(?P<outcome>success|failure))?", description="pattern of the text that ends one"
+    stop: re.Pattern[str] = Field(
+        default=re.compile(r"stop(: *(?P<outcome>success|failure))?"), description="the whole text that ends one"
     )
-
-    @model_validator(mode="after")
-    def _patterns(self) -> Markers:
-        for name, pattern in (("start", self.start), ("stop", self.stop)):
-            try:
-                re.compile(pattern)
-            except re.error as error:
-                raise ValueError(f"episodes.{name}: {pattern!r} is no regular expression: {error}") from error
-        return self
 
 
 class McapTopicsSourceConfig(ForeignSourceConfig):
@@ -160,18 +151,14 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
         default={}, description="topic -> what to add to its header times, where its clock is known to be off"
     )
     max_image_distance_frames: float = Field(
-        default=1.5,
-        gt=0,
-        description="largest distance of an image from its instant; 1.5 lets two images in a row be lost",
+        default=1.5, gt=0, description="of an image from its instant; 1.5 lets two images in a row be lost"
     )
     max_gap_s: float = Field(default=0.2, gt=0, description="largest interval between joint readings or transforms")
     max_trim_s: float = Field(
         default=1.0, ge=0, description="how much later a topic may begin, or earlier end, than the others"
     )
     max_clock_skew_ms: float = Field(
-        default=200.0,
-        gt=0,
-        description="by how much the least delays (log time minus header time) of topics may differ",
+        default=200.0, gt=0, description="between the least delays (log time minus header time) of topics"
     )
 
     @model_validator(mode="after")
@@ -217,7 +204,7 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
 
     @property
     def topics(self) -> dict[str, set[str]]:
-        """Declared topics by what they are expected to hold."""
+        """Declared topics by role."""
         return {
             "images": {view.image for view in self.views.values()},
             "calibrations": {view.calibration for view in self.views.values() if view.calibration is not None},

@@ -118,7 +118,7 @@ def _between_markers(rule: Markers, file: McapFile) -> Iterator[Segment]:
     begun: tuple[int, re.Match[str]] | None = None
     count = 0
     for log_ns, text in sorted(markers, key=itemgetter(0)):
-        start, stop = re.fullmatch(rule.start, text), re.fullmatch(rule.stop, text)
+        start, stop = rule.start.fullmatch(text), rule.stop.fullmatch(text)
         if start is None and stop is None:
             continue
         if (start is not None) == (begun is not None):
@@ -141,7 +141,7 @@ def _unpaired(rule: Markers, file: McapFile, count: int, text: str) -> Segment:
         "missing_marker",
         "Markers of an episode are not a start and a stop",
         where=f"{file.path}, topic {rule.topic}, episode {count}",
-        expected=f"{rule.start!r}, then {rule.stop!r}",
+        expected=f"{rule.start.pattern!r}, then {rule.stop.pattern!r}",
         got=repr(text),
     )
     return Segment(f"{count:04d}", fault=fault)
