@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.metrics import end_effector_error, frame_iou, video_iou
+from worldline_core.evaluation.metrics import end_effector_error, frame_iou
 
 EMPTY = np.zeros((4, 6), dtype=bool)
 LEFT = EMPTY.copy()
@@ -19,16 +19,11 @@ def test_overlap_over_union():
 def test_frame_with_both_masks_empty_is_left_out():
     true, predicted = np.stack([LEFT, EMPTY]), np.stack([MIDDLE, EMPTY])
     assert np.isnan(frame_iou(true, predicted)[1])
-    assert video_iou(true, predicted) == pytest.approx(1 / 3)
 
 
 def test_frame_with_one_mask_empty_counts_zero():
-    assert video_iou(np.stack([LEFT, LEFT]), np.stack([LEFT, EMPTY])) == pytest.approx(0.5)
-    assert video_iou(np.stack([LEFT, EMPTY]), np.stack([LEFT, LEFT])) == pytest.approx(0.5)
-
-
-def test_video_empty_throughout_is_left_out():
-    assert video_iou(np.stack([EMPTY, EMPTY]), np.stack([EMPTY, EMPTY])) is None
+    assert frame_iou(np.stack([LEFT, LEFT]), np.stack([LEFT, EMPTY])).tolist() == [1.0, 0.0]
+    assert frame_iou(np.stack([LEFT, EMPTY]), np.stack([LEFT, LEFT])).tolist() == [1.0, 0.0]
 
 
 def test_masks_of_other_shape_or_type_are_refused():

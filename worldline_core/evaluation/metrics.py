@@ -123,13 +123,6 @@ def frame_iou(true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     return np.divide(intersection, union, out=np.full_like(union, np.nan), where=union > 0)
 
 
-def video_iou(true: np.ndarray, predicted: np.ndarray) -> float | None:
-    """Mean IoU over the valid frames of one video; None when every frame is empty in both (the video is left out)."""
-    values = frame_iou(true, predicted)
-    valid = values[~np.isnan(values)]
-    return float(valid.mean()) if valid.size else None
-
-
 def end_effector_error(true: np.ndarray, predicted: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Error of each frame and point (n, p) float64 [px]; NaN where a point is invalid or its patch leaves the frame.
 

@@ -35,8 +35,7 @@ from worldline_core.store.atomic import write_json_atomic
 
 SIGNALS = ("doubt", "disagreement", "new_controls", "new_setup")
 TRUST_COLUMNS = (*SIGNALS, "trust", "do_not_trust")
-LEAST_OF_EACH = 5
-"""Right and wrong verdicts that a half needs to calibrate with."""
+LEAST_OF_EACH = 5  # right and wrong verdicts that a half needs to calibrate with
 LEAST_RECORDINGS, MOST_RECORDINGS = 5, 2000
 """Training recordings of a kind: fewer give no novelty, of more a sample is kept."""
 PLACE_M, SPEED_M, OPENING = 0.1, 0.05, 0.5
@@ -145,8 +144,8 @@ def assess_trust(
         news[name]["new_controls"] = controls.novelty(*control_vectors(found))
         if _has_head_camera(found):
             news[name]["new_setup"] = setups.novelty(*setup_vectors(found))
-    rows_with_news = [{**row, **news[row["episode_id"]]} for row in predicted]
-    trusted, methods = trust_verdicts(rows_with_news, config, resamples=resamples, seed=seed)
+    predicted = [{**row, **news[row["episode_id"]]} for row in predicted]
+    trusted, methods = trust_verdicts(predicted, config, resamples=resamples, seed=seed)
     trusted += [{**dict.fromkeys(TRUST_COLUMNS), **row} for row in rows if row["method"] == TRUE_METHOD]
     trusted.sort(key=lambda row: (row["method"], row["episode_id"], row["seed"]))
     write_table(folder / DECISIONS_FILE, trusted, tuple(trusted[0]))
@@ -166,7 +165,7 @@ def trust_verdicts(
     Args:
         rows: verdicts on predicted videos with their novelties, and confidence None where the judge stated none.
 
-    Raises: ConfigError: ``compare_with`` names a method without verdicts.
+    Raises ConfigError where ``compare_with`` names a method without verdicts.
     """
     by_method: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in sorted(rows, key=lambda row: row["method"]):
@@ -267,8 +266,7 @@ def _reliability(rows: Sequence[Mapping[str, Any]], resamples: int, seed: int) -
     marked = np.array([bool(row["do_not_trust"]) for row in rows])
     trust = np.array([row["trust"] for row in rows])
     starts, start = np.unique([row["start"] for row in rows], return_inverse=True)
-    chance = np.full(len(starts), 1.0 / len(starts))
-    counts = np.random.default_rng(seed).multinomial(len(starts), chance, resamples)
+    counts = np.random.default_rng(seed).multinomial(len(starts), np.full(len(starts), 1.0 / len(starts)), resamples)
     everything = np.arange(len(rows))
     drawn = [np.repeat(everything, count[start]) for count in counts]
 
@@ -287,7 +285,6 @@ def _reliability(rows: Sequence[Mapping[str, Any]], resamples: int, seed: int) -
         pairs = wrong * (len(i) - wrong)
         return (rankdata(-trust[i])[~right[i]].sum() - wrong * (wrong + 1) / 2) / pairs if pairs else np.nan
 
-    # Ten bins of about equal size; equal trust shares one.
     bins = np.searchsorted(np.unique(np.quantile(trust, np.linspace(0, 1, 11)[1:-1])), trust, side="right")
     return {
         "verdicts": len(rows),
