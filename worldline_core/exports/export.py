@@ -226,13 +226,7 @@ def export_rollout(
     """
     predicted = {method: rollout for method, rollout in rollouts.items() if episode_id in rollout.episode_ids}
     if not predicted:
-        raise DataError(
-            "No prediction of this episode",
-            where=episode_id,
-            expected="an episode of the RolloutSet",
-            got=", ".join(rollouts) or "no RolloutSet",
-            next_step="list what was predicted with `worldline inspect <folder>`",
-        )
+        raise DataError("No prediction of this episode", where=episode_id, got=", ".join(rollouts) or "no RolloutSet")
     sigma_px_ref = SIGMA_PX_REFERENCE if tracks is None else tracks.sigma_px_ref
     drawn = None if tracks is None else tracks.tracks(episode_id)
     content = recording_content(predicted, episodes, drawn, episode_id, sigma_px_ref=sigma_px_ref)
@@ -328,14 +322,8 @@ def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequenc
         if stride * (clip.num_frames - 1) >= row.video_frames:
             raise DataError("Longer than its recording", where=name, expected=row.video_frames, got=clip.num_frames)
         stem = f"{safe_stem(row.task_family or 'task')}_episode_{number}"
-        predicted, true, first = (
-            output / folder / f"{stem}.{suffix}"
-            for folder, suffix in (
-                (f"{safe_stem(rollouts.method)}_sort", "mp4"),
-                ("gt_video", "mp4"),
-                ("gt_frames", "png"),
-            )
-        )
+        predicted = output / f"{safe_stem(rollouts.method)}_sort" / f"{stem}.mp4"
+        true, first = output / "gt_video" / f"{stem}.mp4", output / "gt_frames" / f"{stem}.png"
         with atomic_path(predicted) as temporary:
             shutil.copyfile(check_video_header(clip.path), temporary)
         frames = VideoFrames(episodes.clip(position, HEAD), stride)
