@@ -100,14 +100,6 @@ def test_a_truncated_video_names_file_and_frame_counts(tmp_path: Path) -> None:
     assert len(decode_frames(VideoClip(path, 24, 8.0, 0.0), [0, 1, 2])) == 3  # what is left is still readable
 
 
-def test_a_file_that_is_no_video_and_one_that_is_missing(tmp_path: Path) -> None:
-    (tmp_path / "text.mp4").write_text("not a video")
-    with pytest.raises(DataError, match=r"(?s)no video container.*text\.mp4"):
-        decode_video(tmp_path / "text.mp4", 3)
-    with pytest.raises(DataError, match="Video file is missing"):
-        decode_video(tmp_path / "absent.mp4", 3)
-
-
 def test_a_video_of_another_length_is_refused(tmp_path: Path) -> None:
     encode_video(tmp_path / "v.mp4", picture(0), 8)
     with pytest.raises(DataError, match=r"(?s)too many frames.*expected: 5 frames.*got: 12 frames"):

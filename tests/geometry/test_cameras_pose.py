@@ -51,7 +51,7 @@ def test_all_four_conventions_of_one_camera_project_alike() -> None:
         np.testing.assert_allclose(pose.T_base_camera, T_base_camera, atol=1e-12)
         uv, _ = project_points(points, K, pose.T_base_camera)
         np.testing.assert_allclose(uv, expected[:, 0], rtol=1e-8, atol=1e-7)
-    track = CameraTrack.from_pose("head", K, made[1], width=640, height=480)
+    track = CameraTrack("head", K, made[1].T_base_camera, width=640, height=480)
     np.testing.assert_allclose(track.T_base_camera, T_base_camera, atol=1e-12)
 
 

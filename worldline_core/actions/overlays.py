@@ -318,10 +318,16 @@ def overlay_clip(
         DataError: the tracks have none of these views.
     """
     columns: dict[str, Frames] = {}
-    for view in tracks.views:
-        if view in frames:
-            label = view_name(view) + (f"  ·  {title}" if title and not columns else "")
-            columns[label] = _drawn(frames[view], tracks, view, tile_height, style)
+    for view in [view for view in tracks.views if view in frames]:
+        images = frames[view]
+        shape = min(len(images), tracks.num_frames), *scaled_size(images.shape[1], images.shape[2], tile_height), 3
+
+        def draw(images: Frames = images, view: str = view, count: int = shape[0]) -> Iterator[Picture]:
+            for n, frame in enumerate(islice(images, count)):
+                yield draw_overlay(frame, tracks, n, view, tile_height=tile_height, style=style)
+
+        label = view_name(view) + (f"  ·  {title}" if title and not columns else "")
+        columns[label] = MadeFrames(draw, shape, np.uint8)
     if not columns:
         raise DataError(
             "No view to draw",
@@ -332,23 +338,12 @@ def overlay_clip(
     return _with_legend(side_by_side(columns, tile_height=tile_height), tracks, fps, style)
 
 
-def _drawn(frames: Frames, tracks: EpisodeTracks, view: str, tile_height: int, style: OverlayStyle) -> Frames:
-    count = min(len(frames), tracks.num_frames)
-
-    def draw() -> Iterator[Picture]:
-        for n, frame in enumerate(islice(frames, count)):
-            yield draw_overlay(frame, tracks, n, view, tile_height=tile_height, style=style)
-
-    height, width = scaled_size(frames.shape[1], frames.shape[2], tile_height)
-    return MadeFrames(draw, (count, height, width, 3), np.uint8)
-
-
 def _with_legend(rows: Iterator[Picture], tracks: EpisodeTracks, fps: float, style: OverlayStyle) -> Iterator[Picture]:
     for n, row in enumerate(rows):
-        note = f"frame {n}  ·  {n / fps:.2f} s"
         legend = legend_strip(
-            tracks.arms, row.shape[1], note=note, outline=style.outline, ink=STRIP_INK, paper=STRIP_PAPER
-        )
+            tracks.arms, row.shape[1], note=f"frame {n}  ·  {n / fps:.2f} s", outline=style.outline, ink=STRIP_INK,
+            paper=STRIP_PAPER,
+        )  # fmt: skip
         whole = np.concatenate([row, legend], axis=0)
         yield np.ascontiguousarray(whole[: whole.shape[0] // 2 * 2, : whole.shape[1] // 2 * 2])
 

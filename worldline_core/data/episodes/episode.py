@@ -16,7 +16,7 @@ from pydantic import TypeAdapter
 
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.errors import DataError
-from worldline_core.geometry.cameras import CameraPose, ImageTransform
+from worldline_core.geometry.cameras import ImageTransform
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 NO_EMBODIMENT = "none"
@@ -52,11 +52,6 @@ class CameraTrack:
         shape = self.T_base_camera.shape
         if len(shape) != 3 or shape[1:] != (4, 4) or shape[0] < 1:
             raise DataError("Camera poses have a wrong shape", where=self.view, expected="(N or 1, 4, 4)", got=shape)
-
-    @classmethod
-    def from_pose(cls, view: str, K: np.ndarray, pose: CameraPose, *, width: int, height: int) -> CameraTrack:
-        """From a pose that says its convention; what every reader of foreign calibration uses."""
-        return cls(view, K, pose.T_base_camera, width, height)
 
     @property
     def moving(self) -> bool:

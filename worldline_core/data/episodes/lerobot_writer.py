@@ -88,7 +88,9 @@ def write_dataset(root: Path, episodes: Sequence[Episode], videos: Sequence[Mapp
             rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
     write_table_atomic(root / _EPISODES_PATH, pa.Table.from_pylist(rows))
     write_table_atomic(root / "meta" / "tasks.parquet", _tasks_table(instructions))
-    write_json_atomic(root / "meta" / "stats.json", as_json(_statistics(table, histograms)))
+    statistics = _statistics(table, histograms)
+    as_lists = {key: {name: v.tolist() for name, v in feature.items()} for key, feature in statistics.items()}
+    write_json_atomic(root / "meta" / "stats.json", as_lists)
     write_json_atomic(root / "meta" / "info.json", _info(episodes, videos[0], len(instructions)))
 
 
@@ -330,8 +332,3 @@ def image_statistics(histograms: Sequence[np.ndarray], num_frames: int) -> dict[
         channels[name] = np.array([levels[np.searchsorted(row, level)] for row in cumulative])
     shaped: dict[str, np.ndarray] = {name: value[:, None, None] for name, value in channels.items()}
     return shaped | {"count": np.array([num_frames], dtype=np.int64)}
-
-
-def as_json(statistics: dict[str, dict[str, np.ndarray]]) -> dict[str, Any]:
-    """Nested lists, for meta/stats.json."""
-    return {key: {name: value.tolist() for name, value in feature.items()} for key, feature in statistics.items()}

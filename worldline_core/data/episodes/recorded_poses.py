@@ -83,7 +83,7 @@ class RecordedCameras:
         Args:
             K: (3, 3) for images of `size` (height, width).
         """
-        self.tracks[view] = CameraTrack.from_pose(view, K, pose, width=size[1], height=size[0])
+        self.tracks[view] = CameraTrack(view, K, pose.T_base_camera, width=size[1], height=size[0])
         self._repairs[view] = pose.repair
         if lens is not None:
             self.lenses[view] = lens
