@@ -10,20 +10,7 @@ import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
-
-from tasks.execution.artifact_task import find_task
-from tasks.execution.command_line import exit_with_clear_errors
-from tests.evaluation.conftest import _write as write_world
-from worldline_core.config import StrictModel
-from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEvaluationConfig, VideoEvaluationConfig
-from worldline_core.evaluation.planning.evaluate_planning import SEALED_FILE
-from worldline_core.report.report import ReportConfig
-from worldline_core.rollout.rollout_config import CopyFirstFrameConfig, RolloutConfig
-from worldline_core.shipped import shipped_folder
-from worldline_core.store.store import Artifact, ArtifactStore
 
 SIZE = 2 << 20
 
@@ -90,54 +77,3 @@ def test_a_video_is_whole_or_an_error_however_little_space_is_left(
     assert set(said) == {"whole True", "full 28"}
     assert said[0] == "full 28"
     assert len(said) > 30
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Path]]:
-    """What each of the later steps reads, all of it on a disk with space."""
-    root = tmp_path_factory.mktemp("world")
-    recordings = write_world(root / "recordings", {"ep-0": True, "ep-1": False}, split="test", bank=None).inputs
-    bank = write_world(root / "bank", {"c-0": True, "c-1": False}, split="bank", bank="bank-0")
-    table = pa.table({"episode_id": list(bank.outcomes), "outcome": list(bank.outcomes.values())})
-    pq.write_table(table, bank.inputs["banks"] / SEALED_FILE)
-    scores = find_task("evaluate_video").run(ArtifactStore(root), CONFIGS["evaluate_video"], recordings).path
-    tokenizer = shipped_folder() / "models" / "tokenizer"
-    return {
-        "rollout": {"episodes": recordings["episodes"], "tracks": recordings["tracks"], "tokenizer": tokenizer},
-        "evaluate_video": recordings,
-        "evaluate_policy": recordings,
-        "evaluate_planning": bank.inputs,
-        "report": {"evaluate_video": scores, "rollout.good": recordings["rollouts.good"]},
-    }
-
-
-CONFIGS: dict[str, StrictModel] = {
-    "rollout": RolloutConfig(method="copy", sampler=CopyFirstFrameConfig(), num_frames=17),
-    "evaluate_video": VideoEvaluationConfig(segmenters=("colour",), resamples=100),
-    "evaluate_policy": PolicyEvaluationConfig(segmenter="colour", splits=("test",), resamples=100),
-    "evaluate_planning": PlanningConfig(segmenter="colour", budgets=(2,), runs=1, resamples=100),
-    "report": ReportConfig(),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("step", CONFIGS)
-def test_the_later_steps_end_with_one_message_and_the_same_command_continues(
-    step: str, disk: Path, tmp_path: Path, inputs: dict[str, dict[str, Path]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run(root: Path) -> Artifact:
-        return find_task(step).run(ArtifactStore(root), CONFIGS[step], inputs[step])
-
-    whole = run(tmp_path / "elsewhere")
-    (disk / step).mkdir()
-    capsys.readouterr()
-    for free in (0, 4096, sum(path.stat().st_size for path in whole.path.rglob("*") if path.is_file()) // 2):
-        leave(disk, free)
-        with pytest.raises(SystemExit):
-            exit_with_clear_errors(lambda: run(disk))
-        said = capsys.readouterr().err
-        assert "error: No space left" in said
-        assert "Traceback" not in said
-        assert not list((disk / step).glob("*/manifest.json"))
-    (disk / "fill").unlink()
-    assert run(disk).digest == whole.digest

@@ -38,7 +38,6 @@ from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 logger = logging.getLogger(__name__)
 
 OUTPUT_ROOT = Path("artifacts") / "calibration"
-TIME_TOLERANCE_FRAMES = 0.25
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName) 
         loaded = item.load()
         episode = loaded.episode
         check_values(episode)
-        check_times(episode, TIME_TOLERANCE_FRAMES)
+        check_times(episode)
         for camera in episode.cameras.values():
             check_camera(episode, camera)
         frames = {view: _images(loaded, view) for view in loaded.views}

@@ -50,9 +50,9 @@ Splits = Annotated[
 class LeakageConfig(StrictModel):
     """What to do when a scene that is learnt from looks like a scene that is tested on."""
 
-    action: Literal["report", "quarantine", "refuse", "off"] = Field(
+    action: Literal["report", "quarantine", "off"] = Field(
         default="report",
-        description="report: write it down; quarantine: take the learning scene out (scene_leak); refuse: stop",
+        description="report: write it down; quarantine: take the learning scene out (scene_leak)",
     )
     max_distance: int = Field(
         default=52, ge=0, le=256, description="most differing bits of 256 between first images of one scene"
@@ -95,10 +95,6 @@ class CurateConfig(StrictModel):
     )
     require_calibration: bool = Field(default=False, description="quarantine episodes with an uncalibrated view")
     min_frames: int = Field(default=2, ge=1)
-    joint_tolerance_rad: float = Field(default=0.05, ge=0)
-    time_tolerance_frames: float = Field(
-        default=0.25, gt=0, description="largest distance of a frame from its rate's grid"
-    )
     video_mode: VideoMode = Field(
         default="auto",
         description="auto: where neither size, rate nor lens changes, encoded videos are copied as they are, with their own "

@@ -17,6 +17,9 @@ from worldline_core.geometry.embodiment import Embodiment, check_embodiment_name
 MAX_JOINT_RAD = 4 * np.pi
 """No joint of a manipulator turns further; larger numbers are degrees or encoder ticks."""
 _GRIPPER_MARGIN = 0.05
+_JOINT_TOLERANCE_RAD = 0.05
+_TIME_TOLERANCE_FRAMES = 0.25
+"""Largest distance of a frame from its place on the grid of its rate."""
 
 
 def check_episode(config: CurateConfig, loaded: LoadedEpisode) -> None:
@@ -27,8 +30,8 @@ def check_episode(config: CurateConfig, loaded: LoadedEpisode) -> None:
     faults: list[RejectedInputError] = []
     for check in (
         partial(check_lengths, loaded),
-        partial(check_times, episode, config.time_tolerance_frames),
-        partial(check_joints, episode, config.joint_tolerance_rad),
+        partial(check_times, episode),
+        partial(check_joints, episode),
         *(partial(check_camera, episode, camera) for camera in episode.cameras.values()),
         partial(check_views, config, loaded),
     ):
@@ -61,18 +64,11 @@ def check_views(config: CurateConfig, loaded: LoadedEpisode) -> None:
             where=where,
             expected=", ".join(missing),
             got=", ".join(loaded.views),
-            evidence={"missing": missing, "found": list(loaded.views)},
         )
     uncalibrated = [view for view in wanted if view not in episode.cameras]
     if config.require_calibration and uncalibrated:
-        raise RejectedInputError(
-            "missing_calibration",
-            "View has no calibration",
-            where=where,
-            expected="K and T_base_camera of each view",
-            got="none for " + ", ".join(uncalibrated),
-            evidence={"views": uncalibrated},
-        )
+        got = "none for " + ", ".join(uncalibrated)
+        raise RejectedInputError("missing_calibration", "View has no calibration", where=where, got=got)
 
 
 def check_values(episode: Episode) -> None:
@@ -84,29 +80,25 @@ def check_values(episode: Episode) -> None:
         check_finite(name, values, f"episode {episode.episode_id}")
 
 
-def check_embodiment(episode: Episode) -> None:
-    """Raises: RejectedInputError (unknown_embodiment) when nobody describes the robot, and the recording does not say so."""
-    if episode.state_kind == "none" or episode.embodiment == NO_EMBODIMENT:
-        return
-    try:
-        check_embodiment_name(episode.embodiment)
-    except ConfigError as error:
-        raise RejectedInputError(
-            "unknown_embodiment",
-            "Nobody describes the robot",
-            where=f"episode {episode.episode_id}",
-            expected=error.expected,
-            got=episode.embodiment,
-            next_step=error.next_step,
-        ) from error
-
-
-def check_joints(episode: Episode, tolerance_rad: float) -> None:
+def check_joints(episode: Episode) -> None:
     """Compare joints with the limits of the embodiment, where it is described.
 
     Raises: RejectedInputError (unknown_embodiment, joint_out_of_range, invalid_gripper, length_mismatch).
     """
-    check_embodiment(episode)
+    where = f"episode {episode.episode_id}"
+    described = episode.state_kind != "none" and episode.embodiment != NO_EMBODIMENT
+    if described:
+        try:
+            check_embodiment_name(episode.embodiment)
+        except ConfigError as error:
+            raise RejectedInputError(
+                "unknown_embodiment",
+                "The robot has no description",
+                where=where,
+                expected=error.expected,
+                got=episode.embodiment,
+                next_step=error.next_step,
+            ) from error
     if episode.state_kind != "joints":
         return
     names = episode.state_names or ()
@@ -116,31 +108,30 @@ def check_joints(episode: Episode, tolerance_rad: float) -> None:
         raise RejectedInputError(
             "joint_out_of_range",
             "Joint positions are no angles in radians",
-            where=f"episode {episode.episode_id}",
+            where=where,
             expected=f"at most {MAX_JOINT_RAD:.2f} rad",
             got=worst,
             next_step="declare the unit of the source",
             evidence={"max_abs_rad": worst},
         )
-    if episode.embodiment == NO_EMBODIMENT:
+    if not described:
         return
     embodiment = _embodiment(episode.embodiment)
     if embodiment.state_size != episode.state.shape[1]:
         raise RejectedInputError(
             "length_mismatch",
             "State has another size than the embodiment",
-            where=f"episode {episode.episode_id}, {episode.embodiment}",
+            where=f"{where}, {episode.embodiment}",
             expected=embodiment.state_size,
             got=episode.state.shape[1],
-            evidence={"expected": embodiment.state_size, "found": int(episode.state.shape[1])},
         )
-    outside = embodiment.outside_limits(episode.state, tolerance_rad)
+    outside = embodiment.outside_limits(episode.state, _JOINT_TOLERANCE_RAD)
     if outside.any():
         frame, column = (int(value) for value in np.argwhere(outside)[0])
         raise RejectedInputError(
             "joint_out_of_range",
             "Joint position is beyond its limit",
-            where=f"episode {episode.episode_id}, frame {frame}, {embodiment.state_names[column]}",
+            where=f"{where}, frame {frame}, {embodiment.state_names[column]}",
             expected="a position within the embodiment's limits",
             got=float(episode.state[frame, column]),
             evidence={
@@ -156,7 +147,7 @@ def check_joints(episode: Episode, tolerance_rad: float) -> None:
         raise RejectedInputError(
             "invalid_gripper",
             "Gripper opening is not in 0 closed .. 1 open",
-            where=f"episode {episode.episode_id}",
+            where=where,
             expected="0..1",
             got=f"{opening.min():.3f}..{opening.max():.3f}",
             evidence={"min": float(opening.min()), "max": float(opening.max())},
@@ -169,21 +160,17 @@ def _embodiment(name: str) -> Embodiment:
     return load_embodiment(name)
 
 
-def check_times(episode: Episode, tolerance: float) -> None:
-    """Raises: RejectedInputError (wrong_fps) when frame times leave the grid of the stated rate.
-
-    Args:
-        tolerance: largest distance of a frame from its place on the grid, in frames.
-    """
+def check_times(episode: Episode) -> None:
+    """Raises: RejectedInputError (wrong_fps) when frame times leave the grid of the stated rate."""
     grid = np.arange(episode.num_frames) / episode.fps
     off = np.abs(episode.timestamps - episode.timestamps[0] - grid) * episode.fps
-    if off.max() > tolerance:
+    if off.max() > _TIME_TOLERANCE_FRAMES:
         steps = np.diff(episode.timestamps)
         raise RejectedInputError(
             "wrong_fps",
             "Frame times do not follow the stated rate",
             where=f"episode {episode.episode_id}",
-            expected=f"{episode.fps} fps within {tolerance} frames",
+            expected=f"{episode.fps} fps within {_TIME_TOLERANCE_FRAMES} frames",
             got=f"{off.max():.2f} frames off; median step {np.median(steps) * 1e3:.2f} ms",
             evidence={
                 "stated_fps": float(episode.fps),

@@ -26,7 +26,6 @@ from worldline_core.geometry.cameras import ImageTransform
 
 _KEPT_SPLITS = ("ood_test", "bank")
 """Splits that stay where a source declares them."""
-PRIMARY_VIEW_REASON = "primary_view_reason"
 TRIMMED = "trimmed"
 """Noted in the conventions of an episode that `trim` shortened: how many frames states and videos had."""
 MAX_TRIMMED_FRAMES = 1
@@ -96,7 +95,6 @@ def prepare_episode(
             where=f"episode {episode.episode_id}",
             expected=f"at least {config.min_frames}",
             got=episode.num_frames,
-            evidence={"frames": episode.num_frames},
         )
     frames = {
         view: RecordedView(
@@ -181,21 +179,17 @@ def drawn_split(scene: str, splits: SceneSplits) -> Split:
 def with_primary_view(
     episode: Episode, configured: str | None, views: Sequence[str], thumbnails: Mapping[str, ViewThumbnails]
 ) -> Episode:
-    """The episode with the view that stands for it in single-view training (Stage I), and in its conventions why.
+    """The episode with the view that represents it in single-view training (Stage I).
 
     In this order: the configured view, the one that the source declares, the head's, the one that shows most motion (of
     equal ones the last by name). An episode that lacks the configured view stays out of Stage I, as the configuration
     asks.
     """
-    if configured is not None:
-        view, why = configured, "configured"
-    elif episode.primary_view in views:
+    if configured is None and episode.primary_view in views:
         return episode
-    elif "head" in views:
-        view, why = "head", "head"
-    else:
-        view, why = max(views, key=lambda view: (motion(thumbnails[view]), view)), "most_motion"
-    return replace(episode, primary_view=view, conventions={**episode.conventions, PRIMARY_VIEW_REASON: why})
+    head = "head" if "head" in views else None
+    most_motion = max(views, key=lambda view: (motion(thumbnails[view]), view))
+    return replace(episode, primary_view=configured or head or most_motion)
 
 
 def motion(view: ViewThumbnails) -> float:

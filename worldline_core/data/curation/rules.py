@@ -59,8 +59,7 @@ def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> tuple
     Returns:
         Episodes to take out, in listed order, and the pairs of scenes that look like one across the split.
 
-    Raises: DataError when a scene is both learnt from and tested on, or scenes leak and
-        the configuration refuses that.
+    Raises: DataError when a scene is both learnt from and tested on.
     """
     prints = [Fingerprint.from_json(part["fingerprint"]) for part in parts]
     rows: dict[int, QuarantineRow] = {}
@@ -91,8 +90,6 @@ def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> tuple
         if (part := parts[position])["primary_view"] in prints[position].views
     ]
     leaks = find_scene_leaks(views, config.leakage)
-    if leaks and config.leakage.action == "refuse":
-        raise _refusal(leaks)
     if config.leakage.action == "quarantine":
         rows.update(_leaking(parts, kept, leaks))
     return [rows[position] for position in sorted(rows)], leaks
@@ -143,17 +140,6 @@ def _leaking(parts: Sequence[Described], kept: Sequence[int], leaks: Sequence[Sc
     return rows
 
 
-def _refusal(leaks: Sequence[SceneLeak]) -> DataError:
-    named = [f"{leak.learning_scene} ~ {leak.testing_scene} ({leak.distance} bits)" for leak in leaks]
-    return DataError(
-        "Scenes that are learnt from look like scenes that are tested on",
-        where="curate.leakage",
-        expected="no two scenes across the split whose first images are alike",
-        got=", ".join(named[:10]) + (" ..." if len(named) > 10 else ""),
-        next_step="give both names one split in curate.splits, or set curate.leakage.action to quarantine or report",
-    )
-
-
 @dataclass(frozen=True)
 class SceneView:
     """What the search sees of an episode. `first` is (4,) uint64, 256 bits of the primary view's first image."""
@@ -193,9 +179,5 @@ def find_scene_leaks(seen: Sequence[SceneView], config: LeakageConfig) -> list[S
                 continue
             leak = SceneLeak(other.scene, tested.scene, other.episode_id, tested.episode_id, int(distances[index]))
             known = best.setdefault((other.scene, tested.scene), leak)
-            best[other.scene, tested.scene] = min(known, leak, key=_by_distance)
+            best[other.scene, tested.scene] = min(known, leak, key=lambda leak: (leak.distance, leak.learning_episode))
     return sorted(best.values(), key=lambda leak: (leak.testing_scene, leak.learning_scene))
-
-
-def _by_distance(leak: SceneLeak) -> tuple[int, str, str]:
-    return leak.distance, leak.learning_episode, leak.testing_episode

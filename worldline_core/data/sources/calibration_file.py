@@ -27,7 +27,7 @@ from worldline_core.config import StrictModel, read_yaml
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose
 from worldline_core.data.episodes.source import LensConfig
 from worldline_core.data.guards.plain_files import read_json, validated
-from worldline_core.data.guards.rejection import RejectedInputError, check_shape
+from worldline_core.data.guards.rejection import RejectedInputError, check_shape, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import CameraAxes, Extrinsics, ImageTransform
@@ -75,27 +75,18 @@ def read_calibration(path: AnyPath) -> CalibrationFile:
         unknown or missing, or a value of another kind).
     """
     try:
-        content = read_json(path) if path.suffix.lower() == ".json" else _yaml(path)
+        file = regular_file(path, "Calibration file")
     except RejectedInputError as error:
         if error.reason != "missing_file":
             raise
+        next_step = "write the file, or leave `calibration` out: such episodes then serve action-free training"
         raise RejectedInputError(
-            "missing_calibration",
-            "Calibration file is missing",
-            where=str(path),
-            next_step="write the file, or leave `calibration` out: such episodes then serve action-free training",
+            "missing_calibration", "Calibration file is missing", where=path, next_step=next_step
         ) from error
+    faults = (ConfigError, OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError)
+    with unreadable("Calibration file is no YAML", path, faults):
+        content = read_json(path) if path.suffix.lower() == ".json" else read_yaml(file)
     return validated(CalibrationFile, content, path, "Calibration file")
-
-
-def _yaml(path: AnyPath) -> Any:
-    file = regular_file(path, "Calibration file")
-    try:
-        return read_yaml(file)
-    except (ConfigError, OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
-        raise RejectedInputError(
-            "unreadable", "Calibration file is no YAML", where=str(path), got=str(error)
-        ) from error
 
 
 def add_calibrated_view(
@@ -141,19 +132,11 @@ def add_calibrated_view(
 def _matrices(listed: list[Any], num_frames: int, where: str) -> np.ndarray:
     try:
         values = np.asarray(listed, dtype=np.float64)
+        values = values.reshape(-1, 4, 4) if values.shape[-2:] == (4, 4) else values.reshape(0, 4, 4)
     except (ValueError, TypeError, OverflowError) as error:
         raise RejectedInputError(
             "invalid_extrinsics", "Camera matrices have a wrong shape", where=where, expected="(4, 4)", got=str(error)
         ) from error
-    values = values[None] if values.ndim == 2 else values
-    if values.shape[1:] != (4, 4):
-        raise RejectedInputError(
-            "invalid_extrinsics",
-            "Camera matrices have a wrong shape",
-            where=where,
-            expected="(4, 4), or (N, 4, 4) with one per frame",
-            got=values.shape,
-        )
     if len(values) not in (1, num_frames):
         raise RejectedInputError(
             "length_mismatch",
