@@ -1,14 +1,18 @@
 from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("mujoco")
 
+from worldline_core.config import load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import read_clip
 from worldline_core.recorder.attempts import BankGrid, RecordPoliciesConfig, record_policies
 from worldline_core.recorder.controllers import ScriptedPolicy, plan_waypoints
+from worldline_core.recorder.record import RecordConfig, Variety, plan_jobs
 from worldline_core.recorder.scene import sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder
 
@@ -73,6 +77,30 @@ def test_mistakes_set_the_share_of_wrong_plans(recorder):
     assert aims(0.0) == 1.0
     assert aims(1.0) == 0.0
     assert 0.3 < aims(0.5) < 0.7
+
+
+def test_variety_is_drawn_within_its_limits_and_changes_nothing_else():
+    path = Path(__file__).resolve().parents[2] / "configs/recording/small_world_varied.yaml"
+    config = load_config(RecordConfig, path=path)
+    jobs = plan_jobs(config)
+    policies = [job.policy for job in jobs]
+    assert None not in policies
+    assert {policy.mistakes for policy in policies} == {None}  # pyright: ignore[reportOptionalMemberAccess]
+    noise, delay, gripper = (
+        np.array([getattr(policy, name) for policy in policies])
+        for name in ("noise_m", "delay_frames", "gripper_delay_frames")
+    )
+    assert (noise == 0).mean() == pytest.approx(0.5, abs=0.1)
+    assert 0.04 < noise.max() <= 0.05
+    assert set(delay) == set(range(17))
+    assert set(gripper) == set(range(-8, 7))
+    plain = plan_jobs(config.model_copy(update={"variety": None}))
+    assert [replace(job, policy=None) for job in jobs] == plain
+    half = Variety(share=0.5, noise_m=0.01, delay_frames=0)
+    drawn = [half.draw(np.random.default_rng(number)) for number in range(200)]
+    assert 70 < sum(policy is None for policy in drawn) < 130
+    with pytest.raises(ValueError, match="earliest <= latest"):
+        Variety(share=1, noise_m=0, delay_frames=0, gripper_delay_frames=(3, -3))
 
 
 @pytest.mark.slow

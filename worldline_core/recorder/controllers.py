@@ -64,14 +64,15 @@ class ScriptedPolicy(StrictModel):
     """A controller that knows the right plan and carries it out badly.
 
     Attributes:
-        mistakes: share of the episodes whose plan is wrong (missed by a hand's width, dropped, wrong place, ..).
+        mistakes: share of the episodes whose plan is wrong (missed by a hand's width, dropped, wrong place, ..); ``None``:
+            that of the task.
         noise_m: standard deviation of each episode's error of aim, along x and along y.
         bias_m: error of aim of all episodes, along x and along y of the robot's base.
         delay_frames: everything happens this many frames late.
         gripper_delay_frames: the gripper moves this many frames after the arm; below zero before it.
     """
 
-    mistakes: float = Field(default=0.0, ge=0, le=1)
+    mistakes: float | None = Field(default=0.0, ge=0, le=1)
     noise_m: float = Field(default=0.0, ge=0, le=0.2)
     bias_m: tuple[Bias, Bias] = (0.0, 0.0)
     delay_frames: int = Field(default=0, ge=0, le=32)

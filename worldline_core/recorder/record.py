@@ -21,6 +21,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.errors import DataError
 from worldline_core.progress import Progress
 from worldline_core.recorder.bodies import BODIES
+from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene import TASKS, Family
@@ -66,6 +67,46 @@ class RecordGroup(StrictModel):
         return self
 
 
+class Variety(StrictModel):
+    """Ordinary controllers carried out worse than planned: near misses, late starts, a gripper at the wrong time.
+
+    Each of the three befalls half of these episodes, by an amount drawn evenly up to the limit.
+
+    Attributes:
+        share: of all episodes.
+        noise_m: largest standard deviation of the error of aim, along x and along y.
+        delay_frames: latest start.
+        gripper_delay_frames: earliest and latest gripper, against the arm.
+    """
+
+    share: float = Field(ge=0, le=1)
+    noise_m: float = Field(ge=0, le=0.2)
+    delay_frames: int = Field(ge=0, le=32)
+    gripper_delay_frames: tuple[int, int] = (0, 0)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Variety:
+        earliest, latest = self.gripper_delay_frames
+        if not -32 <= earliest <= latest <= 32:
+            raise ValueError(f"gripper_delay_frames: -32 <= earliest <= latest <= 32 wanted, got {earliest}, {latest}")
+        return self
+
+    def draw(self, random: np.random.Generator) -> ScriptedPolicy | None:
+        """Draw the faults of one episode; None where it is carried out as planned."""
+        if random.uniform() >= self.share:
+            return None
+        noisy, late, gripper_off = random.uniform(size=3) < 0.5
+        earliest, latest = self.gripper_delay_frames
+        noise = random.uniform(0, self.noise_m)
+        delay, gripper = random.integers(self.delay_frames + 1), random.integers(earliest, latest + 1)
+        return ScriptedPolicy(
+            mistakes=None,
+            noise_m=float(noise * noisy),
+            delay_frames=int(delay * late),
+            gripper_delay_frames=int(gripper * gripper_off),
+        )
+
+
 class RecordConfig(StrictModel):
     """Episodes to record.
 
@@ -76,6 +117,7 @@ class RecordConfig(StrictModel):
         video_crf: x264 quality of the stored videos.
         defects: per embodiment, how many of the first training recordings are spoiled in which way (see
             ``defects.py``); what was done to which episode is written to ``injected_defects.json``.
+        variety: carry some episodes out worse than planned.
     """
 
     groups: tuple[RecordGroup, ...] = Field(min_length=1)
@@ -84,6 +126,7 @@ class RecordConfig(StrictModel):
     workers: int = Field(default=2, ge=1, le=64)
     video_crf: int = Field(default=18, ge=0, le=51)
     defects: dict[Embodiment, dict[Defect, int]] = Field(default_factory=dict)
+    variety: Variety | None = None
 
     @model_validator(mode="after")
     def _enough_to_spoil(self) -> RecordConfig:
@@ -116,6 +159,7 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
                 entropy=entropy,
                 defect=left.pop(0) if left else None,
                 held_out_camera=group.held_out_camera,
+                policy=config.variety and config.variety.draw(np.random.default_rng((*entropy, 2))),
             )
             jobs.append((round(10 * position / group.count), job))
     # A tenth of every group in turn, so that a worker keeps its compiled model for a while.

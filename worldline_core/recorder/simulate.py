@@ -69,6 +69,7 @@ class Job:
     entropy: tuple[int, ...]
     defect: str | None = None
     held_out_camera: bool = False
+    policy: ScriptedPolicy | None = None
 
 
 @dataclass(frozen=True)
@@ -283,7 +284,7 @@ class EpisodeRecorder:
         scene_id = str(random.choice(scenes))
         for _ in range(50):
             layout = sample_layout(self.scene.robot, job.family, random)
-            motion = self.move(layout, random, num_frames)
+            motion = self.move(layout, random, num_frames, job.policy)
             if motion is not None:
                 return layout, motion, scene_id, random
         raise DataError(
