@@ -3,6 +3,7 @@ does the same with thousands of recordings)."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 
 pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
+import tools.corrupted.__main__ as command
 from tools.corrupted import lerobot_v21
+from tools.corrupted.attacks import ATTACKS
 from tools.corrupted.corpus import confusion, is_right, outcomes, write_corpus
 from tools.corrupted.labels import Label
 from worldline_core.data.curation.curate import curate
@@ -65,3 +68,26 @@ def test_an_outcome_counts_only_at_the_stage_that_has_to_find_it() -> None:
     clean = Label("e", "layout", "clean")
     assert is_right(clean, Outcome("stage2", "missing_view"))
     assert not is_right(clean, Outcome("filter", "static"))
+
+
+def test_the_table_of_attacks_names_a_wrong_ending(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    playlist = next(attack for attack in ATTACKS if attack.name == "a playlist")
+    sound = replace(playlist, name="nothing", change=lambda _: None, endings=("read",))
+    for attacks, right in (((playlist, sound), True), ((replace(playlist, endings=("read",)), sound), False)):
+        monkeypatch.setattr(command, "ATTACKS", attacks)
+        assert command.report_attacks(tmp_path / str(right)) is right
+        rows = capsys.readouterr().out.splitlines()[2:]
+        assert [row.split(" | ")[2] for row in rows] == ["unreadable", "read"]
+        assert [row.split(" | ")[4] for row in rows] == [f"{right} |", "True |"]
+
+
+@pytest.mark.slow
+def test_the_command_runs_all_damage_and_all_attacks(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        command.main(["--each", "1", "--seed", "5"])
+    printed = capsys.readouterr().out
+    assert ended.value.code == 0, printed
+    assert printed.count("100%") >= 50
+    assert all(f"| {attack.layout} | {attack.name} |" in printed for attack in ATTACKS)
