@@ -36,6 +36,7 @@ from worldline_core.data.guards.plain_files import decode_image
 from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.data.mcap.messages import IMAGE_KINDS, EncodedImage, Kind, MessageDecoder, RawImage
+from worldline_core.data.video.picture import Picture
 
 # What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
 _DAMAGE = (
@@ -399,7 +400,7 @@ def _picture(frame: av.VideoFrame, where: str) -> tuple[int, np.ndarray]:
     check_image_size(frame.width, frame.height, where)
     if frame.is_corrupt or frame.pts is None:
         raise _lost_frame(f"{where}, frame {frame.pts}")
-    return int(frame.pts), frame.to_ndarray(format="rgb24")
+    return int(frame.pts), Picture(frame).rgb
 
 
 def _lost_frame(where: str) -> RejectedInputError:

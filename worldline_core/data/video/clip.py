@@ -18,17 +18,14 @@ import av.error
 import numpy as np
 from av.container import InputContainer
 from av.video.frame import VideoFrame
-from av.video.reformatter import ColorRange, VideoReformatter
+from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 
 from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import AnyPath, local_file, regular_file
+from worldline_core.data.video.picture import Picture
 from worldline_core.errors import DataError
 
-_LUMA_FIRST = frozenset(
-    ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "nv21", "gray", "yuv440p", "yuvj440p")
-)
-_FULL_RANGE = frozenset(("yuvj420p", "yuvj422p", "yuvj444p", "yuvj440p"))
 FRAME_TOLERANCE = 0.25
 """A decoded frame is the wanted one when their times differ by less than this share of a frame's duration."""
 _BOUNDED = {"max_pixels": str(MAX_PIXELS)}
@@ -69,43 +66,6 @@ class VideoClip:
     def start_time(self) -> float:
         """Presentation time [s] of the clip's frame 0, where frames are found by time."""
         return (self.from_time or 0.0) + self.skip / self.fps
-
-
-class Picture:
-    """One decoded frame."""
-
-    def __init__(self, frame: VideoFrame) -> None:
-        self._frame = frame
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(height, width)."""
-        return self._frame.height, self._frame.width
-
-    @property
-    def full_range(self) -> bool:
-        """True if black is 0 and white 255 in `luma`, instead of 16 and 235."""
-        return self._frame.format.name in _FULL_RANGE or self._frame.color_range == ColorRange.JPEG
-
-    @property
-    def luma(self) -> np.ndarray:
-        """uint8 (H, W), a view into the decoder's memory where the format allows it."""
-        frame = self._frame
-        if frame.format.name not in _LUMA_FIRST:  # more than 8 bits, or no YUV at all
-            frame = frame.reformat(format="yuv420p", dst_color_range=self._frame.color_range)
-        plane = frame.planes[0]
-        rows = np.frombuffer(plane, dtype=np.uint8, count=plane.line_size * plane.height)
-        return rows.reshape(plane.height, plane.line_size)[:, : plane.width]
-
-    @property
-    def rgb(self) -> np.ndarray:
-        """uint8 (H, W, 3)."""
-        return self._frame.to_ndarray(format="rgb24")
-
-    @property
-    def damaged(self) -> bool:
-        """True if the decoder had to make up parts of it."""
-        return bool(self._frame.is_corrupt)
 
 
 _QUICKTIME = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp")
@@ -258,14 +218,14 @@ def read_clip(clip: VideoClip) -> Iterator[Picture]:
 
 
 def _counted(clip: VideoClip) -> Iterator[Picture]:
-    seen = 0
+    seen, reformatter = 0, VideoReformatter()
     expected = clip.file_frames if clip.file_frames is not None else clip.skip + clip.num_frames
     with named_break(clip, lambda: seen), open_video(clip.path) as (container, stream):
         for frame in container.decode(stream):
             if frame.pts is None:
                 continue
             if clip.skip <= seen < clip.skip + clip.num_frames:
-                yield Picture(frame)
+                yield Picture(frame, reformatter)
             seen += 1
             if clip.file_frames is None and seen == expected:
                 return
@@ -274,7 +234,7 @@ def _counted(clip: VideoClip) -> Iterator[Picture]:
 
 
 def _timed(clip: VideoClip) -> Iterator[Picture]:
-    found = 0
+    found, reformatter = 0, VideoReformatter()
     with named_break(clip, lambda: found), open_video(clip.path) as (container, stream):
         time_base = stream.time_base or Fraction(1, 1000)
         for frame in seek_before(container, stream, clip.start_time):
@@ -282,7 +242,7 @@ def _timed(clip: VideoClip) -> Iterator[Picture]:
                 continue
             number = (float(frame.pts * time_base) - clip.start_time) * clip.fps
             if round(number) == found and abs(number - found) < FRAME_TOLERANCE:
-                yield Picture(frame)
+                yield Picture(frame, reformatter)
                 found += 1
             if found == clip.num_frames:
                 return
@@ -370,7 +330,7 @@ class FrameDecoder:
                     continue
                 if late > FRAME_TOLERANCE:
                     break
-                yield self._reformatter.reformat(frame, format="rgb24").to_ndarray()
+                yield Picture(frame, self._reformatter).rgb
                 found += 1
                 if found == len(times):
                     return

@@ -64,8 +64,8 @@ def _are_lengths(data: bytes) -> bool:
 
 PixelFormat = Literal["yuv420p", "yuv444p"]
 
-# BT.601, limited range: what FFmpeg assumes for untagged video of standard definition, hence what every reader
-# of these files will invert. Rows give Y, U, V of an RGB value in 0..255.
+# BT.601, limited range, at every size, and stated in the file: readers that ignore what it states (OpenCV) assume it too.
+# Rows give Y, U, V of an RGB value in 0..255.
 _RGB_TO_YUV = np.array(
     [[65.481, 128.553, 24.966], [-37.797, -74.203, 112.0], [112.0, -93.786, -18.214]], dtype=np.float32
 ) / np.float32(255.0)
@@ -175,6 +175,8 @@ class VideoEncoder:
             "threads": "1",
             "x264-params": X264_PARAMETERS,
             "colorspace": "smpte170m",
+            "color_primaries": "bt709",
+            "color_trc": "bt709",
             "color_range": "tv",
         }
         self._stream = stream

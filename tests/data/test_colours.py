@@ -1,0 +1,190 @@
+"""Colours of videos by their matrix and range, in every path: against patches of known colour, and against `ffmpeg`.
+
+Planes are computed here from the luma coefficients that the standards state, so nothing of this project or of libswscale
+takes part in making a video.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap.file import _decoded  # pyright: ignore[reportPrivateUsage]
+from worldline_core.data.mcap.messages import EncodedImage
+from worldline_core.data.video.clip import FrameDecoder, VideoClip, open_video, read_clip
+from worldline_core.data.video.encoder import encode_video
+from worldline_core.exports.export import export
+
+FRAMES, RATE, TOLERANCE = 4, 10, 3
+LUMA = {"bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722), "bt2020": (0.2627, 0.0593)}
+"""Weights of red and blue: BT.601, BT.709 and BT.2020, each section 3."""
+TAGS = {"bt601": 6, "bt709": 1, "bt2020": 9, "unspecified": 2, "ycgco": 8}
+"""ITU-T H.273, table 4."""
+CODECS = {
+    "h264": ("libx264", "yuv420p", {"crf": "2", "bf": "2"}),
+    "hevc10": ("libx265", "yuv420p10le", {"crf": "2", "x265-params": "log-level=none"}),
+    "av1": ("libsvtav1", "yuv420p10le", {"crf": "4", "preset": "8", "svtav1-params": "lp=1"}),
+}
+PATCHES = np.array(
+    [[(200, 30, 40), (30, 180, 60), (40, 60, 210)], [(230, 220, 40), (120, 120, 120), (20, 200, 220)]], np.uint8
+)
+
+
+@dataclass(frozen=True)
+class Made:
+    """Stated is the tag in the file, matrix what the planes have."""
+
+    codec: str = "h264"
+    matrix: str = "bt709"
+    full: bool = False
+    stated: str | None = None
+    side: int = 48
+
+    def picture(self) -> np.ndarray:
+        return PATCHES.repeat(self.side, 0).repeat(self.side, 1)
+
+    def write(self, path: Path) -> Path:
+        encoder, pixel_format, options = CODECS[self.codec]
+        picture = self.picture()
+        red, blue = LUMA[self.matrix]
+        rgb = picture.astype(float) / 255
+        luma = rgb @ (red, 1 - red - blue, blue)
+        chroma = ((rgb[..., 2] - luma) / (2 - 2 * blue), (rgb[..., 0] - luma) / (2 - 2 * red))
+        scales = (0, 255, 255) if self.full else (16, 219, 224)
+        planes = [scales[0] + scales[1] * luma, *(128 + scales[2] * plane for plane in chroma)]
+        yuv = np.clip(np.rint(planes), 0, 255).astype(np.uint8)
+        with av.open(str(path), "w", format="mp4") as out:
+            stream = out.add_stream(encoder, rate=RATE, options=options)
+            stream.height, stream.width, stream.pix_fmt = *picture.shape[:2], pixel_format
+            context = stream.codec_context
+            context.thread_count = 1
+            context.colorspace = TAGS[self.stated or self.matrix]
+            context.color_range = 0 if self.stated == "unspecified" else 2 if self.full else 1
+            for number in range(FRAMES):
+                frame = av.VideoFrame.from_ndarray(yuv, format="yuv444p").reformat(format=pixel_format)
+                frame.colorspace, frame.color_range = context.colorspace, context.color_range
+                frame.pts, frame.time_base = number, Fraction(1, RATE)
+                out.mux(stream.encode(frame))
+            out.mux(stream.encode(None))
+        return path
+
+
+CASES = [Made(codec, matrix, full) for codec in CODECS for matrix in LUMA for full in (False, True)]
+
+
+def off(found: np.ndarray) -> int:
+    """Largest difference to the patches in their middle, where nothing is smeared."""
+    height, width = found.shape[-3] // 2, found.shape[-2] // 3
+    centres = found[..., height // 2 :: height, width // 2 :: width, :]
+    return int(np.abs(centres.astype(int) - PATCHES).max())
+
+
+def by_ffmpeg(path: Path, *options: str) -> np.ndarray | None:
+    if shutil.which("ffmpeg") is None:
+        return None
+    with av.open(str(path)) as container:
+        size = container.streams.video[0].height, container.streams.video[0].width
+    command = ["ffmpeg", "-v", "error", "-i", str(path), *options, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run(command, capture_output=True, check=True).stdout
+    return np.frombuffer(raw, np.uint8).reshape(-1, *size, 3)
+
+
+def curated(folder: Path, out: Path, **changes: Any) -> EpisodeSet:
+    source = {"kind": "video_folder", "path": str(folder), "name": "web", "split": "train"}
+    curate(CurateConfig.model_validate({"sources": [source], **changes}), {}, out)
+    return EpisodeSet.open(out)
+
+
+@pytest.mark.parametrize("made", CASES, ids=str)
+def test_pictures_have_the_colours_that_ffmpeg_shows(tmp_path: Path, made: Made) -> None:
+    path = made.write(tmp_path / "a.mp4")
+    clip = VideoClip.whole_file(path, FRAMES, RATE)
+    pictures = list(read_clip(clip))
+    found = np.stack([picture.rgb for picture in pictures])
+    assert off(found) <= TOLERANCE
+    decoder = FrameDecoder()
+    assert np.array_equal(np.stack(list(decoder.frames(clip, range(FRAMES)))), found)  # what training reads
+    decoder.close()
+    shown = by_ffmpeg(path)
+    assert shown is None or np.abs(shown.astype(int) - found).max() <= TOLERANCE
+    # What filters look at: the same light, whatever the depth and the range.
+    red, blue = LUMA[made.matrix]
+    light = PATCHES @ (red, 1 - red - blue, blue)
+    luma = pictures[0].luma[made.side // 2 :: made.side, made.side // 2 :: made.side].astype(float)
+    assert np.abs((luma if pictures[0].full_range else (luma - 16) * 255 / 219) - light).max() <= TOLERANCE
+
+
+@pytest.mark.parametrize("made", CASES, ids=str)
+def test_colours_stay_through_curation_and_export(tmp_path: Path, made: Made) -> None:
+    (tmp_path / "raw").mkdir()
+    made.write(tmp_path / "raw" / "a.mp4")
+    copied = curated(tmp_path / "raw", tmp_path / "copied")
+    resized = curated(tmp_path / "raw", tmp_path / "resized", image_size=(96, 120))
+    for number, episodes in enumerate((copied, resized)):
+        assert off(episodes.frames(0, "head")) <= TOLERANCE
+        path = Path(str(episodes.clip(0, "head").path))
+        shown = by_ffmpeg(path)
+        assert shown is None or off(shown) <= TOLERANCE
+        export(episodes.root, tmp_path / f"out{number}", formats=("lerobot",))
+        exported = EpisodeSet.open(tmp_path / f"out{number}")
+        assert off(exported.frames(0, "head")) <= TOLERANCE
+
+
+@pytest.mark.parametrize(("lines", "matrix"), [(240, "bt601"), (716, "bt601"), (720, "bt709"), (1080, "bt709")])
+def test_a_matrix_that_is_not_stated_follows_from_the_number_of_lines(tmp_path: Path, lines: int, matrix: str) -> None:
+    made = Made("h264", matrix, stated="unspecified", side=lines // 2)
+    clip = VideoClip.whole_file(made.write(tmp_path / "a.mp4"), FRAMES, RATE)
+    assert off(next(read_clip(clip)).rgb) <= TOLERANCE
+
+
+@pytest.mark.parametrize("codec", ["h264", "hevc10"])
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("matrix", LUMA)
+def test_video_messages_have_their_colours(tmp_path: Path, codec: str, full: bool, matrix: str) -> None:
+    path = Made(codec, matrix, full).write(tmp_path / "a.mp4")
+    kind = {"h264": "h264", "hevc10": "h265"}[codec]
+
+    def messages() -> Iterator[tuple[int, EncodedImage]]:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            annex_b = av.bitstream.BitStreamFilterContext(f"{kind.replace('h265', 'hevc')}_mp4toannexb", stream)
+            packets = [packet for source in container.demux(stream) for packet in annex_b.filter(source)]
+        for number, packet in enumerate(packets):
+            yield number, EncodedImage("", bytes(packet), kind)
+
+    found = [image for _, image in _decoded(messages(), "here")]
+    assert found
+    assert max(map(off, found)) <= TOLERANCE
+
+
+def test_a_matrix_that_cannot_be_converted_is_named(tmp_path: Path) -> None:
+    path = Made("h264", "bt709", stated="ycgco").write(tmp_path / "a.mp4")
+    with pytest.raises(RejectedInputError, match="matrix coefficients 8"):
+        _ = next(read_clip(VideoClip(path, FRAMES, RATE))).rgb
+
+
+@pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv444p"])
+def test_what_is_encoded_states_its_colours(tmp_path: Path, pixel_format: Any) -> None:
+    encode_video(tmp_path / "a.mp4", [Made().picture()] * 3, RATE, pixel_format=pixel_format)
+    with open_video(tmp_path / "a.mp4") as (container, stream):
+        context = stream.codec_context
+        assert (context.colorspace, context.color_range) == (6, 1)  # BT.601, limited
+        assert (context.color_primaries, context.color_trc) == (1, 1)  # BT.709's, which are those of sRGB
+        assert off(next(container.decode(stream)).to_ndarray(format="rgb24")) <= TOLERANCE
+    shown = by_ffmpeg(tmp_path / "a.mp4")
+    assert shown is None or off(shown) <= TOLERANCE
+    assert cv2.VideoCapture(str(tmp_path / "a.mp4")).isOpened()
