@@ -8,9 +8,9 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -269,13 +269,65 @@ def test_two_commands_do_not_write_into_one_folder(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["run"]
 
 
-def test_a_step_whose_folder_leads_out_of_the_store_is_refused(tmp_path: Path) -> None:
+def make_lock_a_folder(step: Path, key: str) -> None:
+    (step / f".{key}.lock").mkdir(parents=True)
+
+
+def make_partial_a_file(step: Path, key: str) -> None:
+    step.mkdir(parents=True)
+    (step / f"{key}.partial").write_text("")
+
+
+def make_step_a_file(step: Path, key: str) -> None:
+    step.parent.mkdir()
+    step.write_text(key)
+
+
+def make_artifact_a_file(step: Path, key: str) -> None:
+    step.mkdir(parents=True)
+    (step / key).write_text("")
+
+
+def make_step_a_link(step: Path, key: str) -> None:
+    (step.parent.parent / key).mkdir()
+    step.parent.mkdir()
+    step.symlink_to(step.parent.parent / key, target_is_directory=True)
+
+
+def make_step_a_circle(step: Path, key: str) -> None:
+    step.mkdir(parents=True)
+    (step / key).symlink_to(step / key)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        make_lock_a_folder,
+        make_partial_a_file,
+        make_step_a_file,
+        make_artifact_a_file,
+        make_step_a_link,
+        make_step_a_circle,
+    ],
+)
+def test_an_odd_store_ends_in_one_message(tmp_path: Path, make: Callable[[Path, str], None]) -> None:
     store = ArtifactStore(tmp_path / "store")
-    store.root.mkdir()
-    (tmp_path / "disk").mkdir()
-    (store.root / "count").symlink_to(tmp_path / "disk", target_is_directory=True)
-    with pytest.raises(ArtifactError, match="link out of the store"):
+    make(store.root / "count", store.key("count", 1, CountConfig(), {}))
+    with pytest.raises(ArtifactError, match=r"cannot be used|link out of the store") as caught:
         store.run("count", 1, count, CountConfig(), {})
+    assert str(caught.value.where).startswith(str(store.root / "count"))
+    assert caught.value.next_step
+
+
+def test_missing_rights_of_a_store_end_in_one_message_but_those_of_a_source_do_not_name_it(tmp_path: Path) -> None:
+    def refuse(path: Path) -> NoReturn:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    store = ArtifactStore(tmp_path / "store")
+    with pytest.raises(ArtifactError, match=r"0\.txt[\s\S]*Permission denied"):
+        store.run("count", 1, lambda _config, _inputs, output: refuse(output / "0.txt"), CountConfig(), {})
+    with pytest.raises(PermissionError):
+        store.run("count", 1, lambda *_: refuse(tmp_path / "recording.mp4"), CountConfig(), {})
 
 
 def test_a_read_only_store_serves_finished_artifacts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -284,10 +336,12 @@ def test_a_read_only_store_serves_finished_artifacts(tmp_path: Path, monkeypatch
     first = ArtifactStore(tmp_path / "store").run("count", 1, count, config, {})
     (tmp_path / "store" / ".weights.json").unlink()
 
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+    def refuse(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
 
     monkeypatch.setattr(os, "open", refuse)
     monkeypatch.setattr(store_module, "write_json_atomic", refuse)
     store = ArtifactStore(tmp_path / "store")
     assert store.run("count", 1, count, config, {}).path == first.path
+    with pytest.raises(ArtifactError, match=r"cannot be used[\s\S]*Read-only file system"):
+        store.run("count", 2, count, config, {})

@@ -11,6 +11,7 @@ that a helper neither waits for a lock that is never freed nor joins work that a
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import importlib.metadata
 import logging
@@ -57,10 +58,32 @@ StepFunction = Callable[[Any, Mapping[str, Path], Path], dict[str, Any]]
 
 
 @contextmanager
+def clear_store_errors(root: Path) -> Iterator[None]:
+    """Turn missing rights, a read-only disk and files that are in the way below ``root`` into one ArtifactError."""
+    try:
+        yield
+    except OSError as error:
+        in_the_way = PermissionError | FileExistsError | NotADirectoryError | IsADirectoryError
+        if not isinstance(error, in_the_way) and error.errno not in (errno.EROFS, errno.EXDEV, errno.ELOOP):
+            raise
+        place = Path(str(error.filename or root))
+        if not place.is_relative_to(root):
+            raise
+        raise ArtifactError(
+            "A file or folder of the store cannot be used",
+            where=place,
+            expected="a store whose files can be read and written",
+            got=error.strerror,
+            next_step="correct its rights or remove what is in the way, or choose another folder",
+        ) from error
+
+
+@contextmanager
 def _lock_file(path: Path) -> Iterator[int]:
     """Open a lock file. ``flock`` ends with the process, also after kill -9."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    with clear_store_errors(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         yield descriptor
     finally:
@@ -222,9 +245,21 @@ class ArtifactStore:
             distributed: the step shares its work among the processes of torchrun; otherwise the first process does it all.
 
         Raises:
-            ArtifactError: an input differs from its manifest.
+            ArtifactError: an input differs from its manifest, or the store cannot be read or written.
             WorldLineError: an error of the step; its unfinished work stays in ``<key>.partial/``.
         """
+        with clear_store_errors(self.root):
+            return self._run(step, version, function, config, inputs, distributed)
+
+    def _run(
+        self,
+        step: str,
+        version: int,
+        function: StepFunction,
+        config: StrictModel,
+        inputs: Mapping[str, Path],
+        distributed: bool,
+    ) -> Artifact:
         digests = {name: self.input_digest(path) for name, path in sorted(inputs.items())}
         key = self.key(step, version, config, digests)
         if (found := self.find(step, key)) is not None:
