@@ -1,4 +1,4 @@
-"""What is asked before a full-size run: `worldline plan`, what every stage takes before anything is there; `worldline
+"""Commands before a full-size run: `worldline plan` estimates what every stage takes; `worldline
 rehearse`, the whole of a preset at small size, on the processor."""
 
 from __future__ import annotations

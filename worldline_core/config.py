@@ -228,7 +228,7 @@ def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[s
 
 
 def _types_at(model: type[BaseModel], location: Sequence[int | str]) -> list[Any]:
-    """What may stand at a place of the configuration, through lists, mappings and unions."""
+    """Types that are valid at a place of the configuration, through lists, mappings and unions."""
     types: list[Any] = [model]
     for part in location:
         found: list[Any] = []
@@ -256,7 +256,7 @@ def _alternatives(annotation: Any) -> list[Any]:
 
 
 def _tags(model: Any) -> set[str]:
-    """What a model answers to in a union: its name, and the literals of its fields (`kind`)."""
+    """Names of a model in a union: its own, and the literals of its fields (`kind`)."""
     fields = getattr(model, "model_fields", {}).values()
     literals = {str(value) for f in fields if get_origin(f.annotation) is Literal for value in get_args(f.annotation)}
     return literals | {getattr(model, "__name__", "")}

@@ -84,5 +84,5 @@ class UnavailableError(WorldLineError):
 
 
 def installing(extra: str) -> str:
-    """How to install an extra of this package, for the next step of a message."""
+    """Next step of a message: the command that installs an extra of this package."""
     return f"pip install 'worldline[{extra}]' (in a checkout: uv sync --extra {extra})"

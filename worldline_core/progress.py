@@ -1,4 +1,4 @@
-"""How far a loop is: a bar on a terminal; elsewhere, and in processes that share a terminal, a line of the log a minute."""
+"""Progress of a loop: a bar on a terminal; elsewhere, and in processes that share a terminal, a line of the log a minute."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the recordings, candidate banks, robots and models that come with the project lie."""
+"""Folders of the recordings, candidate banks, robots and models that come with the project."""
 
 from __future__ import annotations
 

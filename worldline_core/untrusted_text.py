@@ -36,7 +36,7 @@ def visible(text: str) -> str:
 
 
 def carries_credentials(url: str) -> bool:
-    """Whether a URL has a password, a token or a signature in it."""
+    """Returns whether a URL contains a password, a token or a signature."""
     return any(pattern.search(url) for pattern in _IN_URLS)
 
 

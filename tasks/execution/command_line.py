@@ -137,7 +137,7 @@ def exit_with_clear_errors(action: Callable[[], object]) -> None:
 
 
 def _nobody_reads() -> bool:
-    """Whether what stdout went to has ended (`worldline ... | head`); then nothing is written there at the exit either."""
+    """Returns whether the reader of stdout has ended (`worldline ... | head`); then nothing is written at the exit either."""
     watched = select.poll()
     watched.register(sys.stdout.fileno(), 0)
     if not any(event & select.POLLERR for _, event in watched.poll(0)):

@@ -1,4 +1,4 @@
-"""What Prefect shows of a finished run: a link to its report, a table of what was measured, and pictures."""
+"""Prefect artifacts of a finished run: a link to its report, a table of its metrics, and pictures."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def shard_mapper(config: RunnerConfig) -> ShardMapper:
-    """What does mapped work as configured."""
+    """Returns the configured mapper."""
     return SerialMapper(config) if config.kind == "serial" else PrefectMapper(config)
 
 

@@ -102,7 +102,7 @@ def project_capsules(
     grid_size: tuple[int, int],
     margin_cells: float = 0.0,
 ) -> Bool[Tensor, "b v n h w"]:
-    """Which grid cells a capsule covers: those whose centre lies in it, or within a margin of it.
+    """Mask of the grid cells whose centre is inside a capsule, or within a margin of it.
 
     Args:
         radii: [m]; radius 0 leaves a capsule out.

@@ -76,7 +76,7 @@ def diagnose(
     *,
     quick: bool = False,
 ) -> Diagnosis:
-    """Whether an episode's calibration is consistent and, if not, the usual mistake that explains it.
+    """Diagnose an episode: its calibration is consistent, or a usual mistake explains it.
 
     Args:
         frames: images by view, uint8 (H, W, 3) RGB or (h, w) grey, gone through once; views without images are judged by poses.

@@ -366,7 +366,7 @@ def finger_agreement(observation: Observation, reading: Reading, arm: int) -> fl
 
 
 def _moves(observation: Observation, reading: Reading, arm: int) -> bool:
-    """Whether a gripper moves in front of its own camera."""
+    """Returns whether a gripper moves in front of its own camera."""
     view = observation.arms[arm].wrist_view
     if reading.gripper is None or view not in observation.gray or view not in reading.cameras:
         return False

@@ -90,7 +90,7 @@ class Observation:
         return self._motion[view]
 
     def stands_still(self, view: str) -> bool:
-        """Whether a camera's recorded poses stay the same (2 cm, 2 degrees; at any unit of length)."""
+        """Returns whether a camera's recorded poses stay the same (2 cm, 2 degrees; at any unit of length)."""
         if view not in self._stands:
             poses = self.episode.cameras[view].T_base_camera
             _, metres, degrees = hand_eye_residual(np.eye(4)[None].repeat(len(poses), axis=0), poses)

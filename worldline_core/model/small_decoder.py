@@ -34,7 +34,7 @@ FORMAT, VERSION = "worldline.decoder", 1
 
 
 class SmallDecoderConfig(StrictModel):
-    """Whose latents are decoded, and how large the decoder is.
+    """The tokenizer whose latents are decoded, and the size of the decoder.
 
     Attributes:
         tokenizer: fingerprint of the tokenizer (`tokenizer_fingerprint`).

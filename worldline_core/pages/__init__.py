@@ -1,1 +1,1 @@
-"""What every page that this project writes is made with: templates, tables, charts, styles. Nothing comes from a network."""
+"""Templates, tables, charts and styles of every page. Nothing is loaded from a network."""

@@ -78,7 +78,7 @@ class Axis:
     log: bool = False
 
     def at(self, value: float) -> float:
-        """Where a value is drawn; values outside of the range are drawn at its edge."""
+        """Coordinate of a value; values outside of the range are drawn at its edge."""
         value = min(max(float(value), self.low), self.high)
         low, high, value = (math.log10(v) if self.log else v for v in (self.low, self.high, value))
         share = 0.5 if high == low else (value - low) / (high - low)

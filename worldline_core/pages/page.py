@@ -21,7 +21,7 @@ NARROW_SPACE, MINUS = "\u202f", "\u2212"
 
 
 def _finalize(value: object) -> object:
-    """What a template shows of a value: a plain text is cut, because recordings may hold any."""
+    """Format a value for a template; plain text is cut, because recordings may hold any."""
     return cut(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 

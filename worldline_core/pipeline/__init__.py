@@ -1,1 +1,1 @@
-"""What flows where: the steps, their configuration, and how one feeds the next."""
+"""The configuration of a run, its ablations, and estimates of its memory."""

@@ -230,7 +230,7 @@ class ClipShape:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one stage takes on one device.
+    """Memory and time of one stage on one device.
 
     Attributes:
         parameters: trained ones, or those of a model that only predicts.
@@ -249,7 +249,7 @@ class Estimate:
         return sum(self.parts.values())
 
     def fits(self, memory: float) -> bool:
-        """Whether a device of so many bytes holds it."""
+        """Returns whether a device of so many bytes holds it."""
         return self.total <= USABLE * memory
 
     def describe_parts(self) -> str:

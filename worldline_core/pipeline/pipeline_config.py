@@ -100,7 +100,7 @@ class PipelineConfig(StrictModel):
 
     @property
     def caches_latents(self) -> bool:
-        """Whether a training reads latents that `encode_latents` made before it."""
+        """True if a training reads latents of `encode_latents`."""
         stages = (self.train_stage1, self.train_stage2, self.distill)
         return any(stage is not None and not isinstance(stage.input, FrameInput) for stage in stages)
 
@@ -132,7 +132,7 @@ class PipelineConfig(StrictModel):
         return {name: made for name, made in predicted.items() if (self.rollouts[name].episodes == "banks") == banks}
 
     def checkpoints[T](self, trained: Mapping[str, T]) -> dict[str | None, T | Path | None]:
-        """What rollouts may name: checkpoints that this run trained or is given, and None."""
+        """Checkpoints by the names that rollouts use: trained by this run or given; None for baselines."""
         own = {"stage1": "train_stage1", "stage2": "train_stage2", "causal": "distill"}
         made: dict[str | None, T | Path | None] = {name: trained[step] for name, step in own.items() if step in trained}
         return {None: None, **self.shipped_checkpoints(), **made}

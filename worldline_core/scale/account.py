@@ -110,7 +110,7 @@ _PACKAGE_ROOT = Path(__file__).parents[2]
 
 
 def crash_evidence(error: BaseException) -> dict[str, Any]:
-    """What is known about an unforeseen error, without this machine's paths: {"type", "message", "trace"}.
+    """Evidence of an unforeseen error, without this machine's paths: {"type", "message", "trace"}.
 
     The trace is the innermost frames as `file:line function`, innermost last.
     """

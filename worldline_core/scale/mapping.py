@@ -40,7 +40,7 @@ class WorkerDiedError(WorldLineError):
 
 @dataclass(frozen=True)
 class EpisodeWork[E, R: InputRow](ABC):
-    """What one step does with its episodes; E names an episode (a hashable plain value), R is what becomes of it.
+    """Work of one step on its episodes; E names an episode (a hashable plain value), R is its result.
 
     Subclasses are frozen dataclasses. Their fields are sent to the workers; what they open (`cached_property`) is
     opened in each process once per run.
@@ -62,7 +62,7 @@ class EpisodeWork[E, R: InputRow](ABC):
 
     @property
     def processes(self) -> int | None:
-        """How many processes of a machine can do this at once, one for each device; None: as many as it has cores."""
+        """Processes of a machine that can do this at once, one for each device; None: as many as it has cores."""
         return None
 
     @abstractmethod
@@ -178,7 +178,7 @@ def reading_input(where: object) -> Iterator[None]:
 
 
 def ends_the_run(error: BaseException) -> bool:
-    """Whether every other episode would fail as well until the user removes the cause (a full disk, a wrong configuration)."""
+    """Returns whether every other episode would fail as well until the user removes the cause (a full disk, a wrong setting)."""
     if isinstance(error, UnreachableInputError):
         return False
     if isinstance(error, OSError) and error.errno in _MACHINE_FULL:
@@ -262,7 +262,7 @@ def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequ
 
 
 class RunnerConfig(StrictModel):
-    """Where the work on many episodes runs.
+    """Settings of the work on many episodes.
 
     `auto`: in this process for few episodes, because starting others would take longer than the work; else in several.
     """

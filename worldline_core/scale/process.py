@@ -1,4 +1,4 @@
-"""What a process of a run needs: to end with its parent, equal bytes when it is continued, and freed memory kept."""
+"""Settings of a run's processes: end with the parent, equal bytes when continued, freed memory kept."""
 
 from __future__ import annotations
 

@@ -215,12 +215,12 @@ def digest_folder(folder: Path, *, everything: bool = False) -> str:
 
 
 def is_stored(folder: Path) -> bool:
-    """Whether a folder has the name of a store's artifact: its key."""
+    """Returns whether a folder has the name of a store's artifact: its key."""
     return re.fullmatch(rf"[0-9a-f]{{{KEY_LENGTH}}}", folder.name) is not None
 
 
 def is_artifact(folder: Path) -> bool:
-    """Whether a folder has the manifest of a finished artifact, damaged or not, rather than an unrelated manifest.json."""
+    """Returns whether a folder has the manifest of a finished artifact, damaged or not, rather than an unrelated manifest.json."""
     path = folder / MANIFEST_NAME
     if not path.is_file():
         return False

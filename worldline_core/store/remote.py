@@ -56,7 +56,7 @@ class UnreachableInputError(UnavailableError):
 
 
 def is_transient(error: BaseException | None) -> bool:
-    """Whether another attempt may help: the error, or one of its causes, comes from a network or a busy store."""
+    """Returns whether another attempt may help: the error, or one of its causes, comes from a network or a busy store."""
     while error is not None:
         if isinstance(error, ConnectionError | TimeoutError | UnreachableInputError):
             return True
@@ -138,7 +138,7 @@ def parse_location(text: str | Path | UPath) -> AnyPath:
 
 
 def is_remote(path: AnyPath) -> bool:
-    """Whether a path names a location in an object store."""
+    """Returns whether a path names a location in an object store."""
     return not isinstance(path, Path)
 
 
@@ -244,7 +244,7 @@ class RemoteCache:
         )
 
     def has(self, path: AnyPath) -> bool:
-        """Whether there is a copy."""
+        """Returns whether there is a copy."""
         return self.place(path) in self._sizes
 
     def fetch(self, path: AnyPath) -> Path:

@@ -1,4 +1,4 @@
-"""Where artifacts live, and the one place that makes a step cached and resumable.
+"""The artifact store: the one place that makes a step cached and resumable.
 
 ``artifacts/<step>/<key>/`` holds a finished artifact; its ``manifest.json`` is written last. The key is a digest of
 the step's name and version, its config, and the digests of its inputs and of weights that the config names: nothing
@@ -133,7 +133,7 @@ def folder_lock(folder: Path) -> AbstractContextManager[None]:
 
 
 def _is_helper() -> bool:
-    """Whether torchrun started this process as another than the first."""
+    """Returns whether torchrun started this process as another than the first."""
     return int(os.environ.get("WORLD_SIZE", "1")) > 1 and int(os.environ.get("RANK", "0")) > 0
 
 

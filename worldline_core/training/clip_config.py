@@ -1,4 +1,4 @@
-"""Which clips are drawn and how they are read: as cached latents, or as frames encoded during training. No torch in here."""
+"""Settings of clips: which are drawn, and how they are read (cached latents, or frames encoded during training). Without torch."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _expand_range(value: Any) -> Any:
 
 
 class ClipSampling(StrictModel):
-    """How clips are drawn.
+    """Sampling of clips.
 
     ``lengths``: clip lengths in video frames (4 k + 1), equally likely; a list, or ``{from: 33, to: 129}`` for every
     such length between. ``strides``: temporal strides.
@@ -60,7 +60,7 @@ class ClipSampling(StrictModel):
 
 
 class ReadingConfig(StrictModel):
-    """How clips are read; what is trained on does not depend on it, but for clips that are skipped.
+    """Reading of clips. It does not change what is trained on, except for skipped clips.
 
     ``workers``: processes that read two micro-batches ahead each; 0 reads in the training process when a batch is needed.
     ``on_unreadable``: "raise" stops at the first clip that cannot be read; "skip" takes another clip in its place and
@@ -103,7 +103,7 @@ ClipInput = Annotated[LatentInput | FrameInput, Field(discriminator="kind")]
 
 
 class EncodeLatentsConfig(StrictModel):
-    """Which latents are cached.
+    """Settings of cached latents.
 
     ``start_step``: clips may start at multiples of it. ``strides``: temporal strides that training may ask for.
     ``primary_alone``: also encode, by their task-facing view alone, episodes that lack some of ``views``: Stage I takes

@@ -289,7 +289,7 @@ class ClipLoader:
         return self.finish(read_batch(self.source, batch))
 
     def finish(self, read: ReadBatch) -> Batch:
-        """What a model sees of clips that were read.
+        """Turn clips that were read into a batch.
 
         Raises:
             ArtifactError: if the tracks lack an episode.
@@ -316,7 +316,7 @@ class ClipLoader:
         return Batch(clips, views, latents, maps, ids, mask, frames, fps, weights)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
-        """What a prompt may say about a clip; a stride lowers its rate."""
+        """Facts that a prompt may state about a clip; a stride lowers its rate."""
         return ClipFacts(clip.num_frames, self._rate(clip), self.source.image_size)
 
     def _rate(self, clip: Clip) -> float:

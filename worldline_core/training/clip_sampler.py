@@ -1,4 +1,4 @@
-"""Which clips a step trains on: a pure function of (seed, micro-step, rank), so that a run needs no other state to continue."""
+"""Sampling of clips as a pure function of (seed, micro-step, rank), so that a run needs no other state to continue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where clips are read from: cached latents on disk or on the training device, or frames of an EpisodeSet.
+"""Sources of clips: cached latents on disk or on the training device, or frames of an EpisodeSet.
 
 `ClipSource.read` touches files and runs in any process; `ClipSource.latents` turns what it returned into what the model sees.
 """

@@ -69,12 +69,12 @@ def average_values(values: Mapping[str, float]) -> dict[str, float]:
 
 
 def any_process(flag: bool) -> bool:
-    """Whether it holds on at least one process."""
+    """Returns whether a condition is true in at least one process."""
     return average_values({"flag": float(flag)})["flag"] > 0
 
 
 def another_process_ended(error: BaseException | None) -> bool:
-    """Whether this is what the network says of a process that cannot be reached any more."""
+    """Returns whether an error means that another process cannot be reached any more."""
     return isinstance(error, torch.distributed.DistError) or (isinstance(error, RuntimeError) and "gloo" in str(error))
 
 
@@ -102,7 +102,7 @@ def reporting_lost_processes(where: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class BatchPlan:
-    """How the micro-batches of a training are shared out among processes, whose number may change when it goes on.
+    """Distribution of a training's micro-batches over processes, whose number may change when it continues.
 
     A step has ``per_step`` micro-batches, whatever the number of processes. Micro-batch number m of the run decides its
     clips and its noise. ``together`` neighbours are drawn as one batch (clips of one length), as many as there were
@@ -228,7 +228,7 @@ def _register_outputs() -> None:
 
 
 def reduce_gradients(models: Iterable[nn.Module], now: bool) -> None:
-    """Whether the next backward pass of sharded models sums gradients over the processes, or keeps them until one does."""
+    """Set whether the next backward pass of sharded models sums gradients over the processes, or keeps them until one does."""
     from torch.distributed.fsdp import FSDPModule
 
     for model in models:

@@ -1,4 +1,4 @@
-"""What Stage I and Stage II share around their objective: the model and clips a run starts with, the run, its checkpoint."""
+"""Common parts of Stage I and Stage II around their objective: start model, clips, run and checkpoint."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Stage:
 
     @cached_property
     def sampler(self) -> ClipSampler:
-        """Which clips every micro-step trains on."""
+        """Sampler of the clips of every micro-step."""
         trainer = self.config.trainer
         return ClipSampler(
             self.rows,
@@ -105,7 +105,7 @@ class Stage:
 
     @cached_property
     def plan(self) -> BatchPlan:
-        """How each step's micro-batches are shared out among the processes."""
+        """Distribution of each step's micro-batches over the processes."""
         return batch_plan(self.config.trainer, self.output)
 
     def loader(self, **conditions: Any) -> ClipLoader:
@@ -196,7 +196,7 @@ def weights_of(weighting: LossWeighting, episodes: EpisodeSet, source: ClipSourc
 
 
 def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str, Any]:
-    """How clips were read, and how many were skipped by what is written in the folders ``runs``."""
+    """Facts on how clips were read; skipped clips are counted from the folders ``runs``."""
     facts: dict[str, Any] = {}
     if isinstance(reading, FrameInput):
         facts["input"] = {"kind": reading.kind, "decoder": source.description["decoder"]}

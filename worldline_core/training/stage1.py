@@ -20,7 +20,7 @@ from worldline_core.training.training_config import Stage1Config
 
 
 def is_trained(name: str) -> bool:
-    """Whether Stage I trains a parameter: all of both towers, not the action branch."""
+    """Returns whether Stage I trains a parameter: all of both towers, not the action branch."""
     return not name.startswith("action_encoder.")
 
 

@@ -34,7 +34,7 @@ def stage2_groups(model: WorldModel, action_multiplier: float) -> list[Parameter
 
 
 def _film(config: Stage2Config) -> dict[str, Any]:
-    """What differs in the model where the robot's own control vectors take the place of maps."""
+    """Changes of the model config where control vectors replace maps."""
     if config.native_size is None:
         return {}
     return {"action_conditioning": "native_film", "action_channels": config.native_size}

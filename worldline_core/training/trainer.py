@@ -64,7 +64,7 @@ class NamedBatch(Protocol):
 
 
 class Objective[BatchT: NamedBatch](Protocol):
-    """What a training minimises. Objectives that train all groups at once, without a state, inherit what follows `loss`."""
+    """Loss of a training. Objectives that train all groups at once, without a state, inherit what follows `loss`."""
 
     def loss(self, batch: BatchT, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss of one micro-batch, and values to log beside it."""
@@ -132,7 +132,7 @@ def held_out_losses[BatchT](
 
 
 def batch_plan(config: TrainerConfig, output: Path) -> BatchPlan:
-    """How the micro-batches of a run are shared out: as its saved state says, or as the configuration asks for.
+    """Distribution of a run's micro-batches: from its saved state, else from the configuration.
 
     Raises: ConfigError: they cannot be shared out evenly. ArtifactError: the saved state is damaged.
     """

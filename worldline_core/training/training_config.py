@@ -1,4 +1,4 @@
-"""What training is told: noise, loss, loop; and the configuration of each step that trains. No torch in here."""
+"""Settings of training: noise, loss, loop, and the config of each training step. Without torch."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NonNegative = Annotated[float, Field(ge=0)]
 
 
 class LossWeighting(StrictModel):
-    """How the squared velocity error is weighted.
+    """Weights of the squared velocity error.
 
     ``kind``: "velocity" leaves it as it is (the paper's objective); "sample" multiplies it by sigma^2, which is the
     squared error of the predicted clean latents (stable for models that predict the sample).
@@ -51,7 +51,7 @@ class LossWeighting(StrictModel):
 
 
 class ShardingConfig(StrictModel):
-    """How a model shares memory among processes, and what it recomputes or compiles. None of it changes what is learnt.
+    """Sharding, recomputation and compilation of a model. None of it changes what is learnt.
 
     Attributes:
         shards: parts of every weight; None: as many as there are processes. With fewer, groups of this many processes
@@ -157,7 +157,7 @@ class RelationalConfig(StrictModel):
 
 
 class StageConfig(StrictModel):
-    """What both stages are told of their clips, their loss and their run.
+    """Settings that both stages share: clips, loss and run.
 
     ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` reads the recordings' frames
     and encodes them during training.

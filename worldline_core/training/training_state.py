@@ -1,4 +1,4 @@
-"""What a killed training run needs to continue: weights, their average, optimiser moments, random state, log.
+"""State of a training run to continue after a kill: weights, their average, optimiser moments, random state, log.
 
 States are written by `torch.distributed.checkpoint` while training goes on, each process its own parts, as safetensors
 and JSON: its usual storage keeps an index that is a pickle, which runs code when it is read, so the storage that knows
@@ -307,7 +307,7 @@ class TrainingStates:
             logger.warning("%s", self.failed(failure))
 
     def failed(self, error: BaseException | None) -> TrainingError:
-        """What to say of a state that could not be written."""
+        """Error for a state that could not be written."""
         from torch.distributed.checkpoint.api import CheckpointException
 
         if isinstance(error, CheckpointException):
@@ -322,18 +322,18 @@ class TrainingStates:
         )
 
     def last_good(self) -> str:
-        """Where a run that cannot go on has its last good state, in words; what is being written is waited for."""
+        """Text that names a run's last good state; waits for a state that is being written."""
         self.collect(wait=True)
         state = newest_state(self.output)
         return f"the last good state is {state['folder']}" if state else "no state had been saved before"
 
     @property
     def busy(self) -> bool:
-        """Whether a state is being written."""
+        """Returns whether a state is being written."""
         return self._writing is not None and not self._writing.done()
 
     def collect(self, *, wait: bool = False) -> BaseException | None:
-        """What kept a state that has been written (``wait``: until it is) from being whole, or None."""
+        """Error of the last write (``wait``: waits for it), or None."""
         if self._writing is None or not (wait or self._writing.done()):
             return None
         writing, self._writing = self._writing, None

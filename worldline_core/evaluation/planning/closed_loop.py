@@ -185,7 +185,7 @@ class ClosedLoopPlanner:
         )
 
     def _sequences(self, situation: Situation, chunk: int) -> Sequences:
-        """What is left of the last choice (its last command held), then proposals; within the robot's limits."""
+        """The rest of the last choice (its last command held), then proposals; within the robot's limits."""
         kept = np.empty((0, situation.frames, len(situation.state)))
         if self._last is not None:
             kept = self._last[None, np.minimum(np.arange(chunk, chunk + situation.frames), len(self._last) - 1)]
