@@ -16,12 +16,15 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     card.add_argument("--output", type=Path, default=None, help="where the card goes (default: FOLDER/run/card)")
     card.add_argument("--title", default=None, help="its heading (default: EpisodeSet and the folder's name)")
     card.set_defaults(run=_card)
-    export = commands.add_parser("export", help="write episodes or predictions as MCAP, Rerun, video or LeRobotDataset")
-    export.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet or a RolloutSet")
+    export = commands.add_parser(
+        "export", help="write episodes, predictions or a model for others: MCAP, Rerun, video, LeRobotDataset"
+    )
+    export.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet, a RolloutSet or a checkpoint")
     export.add_argument(
         "--format", action="append", required=True, dest="formats",
-        choices=("lerobot", "mcap", "mcap-ros2", "rrd", "mp4", "worldarena"),
-        help="repeatable; lerobot: EpisodeSets only, mp4 and worldarena: RolloutSets only; mcap: Foxglove's schemas",
+        choices=("lerobot", "mcap", "mcap-ros2", "rrd", "mp4", "worldarena", "model"),
+        help="repeatable; lerobot: EpisodeSets only, mp4 and worldarena: RolloutSets only; mcap: Foxglove's schemas;"
+        " model: a checkpoint with its tokenizer",
     )  # fmt: skip
     export.add_argument("--output", type=Path, required=True, help="where the files go")
     export.add_argument(

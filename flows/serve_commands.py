@@ -46,11 +46,16 @@ def serve_command(arguments: argparse.Namespace) -> None:
     from worldline_core.shipped import project_path
 
     token, project = server_token(config), Path.cwd()
-    folders = [name for name in ("model", "decoder", "episodes") if getattr(config, name) is not None]
+    folders = [name for name in ("model", "tokenizer", "decoder", "episodes") if getattr(config, name) is not None]
     config = config.model_copy(update={name: project_path(project, getattr(config, name)) for name in folders})
     listening = listening_socket(config)  # before the model is loaded: whether there is a port is known at once
     world = WorldLine.from_pretrained(
-        config.model, decoder=config.decoder, device=config.device, bfloat16=config.bfloat16, steps=config.steps
+        config.model,
+        tokenizer=config.tokenizer,
+        decoder=config.decoder,
+        device=config.device,
+        bfloat16=config.bfloat16,
+        steps=config.steps,
     )
     server = make_server(world, config, token)
     host, port = f"[{config.host}]" if ":" in config.host else config.host, listening.getsockname()[1]

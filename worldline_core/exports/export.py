@@ -30,6 +30,7 @@ from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLi
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.model.pretrained import write_pretrained
 from worldline_core.pictures import png_bytes, write_side_by_side
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import kind_of, linked_folder, verify_artifact
@@ -44,6 +45,7 @@ MCAP_FORMATS: dict[str, tuple[Encoding, str]] = {"mcap": ("protobuf", ".mcap"), 
 FORMATS = {
     "EpisodeSet": ("lerobot", *MCAP_FORMATS, "rrd"),
     "RolloutSet": ("mp4", "rrd", *MCAP_FORMATS, "worldarena"),
+    "Checkpoint": ("model",),
 }
 _CRF, _PRESET = 10, "veryfast"
 """For rows that are encoded again because they do not begin at a key frame; others are copied."""
@@ -58,14 +60,15 @@ def export(
     outcome: str | None = None,
     episodes: Path | None = None,
 ) -> list[Path]:
-    """Write episodes of an EpisodeSet, or predictions of a RolloutSet, below a folder.
+    """Write episodes of an EpisodeSet, predictions of a RolloutSet, or a checkpoint with its tokenizer, below a folder.
 
     The artifact is compared with its manifest first: by every digest, or, for chosen episodes, by sizes and changed files.
 
     Args:
         formats: for an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
             artifact refers to another one's), `mcap`, `mcap-ros2` and `rrd` (one file per episode); for a RolloutSet
-            these without `lerobot`, `mp4` (truth beside prediction) and `worldarena` (`export_worldarena`).
+            these without `lerobot`, `mp4` (truth beside prediction) and `worldarena` (`export_worldarena`); for a
+            checkpoint `model` (a folder with its tokenizer and card, to be published).
         episode_ids: the chosen episodes; default: all.
         outcome: only recordings of an EpisodeSet with this outcome (``success``: demonstrations to train a policy on).
         episodes: the EpisodeSet of predictions; default: the one that their manifest names.
@@ -89,6 +92,8 @@ def export(
         )
     with folder_lock(output):
         verify_artifact(artifact, "fast" if episode_ids else "full")
+        if kind == "Checkpoint":
+            return [write_pretrained(artifact, output / "model")]
         if kind == "EpisodeSet":
             return _export_episodes(EpisodeSet.open(artifact), output, formats, episode_ids, outcome)
         return _export_rollouts(artifact, output, formats, episode_ids, episodes)

@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 from collections.abc import Iterator, Mapping
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from worldline_core.data.curation.source_table import read_source_table
-from worldline_core.errors import CheckpointError, UnavailableError
+from worldline_core.errors import ArtifactError, CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import CheckpointInfo, read_checkpoint_info
-from worldline_core.store.artifact_files import read_manifest
+from worldline_core.model.tokenizers import VideoTokenizer, load_tokenizer, tokenizer_fingerprint
+from worldline_core.store.artifact_files import MANIFEST_NAME, is_stored, linked_folder, read_manifest
 
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 UNKNOWN = "not stated"
@@ -57,6 +61,75 @@ def pretrained_folder(source: Path | str) -> Path:
             next_step="check the name, the network and HF_TOKEN; offline, download it elsewhere and give its folder",
         ) from error
     return Path(found)
+
+
+def load_model_tokenizer(
+    info: CheckpointInfo,
+    folder: Path,
+    given: Path | str | None = None,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> tuple[VideoTokenizer, str, Path]:
+    """The tokenizer that a checkpoint's contract names, its fingerprint and its folder: ``given``, or found by the checkpoint.
+
+    Raises:
+        CheckpointError: none is there, or only others are.
+    """
+    others: dict[Path, str] = {}
+    for place in _tokenizer_folders(folder) if given is None else [Path(given)]:
+        if place in others or not place.is_dir():
+            continue
+        codec = load_tokenizer(place, device, dtype)
+        others[place] = fingerprint = tokenizer_fingerprint(codec, place)
+        if fingerprint == info.contract.tokenizer:
+            return codec, fingerprint, place
+    for place, fingerprint in others.items():
+        info.contract.require(where=place, tokenizer=fingerprint)
+    raise CheckpointError(
+        "The model's tokenizer is not here",
+        where=folder,
+        expected=f"tokenizer {info.contract.tokenizer} at "
+        + (f"{folder / 'tokenizer'}, beside it, or in the checkpoint's store" if given is None else str(given)),
+        next_step="give its folder as tokenizer=...",
+    )
+
+
+def _tokenizer_folders(folder: Path) -> Iterator[Path]:
+    """Where a checkpoint's tokenizer may be, likeliest first: with its files, named by its manifest or by those of its
+    inputs, or anywhere in its store.
+    """
+    yield from (folder / "tokenizer", folder.parent / "tokenizer")
+    # The steps of a distillation are checkpoints inside of the artifact.
+    waiting = [path for path in (folder.resolve(), folder.resolve().parent) if is_stored(path)][:1]
+    stores = [path.parent.parent for path in waiting]
+    for artifact in waiting:
+        inputs = {name: linked_folder(artifact, name) for name in read_manifest(artifact).get("inputs", {})}
+        found = {name: path.resolve() for name, path in inputs.items() if path is not None}
+        if "tokenizer" in found:
+            yield found["tokenizer"]
+        waiting += [path for path in found.values() if is_stored(path) and path not in waiting]
+    for store in stores:  # an artifact on the way there (latents) may have been deleted
+        yield from sorted(path for path in store.glob("train_tokenizer/*") if is_stored(path))
+
+
+def write_pretrained(folder: Path, output: Path) -> Path:
+    """Copy a checkpoint with its tokenizer and its card into a folder that can be published and loaded anywhere.
+
+    Raises:
+        ArtifactError: the folder exists.
+        CheckpointError: it is no Stage II or causal checkpoint, or its tokenizer is not here.
+    """
+    if output.exists() and any(output.iterdir()):
+        raise ArtifactError("Folder exists already", where=output, next_step="export into a new folder")
+    tokenizer = load_model_tokenizer(read_checkpoint_info(folder), folder)[2]
+    root = tokenizer / "vae" if (tokenizer / "vae").is_dir() else tokenizer  # a pipeline's other models do not encode
+    for source, target in ((folder, output), (root, output / "tokenizer")):
+        target.mkdir(parents=True, exist_ok=True)
+        for path in sorted(source.iterdir()):
+            if path.suffix in {".json", ".safetensors"} and path.name != MANIFEST_NAME:
+                shutil.copyfile(path, target / path.name)
+    (output / "README.md").write_text(_model_card(folder, None), encoding="utf-8")
+    return output
 
 
 def write_model_card(folder: Path, license_name: str | None = None) -> Path:

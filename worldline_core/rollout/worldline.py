@@ -18,9 +18,9 @@ from worldline_core.errors import CheckpointError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
-from worldline_core.model.pretrained import pretrained_folder
+from worldline_core.model.pretrained import load_model_tokenizer, pretrained_folder
 from worldline_core.model.small_decoder import SmallDecoder
-from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video, load_tokenizer, tokenizer_fingerprint
+from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.observation import Camera, image_size, ordered_views, project_controls
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
@@ -95,7 +95,8 @@ class WorldLine:
 
         Args:
             folder: of the checkpoint, or ORG/NAME of the hub (safetensors and JSON files are fetched, nothing else).
-            tokenizer: its folder; by default ``tokenizer`` in the checkpoint's folder, else beside it.
+            tokenizer: its folder; by default ``tokenizer`` in the checkpoint's folder or beside it, or, of an artifact, that
+                of its store.
             decoder: folder of a small decoder for its latents (train_tokenizer), which decodes in the tokenizer's place.
             expect_kind: refuse checkpoints of another kind.
             bfloat16: mixed precision of the model and the decoder.
@@ -114,18 +115,7 @@ class WorldLine:
         folder = pretrained_folder(folder)
         kinds: tuple[CheckpointKind, ...] = ("stage2", "causal") if expect_kind is None else (expect_kind,)
         model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation", dtype=getattr(torch, weights))
-        places = [Path(tokenizer)] if tokenizer is not None else [folder / "tokenizer", folder.parent / "tokenizer"]
-        place = next((place for place in places if place.is_dir()), None)
-        if place is None:
-            raise CheckpointError(
-                "The model's tokenizer is not here",
-                where=folder,
-                expected=f"a folder {' or '.join(map(str, places))}",
-                next_step="give its folder as tokenizer=...",
-            )
-        codec = load_tokenizer(place, device, getattr(torch, weights))
-        fingerprint = tokenizer_fingerprint(codec, place)
-        info.contract.require(where=place, tokenizer=fingerprint)
+        codec, fingerprint, _ = load_model_tokenizer(info, folder, tokenizer, device, getattr(torch, weights))
         if decoder is not None:
             codec = SmallDecoder.load(Path(decoder), codec, fingerprint, device)
         return cls(

@@ -40,6 +40,7 @@ class ServeConfig(StrictModel):
 
     Attributes:
         model: folder of a causal or Stage II checkpoint.
+        tokenizer: its tokenizer's folder; by default the one found by the checkpoint.
         decoder: folder of a small decoder for the latents of its tokenizer.
         steps: Euler steps; by default the model's own.
         episodes: EpisodeSet whose recordings sessions may start from.
@@ -53,6 +54,7 @@ class ServeConfig(StrictModel):
     """
 
     model: Path = SHIPPED / "models" / "causal"
+    tokenizer: Path | None = None
     decoder: Path | None = None
     device: str = "cpu"
     bfloat16: bool = True
