@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -281,8 +282,70 @@ def test_raw_images_of_every_encoding(tmp_path: Path, toy: Any, encoding: str) -
     recording.write(tmp_path / "a.mcap")
     loaded = load(toy.declared(tmp_path))
     if encoding == "16UC1":
-        with pytest.raises(RejectedInputError, match=r"(?s)encoding is not supported.*rgb8.*16UC1"):
+        with pytest.raises(RejectedInputError, match=r"(?s)Images are depth.*rgb8.*16UC1.*colour images"):
             loaded.frames("head")
     else:
         wanted = np.repeat(expected[..., :1], 3, -1) if encoding == "mono8" else expected
         assert np.array_equal(loaded.frames("head")[3], wanted)
+
+
+@pytest.mark.parametrize(
+    ("data_format", "header", "bits"),
+    [
+        ("16UC1; png compressed ", b"", 16),
+        ("16UC1; compressedDepth png", bytes(12), 16),
+        ("32FC1; compressedDepth", bytes(12), 16),
+        ("16UC1; compressedDepth rvl", bytes(12), 0),
+        ("png", b"", 16),  # the format says nothing, the picture does
+        ("png", bytes(12), 16),
+        ("16UC1; jpeg compressed", b"", 8),
+    ],
+)
+def test_depth_in_compressed_images_is_refused_by_name(
+    tmp_path: Path, toy: Any, data_format: str, header: bytes, bits: int
+) -> None:
+    depth = np.arange(12 * 16).reshape(12, 16) * 20
+    content = header + bytes(64)
+    if bits:
+        content = header + cv2.imencode(".png", depth.astype(np.uint16 if bits == 16 else np.uint8))[1].tobytes()
+    recording = toy.robot(0.5)
+    message = {"format": data_format, "data": content}
+    recording.change(
+        "/head/image/compressed", lambda sent: [replace(s, message={**s.message, **message}) for s in sent]
+    )
+    recording.write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path))
+    assert (error.reason, "depth" in error.what) == ("unknown_schema", True)
+    assert "colour images" in str(error) and "/head/image/compressed" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"k": [0.0] * 9, "p": [0.0] * 12}, "K is all zeros"),
+        ({"height": 0, "width": 0}, "image size is 0x0"),
+        ({"k": [0.0] * 9, "height": 0, "width": 0, "distortion_model": "", "d": []}, "K is all zeros"),
+        ({"distortion_model": "equidistant", "d": [0.0] * 4}, "D of a equidistant lens is all zeros"),
+        ({"distortion_model": "Inverse Brown Conrady"}, None),
+        ({"distortion_model": "rational_polynomial", "d": [0.0] * 14}, None),
+        ({"distortion_model": "", "d": [0.0] * 5}, None),
+        ({"distortion_model": "plumb_bob", "d": [0.0] * 12}, None),
+    ],
+)
+def test_an_empty_calibration_costs_the_view_its_camera_only(
+    tmp_path: Path, toy: Any, changes: dict[str, Any], why: str | None
+) -> None:
+    recording = toy.robot(0.5)
+    recording.change("/head/camera_info", lambda sent: [replace(s, message={**s.message, **changes}) for s in sent])
+    if why is not None:  # nor is its frame needed
+        recording.change("/tf_static", lambda sent: [
+            replace(s, message={"transforms": s.message["transforms"][1:]}) for s in sent
+        ])  # fmt: skip
+    recording.write(tmp_path / "a.mcap")
+    loaded = load(toy.declared(tmp_path))
+    assert loaded.views == ("head", "right_wrist")
+    assert set(loaded.episode.cameras) == ({"right_wrist"} if why else {"head", "right_wrist"})
+    assert why is None or f"head: {'' if why[0] in 'KD' else 'its '}{why}" == loaded.episode.conventions["uncalibrated"]
+    assert ("uncalibrated" in loaded.episode.conventions) is (why is not None)
+    assert not loaded.distortions
+    assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(loaded.episode.num_frames))

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from pathlib import Path
 
 import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from mcap.records import Channel, Schema
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from tools.corrupted import mcap
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap import file as mcap_file
 from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
 from worldline_core.data.mcap.file import McapFile, check_chunks
+from worldline_core.data.mcap.messages import MessageDecoder
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -149,3 +154,62 @@ def test_every_flipped_byte_of_our_own_file_is_noticed(tmp_path: Path) -> None:
         except RejectedInputError:
             continue
     assert not unnoticed
+
+
+def ros_channel(definition: bytes, name: str = "sensor_msgs/msg/JointState") -> tuple[Channel, Schema]:
+    return Channel(1, "/a", "cdr", {}, 1), Schema(1, definition, "ros2msg", name)
+
+
+@pytest.mark.parametrize(
+    ("definition", "data"),
+    [
+        (b"Empty[] name\nfloat64[] position\n===\nMSG: sensor_msgs/Empty\n", b"\0\1\0\0" + struct.pack("<I", 2**26)),
+        (b"Empty[] name\n===\nMSG: sensor_msgs/Empty\nuint8[0] x\n", b"\0\1\0\0" + struct.pack("<I", 2**31)),
+        (b"Empty[4000000000] name\n===\nMSG: sensor_msgs/Empty\nA[ 0 ] x\n===\nMSG: sensor_msgs/A\nint8 x", bytes(8)),
+        (b"string[] name\nfloat64[] position\n", b"\0\1\0\0" + struct.pack("<I", 2**26) + bytes(2**26)),
+    ],
+)
+def test_ros_messages_of_a_few_bytes_do_not_become_millions_of_objects(definition: bytes, data: bytes) -> None:
+    tracemalloc.start()
+    with pytest.raises(RejectedInputError, match=r"arrays of length 0|Message is too large|cannot be decoded"):
+        MessageDecoder("a").decode(*ros_channel(definition), data)
+    assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("schema", ["foxglove.JointStates", "foxglove.CompressedImage"])
+def test_json_of_a_million_lists_is_not_parsed(schema: str) -> None:
+    channel = Channel(1, "/a", "json", {}, 1)
+    for content in (b"[],", b"{},", b"[[]],", b"1,"):
+        with pytest.raises(RejectedInputError, match=r"is too large|too many values") as caught:
+            MessageDecoder("a").decode(
+                channel, Schema(1, b"{}", "jsonschema", schema), b"[" + content * 300_000 + b"1]"
+            )
+        assert caught.value.reason == "too_large"
+
+
+def test_protobuf_messages_of_a_million_joints_are_not_unpacked() -> None:
+    descriptors = build_file_descriptor_set(JointStates).SerializeToString()
+    channel = Channel(1, "/a", "protobuf", {}, 1)
+    with pytest.raises(RejectedInputError, match="Message is too large"):
+        MessageDecoder("a").decode(
+            channel, Schema(1, descriptors, "protobuf", "foxglove.JointStates"), b"\x12\x00" * 1_000_000
+        )
+
+
+@pytest.mark.parametrize(
+    "definition", [b"\x1b[2J\x1b[31mred", b"int32 \x1b]0;title\x07 x", b"float64 a\n\x1b[1A", b"T\xc2\x9b31m x"]
+)
+def test_escapes_in_a_schema_reach_no_terminal(definition: bytes, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(RejectedInputError, match="Schema definition cannot be read") as caught:
+        MessageDecoder("a").decode(*ros_channel(definition), bytes(8))
+    printed = capfd.readouterr()
+    assert printed.out + printed.err == ""
+    assert not set(str(caught.value)) & set("\x1b\x07\x9b")
+
+
+@pytest.mark.parametrize("definition", [b"", b" \n", b"\n\n"])
+def test_an_empty_definition_says_so(definition: bytes) -> None:
+    with pytest.raises(RejectedInputError, match=r"(?s)no definition of its messages.*JointState.*next step") as caught:
+        MessageDecoder("a").decode(*ros_channel(definition), bytes(8))
+    assert caught.value.reason == "unknown_schema"

@@ -123,13 +123,15 @@ def _first_root(coefficients: np.ndarray) -> float:
 def distortion_from_ros(model: str, coefficients: Sequence[float]) -> Distortion | None:
     """The lens that a ROS or Foxglove camera calibration states (`distortion_model`, `D`); None for a pinhole.
 
-    An empty D with a radtan model is a pinhole. More than 8 radtan coefficients (thin prism, tilt) must be zero.
+    An empty D with a radtan model is a pinhole, and so are zeros under any name but a fisheye's. More than 8 radtan coefficients (thin prism, tilt) must be zero.
 
     Raises: CalibrationError for an unknown model or unusable coefficients.
     """
     values = [float(value) for value in coefficients]
     name = model.strip().lower()
     if not values and name in ("", "none", "plumb_bob", "radtan", "rational_polynomial"):
+        return None
+    if values and not any(values) and not is_fisheye(model):
         return None
     if name not in _ROS_MODELS:
         raise CalibrationError(
@@ -138,8 +140,12 @@ def distortion_from_ros(model: str, coefficients: Sequence[float]) -> Distortion
     kind = _ROS_MODELS[name]
     if kind == "radtan" and 8 < len(values) <= _OPENCV_LONGEST and not any(values[8:]):
         values = values[:8]
-    distortion = Distortion(kind, tuple(values))
-    return None if kind == "radtan" and not any(values) else distortion
+    return Distortion(kind, tuple(values))
+
+
+def is_fisheye(model: str) -> bool:
+    """Whether a ROS `distortion_model` is a fisheye's, for which zeros are no pinhole."""
+    return _ROS_MODELS.get(model.strip().lower()) == "fisheye"
 
 
 def distort_points(points: np.ndarray, distortion: Distortion) -> np.ndarray:

@@ -7,6 +7,7 @@ of 8 bytes, then the record.
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections import deque
@@ -49,6 +50,7 @@ _FOOTER_BYTES = 9 + 20
 _LZ4_RATIO = 255
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
 _SMALLEST_BYTES = 2 * len(_MAGIC) + _FOOTER_BYTES
+_PNG = b"\x89PNG"
 _CODECS = {"h264": "h264", "h265": "hevc"}
 # ROS and Foxglove name -> bytes per pixel, and OpenCV's conversion to RGB.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
@@ -58,6 +60,9 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bgra8": (4, cv2.COLOR_BGRA2RGB),
     "mono8": (1, cv2.COLOR_GRAY2RGB),
 }
+
+_DEPTH = re.compile(r"(?i)16[us]c1|32[fs]c1|compresseddepth|^z16|\bdepth")
+"""ROS' names of depth, as a pixel encoding or in a compressed image's format ("16UC1; compressedDepth png")."""
 
 
 @dataclass
@@ -327,7 +332,7 @@ class ImageTrack:
     def _images(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
         for number, value in self._in_time(np.unique(self.chosen)):
             place = f"{where}, image {number}"
-            yield number, _raw_pixels(value, place) if isinstance(value, RawImage) else decode_image(value.data, place)
+            yield number, _raw_pixels(value, place) if isinstance(value, RawImage) else _picture_of(value, place)
 
     def _video(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
         """Frames from the last key frame before the first chosen one on."""
@@ -408,7 +413,32 @@ def _lost_frame(where: str) -> RejectedInputError:
     return RejectedInputError("truncated_video", what, where=where, next_step=next_step)
 
 
+def _picture_of(image: EncodedImage, where: str) -> np.ndarray:
+    """RGB of a JPEG or PNG of 8 bits.
+
+    A PNG of 16-bit grey (header: bit depth 16, colour type 0) is depth, and so is one behind the 12 bytes that ROS'
+    compressedDepth puts before it.
+    """
+    data = image.data
+    if _DEPTH.search(image.format) or (data[:4] == _PNG and data[24:26] == b"\x10\0") or data[12:16] == _PNG:
+        raise _depth(where, f"{image.format!r} with a PNG of 16 bits" if _PNG in data[:16] else repr(image.format))
+    return decode_image(data, where)
+
+
+def _depth(where: str, got: str) -> RejectedInputError:
+    return RejectedInputError(
+        "unknown_schema",
+        "Images are depth, or other readings of more than 8 bits, not colour",
+        where=where,
+        expected="JPEG or PNG of 8 bits; raw " + ", ".join(_ENCODINGS),
+        got=got,
+        next_step="name the topic of the camera's colour images",
+    )
+
+
 def _raw_pixels(image: RawImage, where: str) -> np.ndarray:
+    if _DEPTH.search(image.encoding):
+        raise _depth(where, image.encoding)
     if image.encoding not in _ENCODINGS:
         what, expected = "Pixel encoding is not supported", ", ".join(_ENCODINGS)
         raise RejectedInputError("unreadable", what, where=where, expected=expected, got=image.encoding)

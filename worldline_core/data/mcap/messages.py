@@ -7,10 +7,13 @@ module.
 from __future__ import annotations
 
 import base64
+import re
 import struct
 from collections.abc import Callable
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from functools import partial
+from io import StringIO
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -18,10 +21,17 @@ from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.records import Channel, Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoderFactory
+from mcap_ros2._vendor.rosidl_adapter.parser import InvalidSpecification, InvalidValue
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
 
 from worldline_core.data.guards.plain_files import parse_json
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, too_large
+
+_MAX_MESSAGE_BYTES = 1 << 20
+"""One message that holds no image: it becomes objects, up to one per byte, and a megabyte is ten thousand transforms."""
+_MAX_JSON_ITEMS = 200_000
+_EMPTY_ARRAY = re.compile(rb"\[\s*0+\s*\]")
+"""A field of a ROS definition that takes no bytes, so that an array of such messages may have any length."""
 
 Kind = Literal["image", "video", "raw_image", "calibration", "joints", "numbers", "transforms", "pose", "marker"]
 IMAGE_KINDS: tuple[Kind, ...] = ("image", "video", "raw_image")
@@ -219,6 +229,10 @@ _FAULTS = (
 )  # fmt: skip
 
 
+# What the ROS 2 parser raises beyond that for texts that are no definitions.
+_SCHEMA_FAULTS = (InvalidSpecification, InvalidValue, NameError, AssertionError)
+
+
 class MessageDecoder:
     """Decodes the messages of one file's channels."""
 
@@ -232,6 +246,9 @@ class MessageDecoder:
         if channel.id not in self._channels:
             self._channels[channel.id] = self._channel(channel, schema)
         kind, decode = self._channels[channel.id]
+        if kind not in IMAGE_KINDS and len(data) > _MAX_MESSAGE_BYTES:
+            what, where = "Message is too large", f"{self._where}, topic {channel.topic}"
+            raise too_large(what, where=where, limit=_MAX_MESSAGE_BYTES, got=len(data), unit="bytes")
         try:
             raw = decode(data)
             return kind, _header_time(raw), _READERS[kind](raw)
@@ -257,11 +274,31 @@ class MessageDecoder:
         return kind, decoder
 
     def _decoder(self, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any] | None:
+        where = f"{self._where}, topic {channel.topic}"
         if channel.message_encoding == "json":
-            return lambda data: _as_object(parse_json(data, f"{self._where}, topic {channel.topic}"))
+            return lambda data: _as_object(_parsed_json(data, where))
+        if schema is not None and channel.message_encoding in ("cdr", "protobuf") and not schema.data.strip():
+            raise RejectedInputError(
+                "unknown_schema",
+                "The file holds no definition of its messages",
+                where=where,
+                got=f"an empty definition of {schema.name}",
+                next_step="record where the message's package is installed, or write the bag again there: ros2 bag convert",
+            )
+        if schema is not None and schema.encoding == "ros2msg" and _EMPTY_ARRAY.search(schema.data):
+            what = "Schema definition has arrays of length 0, which no message needs"
+            raise RejectedInputError("unknown_schema", what, where=where, got=schema.name)
         try:
-            found = (factory.decoder_for(channel.message_encoding, schema) for factory in self._factories)
-            return next((decoder for decoder in found if decoder is not None), None)
-        except _FAULTS as error:
-            what, where = "Schema definition cannot be read", f"{self._where}, topic {channel.topic}"
+            with redirect_stderr(StringIO()):  # the ROS 2 parser prints the line at fault as it is
+                found = (factory.decoder_for(channel.message_encoding, schema) for factory in self._factories)
+                return next((decoder for decoder in found if decoder is not None), None)
+        except (*_FAULTS, *_SCHEMA_FAULTS) as error:
+            what = "Schema definition cannot be read"
             raise RejectedInputError("unknown_schema", what, where=where, got=repr(error)[:200]) from error
+
+
+def _parsed_json(data: bytes, where: str) -> Any:
+    items = sum(data.count(mark) for mark in (b",", b"[", b"{"))
+    if items > _MAX_JSON_ITEMS:
+        raise too_large("Message has too many values", where=where, limit=_MAX_JSON_ITEMS, got=items, unit="values")
+    return parse_json(data, where)

@@ -24,6 +24,7 @@ from worldline_core.data.mcap.resampling import (
     nearest,
     resampled,
     resampled_poses,
+    uncalibrated,
 )
 from worldline_core.data.mcap.topics_config import ArmReadings, McapTopicsSourceConfig, TopicReadings
 
@@ -98,11 +99,13 @@ class _Recording:
             for view, each in config.views.items()
         }
         read = {view: self._calibration(each.calibration) for view, each in config.views.items() if each.calibration}
-        self.calibrations = read
+        reasons = {view: uncalibrated(each, rectified=config.views[view].rectified) for view, each in read.items()}
+        self.uncalibrated = {view: reason for view, reason in reasons.items() if reason is not None}
+        self.calibrations = {view: each for view, each in read.items() if view not in self.uncalibrated}
         self.camera_frames = {
             view: (config.views[view].frame or read[view].frame or self.streams[config.views[view].image].frame)
             .lstrip("/")
-            for view in read
+            for view in self.calibrations
         }  # fmt: skip
         self.tree = self._transforms([*self.camera_frames.values(), *self.tool_frames.values()])
 
@@ -329,6 +332,7 @@ def read_topics_episode(
         where = f"{recording.at(topics.calibration or '')}, frame {frame}"
         calibration = recording.calibrations[view]
         add_camera(cameras, view, calibration, poses[:1] if fixed else poses, where=where, rectified=topics.rectified)
+    unknown = recording.uncalibrated
     state, outside = recording.arm_vectors([arm.state for arm in config.arms], grid)
     action, commands = state, [arm.command for arm in config.arms if arm.command is not None]
     if commands:
@@ -366,6 +370,7 @@ def read_topics_episode(
             "resampling_max_ms": round(max(np.abs(t[nearest(t, grid)] - grid).max() / 1e6 for t in times), 6),
             "gripper_overshoot": outside,
             "action": "commanded" if commands else f"{REPEATS_STATE}: no commands are recorded",
+            **({"uncalibrated": "; ".join(f"{view}: {why}" for view, why in unknown.items())} if unknown else {}),
             **cameras.notes(),
         },
     )

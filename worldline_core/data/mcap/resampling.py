@@ -20,7 +20,7 @@ from worldline_core.data.mcap.file import Stream
 from worldline_core.data.mcap.messages import Calibration, Transform
 from worldline_core.data.mcap.topics_config import McapTopicsSourceConfig
 from worldline_core.geometry.cameras import ImageTransform
-from worldline_core.geometry.lens import distortion_from_ros
+from worldline_core.geometry.lens import distortion_from_ros, is_fisheye
 from worldline_core.geometry.transforms import pose_from_rotation, rigid_inverse
 
 MAX_DISORDER_S = 1.0
@@ -278,6 +278,17 @@ class TransformTree:
         return pose
 
 
+def uncalibrated(calibration: Calibration, *, rectified: bool) -> str | None:
+    """Why a message holds no calibration, by the conventions of ROS and Foxglove and its drivers; None where it holds one."""
+    if not any(calibration.P if rectified else calibration.K):
+        return f"{'P' if rectified else 'K'} is all zeros"
+    if min(calibration.height, calibration.width) < 1:
+        return f"its image size is {calibration.width}x{calibration.height}"
+    if not rectified and calibration.D and not any(calibration.D) and is_fisheye(calibration.model):
+        return f"D of a {calibration.model} lens is all zeros"
+    return None
+
+
 def add_camera(
     cameras: RecordedCameras,
     view: str,
@@ -314,8 +325,6 @@ def _intrinsics(calibration: Calibration, *, rectified: bool, where: object) -> 
         raise refused(f"Calibration has not {count} values of {'P' if rectified else 'K'}", len(numbers))
     K = np.array(numbers, np.float64).reshape(3, -1)[:, :3]
     height, width = calibration.height, calibration.width
-    if min(height, width) < 1:
-        raise refused("Calibration has no image size", f"{width}x{height}")
     transform = ImageTransform.of((height, width))
     x, y, region_width, region_height = calibration.roi
     if region_width and region_height:
