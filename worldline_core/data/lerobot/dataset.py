@@ -22,7 +22,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from worldline_core.data.guards.plain_files import column_names, read_json, read_json_lines, read_table, validated
 from worldline_core.data.guards.rejection import RejectedInputError, check_length, unreadable
-from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, regular_file
+from worldline_core.data.guards.source_paths import (
+    AnyPath,
+    fill_template,
+    find_files,
+    inside,
+    regular_file,
+    relative_name,
+)
 from worldline_core.data.video.clip import VideoClip, decode_frames, video_size
 from worldline_core.errors import DataError
 
@@ -81,9 +88,10 @@ class EpisodeTable:
         self._where = str(where)
         column = table[INDEX] if INDEX in table.column_names else None
         numbers = np.zeros(0)
-        if column is not None and pa.types.is_integer(column.type) and not column.null_count:
+        if column is not None and (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
             numbers = column.to_numpy()
-        if column is None or len(numbers) != len(column) or ((numbers < 0) | (numbers > MAX_INDEX)).any():
+        whole = numbers == np.floor(numbers)  # pandas writes whole numbers as 30.0 where one of a column is missing
+        if column is None or len(numbers) != len(column) or not (whole & (numbers >= 0) & (numbers <= MAX_INDEX)).all():
             raise DataError(
                 "Episode list numbers no episodes",
                 where=self._where,
@@ -95,6 +103,10 @@ class EpisodeTable:
         in_order = bool((order[1:] > order[:-1]).all())
         # One chunk per column: looking up a row among a hundred chunks takes a millisecond.
         self._table = (table if in_order else table.take(pa.array(order))).combine_chunks()
+
+    def column(self, name: str) -> pa.ChunkedArray:
+        """One column, in the order of `indices`."""
+        return self._table[name]
 
     def row(self, episode_index: int) -> dict[str, Any]:
         """One episode's row.
@@ -118,6 +130,8 @@ def whole_number(row: dict[str, Any], key: str, where: object) -> int:
     Raises: RejectedInputError: missing_column, or unreadable for what is no whole number from 0 on.
     """
     value = row.get(key)
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_INDEX:
         raise RejectedInputError(
             "unreadable" if key in row else "missing_column",
@@ -200,7 +214,9 @@ class LeRobotV3Dataset(LeRobotDataset):
 
     def __init__(self, root: AnyPath) -> None:
         super().__init__(root)
-        self._data: dict[AnyPath, pa.Table] = {}
+        self._data: dict[AnyPath, tuple[pa.Table, np.ndarray]] = {}
+        self._episode: tuple[int, str, pa.Table] | None = None
+        self._all_windows: dict[str, list[np.ndarray]] = {}
 
     @cached_property
     def episodes(self) -> EpisodeTable:
@@ -227,41 +243,152 @@ class LeRobotV3Dataset(LeRobotDataset):
         return dict(zip(table["task_index"].to_pylist(), texts, strict=True))
 
     def column(self, episode_index: int, name: str) -> np.ndarray:
+        where, rows = self._rows(episode_index)
+        if name not in rows.column_names:
+            raise RejectedInputError("missing_column", "Data file lacks a column", where=where, expected=name)
+        return _numeric_column(rows[name], len(rows), f"{where}, column {name}")
+
+    def _rows(self, episode_index: int) -> tuple[str, pa.Table]:
+        """An episode's rows in the order of `index`, found by `episode_index`, and what to call them.
+
+        Raises: RejectedInputError (length_mismatch, unreadable) where they contradict the episode list.
+        """
+        if self._episode is not None and self._episode[0] == episode_index:
+            return self._episode[1:]
         row = self.row(episode_index)
+        begin, length = self._number(row, "dataset_from_index"), self._number(row, "length")
+        path, places = self._places(row)
+        table = self._data[path][0]
+        where = f"{path}, episode {episode_index}"
+        check_length("Data file", where, states=length, unit="rows", found=len(places))
+        if self._number(row, "dataset_to_index") - begin != length:
+            raise _contradiction(
+                where, f"{length} rows from dataset_from_index to dataset_to_index", row["dataset_to_index"] - begin
+            )
+        order = np.argsort(table["index"].take(pa.array(places)).to_numpy(), kind="stable")
+        places = places[order]
+        consecutive = length > 0 and int(places[-1] - places[0]) == length - 1 and bool((np.diff(places) == 1).all())
+        rows = table.slice(int(places[0]), length) if consecutive else table.take(pa.array(places))
+        _check_numbering(rows, where, index=begin, frame_index=0)
+        if "timestamp" in rows.column_names:  # LeRobot shows the picture at from_timestamp + timestamp
+            first = float(_numeric_column(rows["timestamp"], length, f"{where}, column timestamp").reshape(-1)[0])
+            if abs(first) * self.fps >= 0.5:
+                raise _contradiction(where, "timestamp 0 in its first row, where its video begins", f"{first:.6g} s")
+        self._episode = episode_index, where, rows
+        return where, rows
+
+    def _places(self, row: dict[str, Any]) -> tuple[AnyPath, np.ndarray]:
+        """The data file with an episode's rows, and where they are in it.
+
+        As in LeRobot, which reads all files, the file that the list names need not be the one: a stale
+        `data/file_index` is common after sets were joined or cut.
+        """
+        episode_index = row[INDEX]
         path = self._path(
             self.info.data_path or DATA_PATH,
             chunk_index=self._number(row, "data/chunk_index"),
             file_index=self._number(row, "data/file_index"),
         )
+        missing: RejectedInputError | None = None
+        places = np.zeros(0, np.int64)
+        try:
+            places = self._load(path, episode_index)
+        except RejectedInputError as error:
+            if error.reason != "missing_file":
+                raise
+            missing = error
+        if len(places):
+            return path, places
+        if episode_index in self._file_of:
+            path = self._file_of[episode_index]
+            return path, self._load(path, episode_index)
+        if missing is not None:
+            raise missing
+        return path, places
+
+    def _load(self, path: AnyPath, episode_index: int) -> np.ndarray:
+        """Where an episode's rows are in a data file, which stays in memory: episodes are read in the order of files."""
         if path not in self._data:
-            self._data = {path: read_table(path)}  # one file at a time: episodes are read in the order of files
-        table = self._data[path]
-        for needed in (name, "index"):
-            if needed not in table.column_names:
-                raise RejectedInputError("missing_column", "Data file lacks a column", where=path, expected=needed)
-        begin = self._number(row, "dataset_from_index")
-        length = self._number(row, "dataset_to_index") - begin
-        first = table["index"][0].as_py() if len(table) else begin
-        offset = begin - int(first) if isinstance(first, int) else -1
-        rows = table[name].slice(offset, length) if offset >= 0 and length >= 0 else table[name].slice(0, 0)
-        return _numeric_column(rows, length, f"{path}, episode {episode_index}, column {name}")
+            table = read_table(path)
+            for needed in (INDEX, "index"):
+                if needed not in table.column_names:
+                    raise RejectedInputError("missing_column", "Data file lacks a column", where=path, expected=needed)
+            numbers = _numeric_column(table[INDEX], len(table), f"{path}, column {INDEX}")
+            self._data = {path: (table, numbers)}
+        return np.flatnonzero(self._data[path][1] == episode_index)
+
+    @cached_property
+    def _file_of(self) -> dict[int, AnyPath]:
+        """The first data file that holds rows of an episode, of all files."""
+        found: dict[int, AnyPath] = {}
+        for listed in find_files(self.root / "data", "*/*.parquet"):
+            path = inside(self.root, str(relative_name(listed, self.root)))
+            if INDEX in column_names(path):
+                for number in pc.unique(read_table(path, [INDEX])[INDEX]).to_pylist():  # pyright: ignore[reportAttributeAccessIssue]
+                    found.setdefault(number, path)
+        return found
 
     def clip(self, episode_index: int, key: str) -> VideoClip:
         row = self.row(episode_index)
-        chunk, file, start = (f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))
-        if any(row.get(name) is None for name in (chunk, file, start)):
+        if any(row.get(f"videos/{key}/{name}") is None for name in ("chunk_index", "file_index", "from_timestamp")):
             raise RejectedInputError("missing_view", "Episode has no such video", where=self.root, expected=key)
-        path = self._path(
-            self.info.video_path or VIDEO_PATH,
-            video_key=key,
-            chunk_index=self._number(row, chunk),
-            file_index=self._number(row, file),
-        )
-        from_time = row[start]
-        if not isinstance(from_time, int | float) or not 0 <= from_time < math.inf:
-            where = f"{self.root}, episode {episode_index}, {start}"
-            raise RejectedInputError("unreadable", "Video has no usable start time", where=where, got=repr(from_time))
-        return VideoClip(path, self._number(row, "length"), self.fps, from_time=float(from_time))
+        file = tuple(self._number(row, f"videos/{key}/{name}") for name in ("chunk_index", "file_index"))
+        path = self._path(self.info.video_path or VIDEO_PATH, video_key=key, chunk_index=file[0], file_index=file[1])
+        where = f"{self.root}, episode {episode_index}, videos/{key}"
+        begin, length = row[f"videos/{key}/from_timestamp"], self._number(row, "length")
+        end = row.get(f"videos/{key}/to_timestamp")  # LeRobot itself reads pictures without it
+        for name, time in (("from_timestamp", begin), ("to_timestamp", begin if end is None else end)):
+            if not isinstance(time, int | float) or not 0 <= time < math.inf:
+                raise RejectedInputError(
+                    "unreadable", f"Video has no usable {name}", where=f"{where}/{name}", got=repr(time)
+                )
+        if end is not None:
+            self._check_window(where, key, episode_index, begin, end, length)
+        return VideoClip(path, length, self.fps, from_time=float(begin))
+
+    def _check_window(self, where: str, key: str, episode_index: int, begin: float, end: float, length: int) -> None:
+        """Raises: RejectedInputError (length_mismatch) for a window of another length than the rows, or that shares
+        pictures with another episode's: one of the two then shows the other.
+        """
+        frames = (end - begin) * self.fps
+        if abs(frames - length) >= 0.5:
+            raise RejectedInputError(
+                "length_mismatch",
+                "Video window and rows differ in length",
+                where=where,
+                expected=f"{length} rows: to_timestamp {begin + length / self.fps:.6g} s at {self.fps:g} fps",
+                got=f"{frames:.3g} frames: {begin:.6g} .. {end:.6g} s",
+                next_step="correct the window or the rate in the metadata, or drop the episode",
+                evidence={"states": length, "frames": round(frames)},
+            )
+        others, starts, stops = self._windows(key, episode_index)
+        shared = (np.minimum(stops, end) - np.maximum(starts, begin)) * self.fps
+        same = (np.abs(starts - begin) * self.fps < 0.5) & (np.abs(stops - end) * self.fps < 0.5)
+        for place in np.flatnonzero((shared >= 0.5) & ~same)[:1]:
+            raise RejectedInputError(
+                "length_mismatch",
+                "Video windows of two episodes overlap",
+                where=where,
+                expected="pictures of one episode",
+                got=f"{begin:.6g} .. {end:.6g} s, and episode {others[place]}: "
+                f"{starts[place]:.6g} .. {stops[place]:.6g} s",
+                next_step="correct from_timestamp and to_timestamp in the metadata, or drop both episodes",
+            )
+
+    def _windows(self, key: str, episode_index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Index, begin and end [s] of the other episodes in the same video file."""
+        if key not in self._all_windows:
+            names = [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp")]
+            names.append("length")
+            self._all_windows[key] = [
+                pc.cast(self.episodes.column(name), pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+                for name in names
+            ]
+        chunks, files, starts, stops, lengths = self._all_windows[key]
+        own = self.episodes.indices == episode_index
+        near = (chunks == chunks[own][0]) & (files == files[own][0]) & ~own
+        near &= np.abs((stops - starts) * self.fps - lengths) < 0.5  # others are refused themselves
+        return self.episodes.indices[near], starts[near], stops[near]
 
     def frames(self, episode_index: int, key: str, indices: Sequence[int]) -> np.ndarray:
         """uint8 (len, H, W, 3) frames of one episode.
@@ -281,11 +408,12 @@ class LeRobotV21Dataset(LeRobotDataset):
 
     version = "v2.1"
     needed_keys = ("data_path", "video_path", "chunks_size")
+    _checked: int | None = None
 
     @cached_property
     def episodes(self) -> EpisodeTable:
         path = self.root / "meta" / "episodes.jsonl"
-        schema = pa.schema([(INDEX, pa.int64()), ("length", pa.int64())])
+        schema = pa.schema([(INDEX, pa.float64()), ("length", pa.float64())])
         with unreadable("File is not JSON lines", path, (pa.ArrowException, OSError, ValueError)):
             table = pyarrow.json.read_json(
                 regular_file(path, "Episode list"),
@@ -309,13 +437,45 @@ class LeRobotV21Dataset(LeRobotDataset):
 
     def column(self, episode_index: int, name: str) -> np.ndarray:
         path = self._episode_path(self.info.data_path, episode_index)
-        return _numeric_column(
-            read_table(path, [name])[name], self._number(self.row(episode_index), "length"), f"{path}, column {name}"
-        )
+        length = self._number(self.row(episode_index), "length")
+        if self._checked != episode_index:
+            present = [column for column in (INDEX, "frame_index") if column in column_names(path)]
+            numbering = read_table(path, present)
+            check_length("Data file", path, states=length, unit="rows", found=len(numbering))
+            if INDEX in present and (numbering[INDEX].to_numpy() != episode_index).any():
+                others = pc.unique(numbering[INDEX]).to_pylist()  # pyright: ignore[reportAttributeAccessIssue]
+                raise _contradiction(path, f"{INDEX} {episode_index}", f"{INDEX} {', '.join(map(str, others[:5]))}")
+            _check_numbering(numbering, path, frame_index=0)
+            self._checked = episode_index
+        return _numeric_column(read_table(path, [name])[name], length, f"{path}, column {name}")
 
     def clip(self, episode_index: int, key: str) -> VideoClip:
         path = self._episode_path(self.info.video_path, episode_index, video_key=key)
         return VideoClip.whole_file(path, self._number(self.row(episode_index), "length"), self.fps)
+
+
+def _contradiction(where: object, expected: str, got: object) -> RejectedInputError:
+    return RejectedInputError(
+        "length_mismatch",
+        "Rows and episode list contradict each other",
+        where=where,
+        expected=expected,
+        got=got,
+        next_step="write the dataset again with LeRobot's own tools, or drop the episode",
+    )
+
+
+def _check_numbering(rows: pa.Table, where: object, **first: int) -> None:
+    """Raises: RejectedInputError (length_mismatch) unless these columns, as far as they are there, count up from here."""
+    for name, begin in first.items():
+        if name not in rows.column_names:
+            continue
+        numbers = _numeric_column(rows[name], len(rows), f"{where}, column {name}").reshape(-1)
+        wrong = np.flatnonzero(numbers != begin + np.arange(len(rows)))
+        if len(wrong):
+            raise _contradiction(
+                where, f"{name} {begin + wrong[0]} in its row {wrong[0]}", f"{name} {numbers[wrong[0]]}"
+            )
 
 
 def _numeric_column(column: pa.ChunkedArray, length: int, where: str) -> np.ndarray:

@@ -365,7 +365,18 @@ class LeRobotSource:
     def _instruction(self, index: int) -> tuple[str, int]:
         """The first frame's task, and how many different ones the episode has."""
         values = self._dataset.column(index, self._config.task_column).reshape(-1)
-        text = self._dataset.tasks.get(int(values[0]), "")
+        listed = self._dataset.tasks
+        unknown = [value for value in dict.fromkeys(values.tolist()) if value not in listed]
+        if unknown:
+            raise RejectedInputError(
+                "missing_column",
+                "Task is not in the list of tasks",
+                where=f"{self._root}, episode {index}, {self._config.task_column}",
+                expected=f"one of the {len(listed)} indices in meta/tasks",
+                got=", ".join(map(str, unknown[:5])),
+                next_step="add the task to meta/tasks, or drop the episode",
+            )
+        text = listed[values[0]]
         separator = self._config.task_separator
         return (text if separator is None else text.rsplit(separator, 1)[-1]).strip(), len(set(values.tolist()))
 

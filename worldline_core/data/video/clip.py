@@ -5,6 +5,7 @@ A picture keeps the decoder's frame: grey values cost nothing, colours are conve
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -234,7 +235,7 @@ def _counted(clip: VideoClip) -> Iterator[Picture]:
 
 
 def _timed(clip: VideoClip) -> Iterator[Picture]:
-    found, reformatter = 0, VideoReformatter()
+    found, nearest, reformatter = 0, math.inf, VideoReformatter()
     with named_break(clip, lambda: found), open_video(clip.path) as (container, stream):
         time_base = stream.time_base or Fraction(1, 1000)
         for frame in seek_before(container, stream, clip.start_time):
@@ -243,12 +244,32 @@ def _timed(clip: VideoClip) -> Iterator[Picture]:
             number = (float(frame.pts * time_base) - clip.start_time) * clip.fps
             if round(number) == found and abs(number - found) < FRAME_TOLERANCE:
                 yield Picture(frame, reformatter)
-                found += 1
+                found, nearest = found + 1, math.inf
+            elif abs(number - found) < abs(nearest):
+                nearest = number - found
             if found == clip.num_frames:
                 return
             if number > found + 1:
                 break
+    if FRAME_TOLERANCE <= abs(nearest) <= 1 - FRAME_TOLERANCE:
+        raise _off_grid(clip, found, nearest)
     raise wrong_count(clip.path, clip.num_frames, found)
+
+
+def _off_grid(clip: VideoClip, number: int, offset: float) -> RejectedInputError:
+    """The rejection of a clip whose frame ``number`` is there, but a part of a frame early or late."""
+    due = clip.start_time + number / clip.fps
+    cause = "the start of the window" if number == 0 else "the rate"
+    return RejectedInputError(
+        "wrong_fps",
+        f"Frames of the video do not fit {cause}",
+        where=clip.path,
+        expected=f"frame {number} at {due:.6g} s: from_timestamp {clip.start_time:.6g} s, {clip.fps:g} fps",
+        got=f"nearest frame at {due + offset / clip.fps:.6g} s, {abs(offset):.2f} of a frame "
+        + ("late" if offset > 0 else "early"),
+        next_step=f"correct {'from_timestamp' if number == 0 else 'fps'} in the metadata",
+        evidence={"frame": number, "offset_frames": round(offset, 4)},
+    )
 
 
 @contextmanager
