@@ -131,9 +131,10 @@ def _pipeline(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments, weights=True)
     prepare_prefect(arguments.artifacts)
     from flows.pipeline import pipeline
+    from tasks.execution.prefect_artifacts import run_flow
 
     print(f"how far it is, and then the report: {arguments.artifacts / 'report' / 'latest' / 'index.html'}")
-    report = pipeline(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
+    report = run_flow(pipeline, preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
     print(f"report: {report.path / 'index.html'}")
 
 
@@ -147,19 +148,21 @@ def _nightly(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments)
     prepare_prefect(arguments.artifacts)
     from flows.nightly_evaluation import nightly_evaluation
+    from tasks.execution.prefect_artifacts import run_flow
 
     values = preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, arguments.night
-    print(f"nightly: {nightly_evaluation(*values) / 'index.html'}")
+    print(f"nightly: {run_flow(nightly_evaluation, *values) / 'index.html'}")
 
 
 def _ablations(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments, weights=True)
     prepare_prefect(arguments.artifacts)
     from flows.ablations import ablations
+    from tasks.execution.prefect_artifacts import run_flow
 
     variants = None if arguments.variant is None else tuple(arguments.variant)
-    overrides, seeds = tuple(arguments.overrides), tuple(arguments.seeds)
-    table = ablations(preset, arguments.config, overrides, arguments.artifacts, variants, arguments.variants, seeds)
+    values = preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, variants, arguments.variants
+    table = run_flow(ablations, *values, tuple(arguments.seeds))
     print((Path(str(table.path)) / "table.md").read_text(), f"table: {table.path / 'table.md'}", sep="\n")
 
 

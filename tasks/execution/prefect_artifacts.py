@@ -3,17 +3,54 @@
 from __future__ import annotations
 
 import base64
+import functools
+import logging
 import mimetypes
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import httpx
+from prefect import Flow
 from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
 from tasks.execution.chain import outline
-from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+from tasks.execution.prefect_run import ArtifactReference, PrefectRun, shorten_errors
+from tasks.execution.temporary_server import private_server
 from worldline_core.config import StrictModel
+from worldline_core.errors import UnavailableError
 from worldline_core.evaluation.paired import collect_metrics
 from worldline_core.scale.mapping import RunnerConfig
+
+logger = logging.getLogger(__name__)
+
+
+def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
+    """Run a flow; its result counts although Prefect's server ended before it could record it.
+
+    Raises:
+        UnavailableError: the server ended before the flow did.
+    """
+    done: list[R] = []
+
+    @functools.wraps(flow.fn)
+    def body(*values: Any, **named: Any) -> R:
+        done.append(flow.fn(*values, **named))
+        return done[0]
+
+    shorten_errors()
+    observed = flow.with_options()
+    observed.fn = body
+    try:
+        with private_server():
+            return observed(*arguments)
+    except httpx.TransportError as error:
+        if not done:
+            raise UnavailableError(
+                "Prefect's server ended before the run", got=error, next_step="the same command continues"
+            ) from error
+        logger.warning("the run is finished; Prefect's server ended before it could record it: %s", error)
+        return done[0]
 
 
 def _report_pictures(report: Path) -> list[Path]:
@@ -41,13 +78,18 @@ def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures:
         {"metric": name, "mean": value.mean, "95 % from": value.low, "to": value.high, "trajectories": value.count}
         for name, value in sorted(collect_metrics(scores).items())
     ]
-    create_link_artifact((page / "index.html").as_uri(), "Open the report", key="report", description=str(page))
-    if rows:
-        create_table_artifact(rows, key="metrics", description="Means with 95 % intervals: what/where/method/metric")
-    for number, picture in enumerate(pictures):
-        key = "picture" if number == 0 else f"picture-{number}"
-        data = f"data:{mimetypes.guess_type(picture)[0]};base64,{base64.b64encode(picture.read_bytes()).decode()}"
-        create_image_artifact(data, key=key, description=f"{picture.stem}: {page / 'index.html'}")
+    try:
+        create_link_artifact((page / "index.html").as_uri(), "Open the report", key="report", description=str(page))
+        if rows:
+            create_table_artifact(
+                rows, key="metrics", description="Means with 95 % intervals: what/where/method/metric"
+            )
+        for number, picture in enumerate(pictures):
+            key = "picture" if number == 0 else f"picture-{number}"
+            data = f"data:{mimetypes.guess_type(picture)[0]};base64,{base64.b64encode(picture.read_bytes()).decode()}"
+            create_image_artifact(data, key=key, description=f"{picture.stem}: {page / 'index.html'}")
+    except httpx.TransportError as error:
+        logger.warning("Prefect shows nothing of this run: its server does not answer (%s)", error)
 
 
 def run_chain[C: StrictModel](

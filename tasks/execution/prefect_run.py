@@ -22,6 +22,7 @@ from queue import SimpleQueue
 from types import TracebackType
 from typing import Any, Self, cast
 
+import httpx
 from prefect import Task
 from prefect.cache_policies import CachePolicy
 from prefect.client.schemas.objects import RunInput, State, TaskRunResult
@@ -93,8 +94,7 @@ class PrefectRun(Outline):
 
     def __enter__(self) -> Self:
         keep_freed_memory()
-        for name in ("prefect.flow_runs", "prefect.task_runs"):
-            logging.getLogger(name).addFilter(_without_traceback)
+        shorten_errors()
         if self._page is not None:
             self._stack.enter_context(self._page)
         self._stack.enter_context(activated(self))
@@ -237,9 +237,14 @@ class PrefectRun(Outline):
         return self._stack.enter_context(process_runner(self._runner.steps_at_once))
 
 
+def shorten_errors() -> None:
+    """Let Prefect log errors of this project, and of its own server's end, without tracebacks."""
+    for name in ("prefect.flow_runs", "prefect.task_runs"):
+        logging.getLogger(name).addFilter(_without_traceback)
+
+
 def _without_traceback(record: logging.LogRecord) -> bool:
-    """Take the traceback out of Prefect's record of an error that says what is wrong and what to do."""
-    if record.exc_info and isinstance(record.exc_info[1], WorldLineError):
+    if record.exc_info and isinstance(record.exc_info[1], WorldLineError | httpx.TransportError):
         record.exc_info = None
     return True
 

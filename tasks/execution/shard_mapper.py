@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from tasks.execution.temporary_server import set_up_temporary_server
+from tasks.execution.temporary_server import private_server, set_up_temporary_server
 from worldline_core.errors import UnavailableError, installing
 from worldline_core.scale.mapping import (
     Outcome,
@@ -192,10 +192,11 @@ def shared_server() -> Iterator[None]:
     if PREFECT_API_URL.value():
         yield
         return
-    with get_client(sync_client=True) as client:
-        url = str(client.api_url)
-    with temporary_settings({PREFECT_API_URL: url}):
-        yield
+    with private_server():
+        with get_client(sync_client=True) as client:
+            url = str(client.api_url)
+        with temporary_settings({PREFECT_API_URL: url}):
+            yield
 
 
 @contextmanager
