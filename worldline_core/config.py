@@ -15,11 +15,11 @@ from types import UnionType
 from typing import Annotated, Any, Literal, TypeAliasType, Union, cast, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from yaml.constructor import ConstructorError
 
 from worldline_core.errors import ConfigError
-from worldline_core.untrusted_text import cut
+from worldline_core.untrusted_text import cut, unusable_text
 
 _PACKAGE = Path(__file__).resolve().parent
 # An installed package carries the presets and embodiments inside of it.
@@ -49,6 +49,12 @@ class _StrictLoader(yaml.SafeLoader):
             return super().construct_object(node, deep)
         except (ValueError, TypeError, KeyError, AttributeError) as error:  # of PyYAML's own readers of values
             raise ConstructorError(None, None, f"no {node.tag.rpartition(':')[2]}: {error}", node.start_mark) from error
+
+    def construct_scalar(self, node: yaml.ScalarNode | yaml.MappingNode) -> Any:
+        value = super().construct_scalar(node)
+        if (found := unusable_text(value)) is not None:
+            raise ConstructorError(None, None, f"text with half of a surrogate pair: {found}", node.start_mark)
+        return value
 
 
 def _count(node: yaml.Node, known: dict[int, int]) -> int:
@@ -99,9 +105,23 @@ def _construct_mapping(loader: _StrictLoader, node: yaml.MappingNode, deep: bool
 
 _StrictLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
 # Of the words that YAML 1.1 takes for booleans only true and false: `off`, `yes` and `no` name choices here.
+# Numbers have no colons: 1:30 is 90 in YAML 1.1 (base 60), and somebody's mistake.
 _BOOLEAN = "tag:yaml.org,2002:bool"
+_BASE_60 = re.compile(r"[-+]?[0-9][0-9_]*(?::[0-5]?[0-9])+(?:\.[0-9_]*)?")
+
+
+class _WithoutBase60:
+    """An implicit resolver's pattern, which does not match numbers of base 60."""
+
+    def __init__(self, pattern: re.Pattern[str]) -> None:
+        self._pattern = pattern
+
+    def match(self, text: str) -> re.Match[str] | None:
+        return None if _BASE_60.fullmatch(text) else self._pattern.match(text)
+
+
 _StrictLoader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag != _BOOLEAN]
+    first: [(tag, _WithoutBase60(pattern)) for tag, pattern in resolvers if tag != _BOOLEAN]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 _StrictLoader.add_implicit_resolver(_BOOLEAN, re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
@@ -324,10 +344,39 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
+def _holds_boolean(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    return isinstance(value, bool) or (isinstance(value, list | tuple) and any(map(_holds_boolean, value)))
+
+
+def _holds_numbers_alone(annotation: Any) -> bool:
+    """True for numbers, texts and choices, and tuples and mappings of these; not for models, which check their own values."""
+    parts = [part for member in _alternatives(annotation) for part in (get_args(member) or [member])]
+    if parts != [annotation]:
+        return all(map(_holds_numbers_alone, parts))
+    return annotation in (int, float, str, type(None), ...) or (
+        isinstance(annotation, str | int | float) and not isinstance(annotation, bool)
+    )
+
+
 class StrictModel(BaseModel):
     """Frozen; an unknown key is an error, never ignored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _strict_values(cls, values: Any) -> Any:
+        """A boolean is no number (pydantic takes true for 1), and a text must be storable."""
+        if isinstance(values, Mapping):
+            for name, value in values.items():
+                if (found := unusable_text((name, value))) is not None:
+                    raise ValueError(f"{name!a} has half of a surrogate pair: {found}")
+                field = cls.model_fields.get(name)
+                if field is not None and _holds_boolean(value) and _holds_numbers_alone(field.annotation):
+                    raise ValueError(f"{name}: true and false are no numbers (got {value!r})")
+        return values
 
     def weights_read(self) -> Mapping[str, Path | None]:
         """Files and folders (weights, a text tokenizer) that a step with this configuration reads and that are no input of it:

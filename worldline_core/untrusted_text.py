@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Mapping
 from urllib.parse import quote
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """What moves a terminal's cursor or turns the direction of the text around it. Line breaks and tabs stay."""
+_HALF_PAIR = re.compile("[\ud800-\udfff]")
 _PARAMETERS = (
     r"signature|sig|token|credential|secret|password|passwd|api[-_]?key|access[-_]?key(?:[-_]?id)?|authorization"
 )
@@ -33,6 +35,27 @@ LONGEST = 4000
 def visible(text: str) -> str:
     """Control characters, and those that change the direction of text, written as escapes (`\\x1b`, `\\u202e`)."""
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+
+
+def unusable_text(value: object) -> str | None:
+    """The first text within nested mappings and sequences that no file or table can hold (half of a surrogate pair), as ASCII."""
+    if isinstance(value, str):
+        return None if value.isascii() or not _HALF_PAIR.search(value) else ascii(cut(value, 200))
+    if isinstance(value, Mapping):
+        value = (*value, *value.values())
+    if not isinstance(value, list | tuple | set | frozenset):
+        return None
+    return next((found for part in value if (found := unusable_text(part)) is not None), None)
+
+
+def printable(text: str) -> str:
+    """Text that can be stored: bytes of a file name that are no UTF-8, and halves of surrogate pairs, written as escapes."""
+
+    def escape(found: re.Match[str]) -> str:
+        code = ord(found[0])
+        return f"\\x{code - 0xDC00:02x}" if 0xDC80 <= code <= 0xDCFF else f"\\u{code:04x}"
+
+    return _HALF_PAIR.sub(escape, text)
 
 
 def carries_credentials(url: str) -> bool:

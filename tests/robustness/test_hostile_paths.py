@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from pathlib import Path
+from hashlib import sha256
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,9 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine, write_index
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import fill_template, inside
-from worldline_core.data.sources.episode_files import check_id, storable
+from worldline_core.data.guards.source_paths import fill_template, inside, safe_stem
+from worldline_core.data.sources.episode_files import check_id, storable, unique_names
+from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
 
@@ -194,3 +196,36 @@ def test_a_set_with_an_id_twice_is_not_resolved_by_chance(dataset: Make, tmp_pat
     counts = curate(again, {}, tmp_path / "out")
     assert (counts["found"], counts["reasons"]) == (3, {"duplicate_id": 2})
     assert kept(tmp_path / "out") == [rows[2].episode_id]
+
+
+def digested(name: str, digits: int) -> str:
+    return sha256(name.encode()).hexdigest()[:digits]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["a\udcff.mp4", "a\\xff.mp4"],
+        ["a-b/c.mp4", "a/b-c.mp4", f"a-b-c-{digested('a-b/c.mp4', 8)}.mp4"],
+        ["a-b/c.mp4", "a/b-c.mp4", f"a-b-c-{digested('a-b/c.mp4', 8)}.mp4", f"a-b-c-{digested('a-b/c.mp4', 64)}.mp4"],
+        ["x.mp4", "x.MP4"],
+    ],
+)
+def test_every_file_has_an_id_of_its_own(tmp_path: Path, names: list[str]) -> None:
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    source = VideoFolderSource(VideoFolderSourceConfig(path=tmp_path, name="web"), tmp_path)
+    assert len(source.episode_ids()) == len(names)
+    assert {str(file) for file in source.files.values()} == set(names)
+
+
+def test_a_name_that_nobody_else_wants_stays() -> None:
+    files = {PurePosixPath(f"{n}.mp4"): f"web-{n}" for n in range(3)}
+    assert unique_names(files) == files
+
+
+def test_stems_of_files_differ_where_names_do() -> None:
+    names = ["run 1", "run_1", "run.1", "run/1", "run\\1"]
+    names += [safe_stem(name) for name in names] + [safe_stem(safe_stem("run 1"))]
+    assert len({safe_stem(name) for name in names}) == len(set(names))

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from safetensors import SafetensorError
 
 from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck
 from worldline_core.calibration.check_report import page as check_page
 from worldline_core.config import ConfigError, load_config
+from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_index import read_quarantine
+from worldline_core.data.episodes.source import LoadedEpisode
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.sources.video_folder import VideoFolderSourceConfig
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.pages.page import Table, environment, markdown
@@ -227,3 +239,81 @@ def test_a_full_disk_ends_a_command_with_one_message(full: Exception, capsys: py
     assert "No space left" in error
     assert "/data/set.parquet" in error
     assert "the same command continues" in error
+
+
+HALF = "lift \\ud800 the block"
+"""Half of a surrogate pair, as JSON and YAML write it."""
+
+
+def test_text_that_cannot_be_stored_costs_its_own_episode(
+    dataset: Callable[[int], tuple[Path, CurateConfig]], video: Path, tmp_path: Path
+) -> None:
+    root, config = dataset(3)
+    listed = root / "meta/episodes.jsonl"  # its texts are not read
+    listed.write_text(listed.read_text().replace("lift", HALF.split(" the")[0]))
+    with (root / "meta/tasks.jsonl").open("a") as tasks:
+        tasks.write(f'{{"task_index": 7, "task": "{HALF}"}}\n')
+    path = root / "data/chunk-000/episode_000002.parquet"
+    rows = pq.read_table(path)
+    rows = rows.set_column(rows.column_names.index("task_index"), "task_index", pa.array([7] * len(rows)))
+    pq.write_table(rows, path)
+    web = tmp_path / "web"
+    for name in ("good", "json", "bytes"):
+        web.mkdir(exist_ok=True)
+        shutil.copy(video, web / f"{name}.mp4")
+    (web / "t.jsonl").write_bytes(
+        b'{"video": "good.mp4", "caption": "push"}\n'
+        + b'{"video": "json.mp4", "caption": "'
+        + HALF.encode()
+        + b'"}\n{"video": "bytes.mp4", "caption": "push \xff"}'
+    )
+    table = {"kind": "video_folder", "path": str(web), "captions": {"file": "t.jsonl"}, "split": "test"}
+    sources = [*config.model_dump()["sources"], table]
+    counts = curate(CurateConfig.model_validate({"sources": sources}), {}, tmp_path / "out")
+    assert counts["found"] == 6
+    reasons = {row.episode_id: row.reason for row in read_quarantine(tmp_path / "out")}
+    assert {name: reason for name, reason in reasons.items() if "duplicate" not in reason} == {
+        "set-000002": "invalid_text",
+        "web-json": "invalid_text",
+        "web-bytes": "invalid_text",
+    }
+
+
+@pytest.mark.parametrize(
+    "field", ["instruction", "scene", "source", "bank", "primary_view", "state_names", "conventions", "views"]
+)
+def test_every_text_of_an_episode_is_checked_where_it_enters(field: str) -> None:
+    half = json.loads(f'"{HALF}"')
+    texts = {"episode_id": "e", "source": "s", "embodiment": "none", "scene": "x", "task_family": "unknown",
+             "instruction": "", "outcome": "unknown", "split": "test"}  # fmt: skip
+    odd = {"state_names": (half,), "conventions": {"note": half}, "views": ()}.get(field, half)
+    still = np.zeros((3, 1))
+    episode = Episode(
+        **(texts | ({} if field == "views" else {field: odd})),  # type: ignore[arg-type]
+        fps=8.0, state=still, action=still, timestamps=np.arange(3) / 8,
+    )  # fmt: skip
+    with pytest.raises(RejectedInputError, match=f"Text of {field} cannot be stored") as caught:
+        LoadedEpisode(episode, (half,) if field == "views" else ("head",))
+    assert caught.value.reason == "invalid_text"
+    assert caught.value.evidence == {"field": field}
+
+
+@pytest.mark.parametrize("text", ['name: "\\ud800"', 'license: "a \\udfff"', '"\\udcff": 1', 'scene: "\\ud83d"'])
+def test_configurations_hold_no_half_characters(tmp_path: Path, text: str) -> None:
+    (tmp_path / "c.yaml").write_text(f"sources: [{{kind: video_folder, path: x, {text}}}]")
+    with pytest.raises(ConfigError, match="half of a surrogate pair"):
+        load_config(CurateConfig, path=tmp_path / "c.yaml")
+    with pytest.raises(ValueError, match="half of a surrogate pair"):
+        VideoFolderSourceConfig(path=tmp_path, scene=json.loads('"\\ud83d"'))
+    with pytest.raises(ValueError, match="half of a surrogate pair"):
+        VideoFolderSourceConfig(path=os.fsdecode(b"fold\xffer"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["fps: 1:30", "fps: true", "fps: 1:30.5", "stride: true", "image_size: [true, 64]", "image_size: [0:50, 64]"],
+)
+def test_numbers_are_no_times_and_no_booleans(tmp_path: Path, text: str) -> None:
+    (tmp_path / "c.yaml").write_text(f"sources: [{{kind: video_folder, path: x}}]\n{text}")
+    with pytest.raises(ConfigError, match=r"no numbers|valid number|valid integer"):
+        load_config(CurateConfig, path=tmp_path / "c.yaml")

@@ -31,6 +31,7 @@ from worldline_core.scale.account import InputRow, check_account, crash_evidence
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, ends_the_run, map_episodes
 from worldline_core.store.remote import UnreachableInputError, first_line, is_transient
 from worldline_core.store.store import helper_lock
+from worldline_core.untrusted_text import visible
 
 logger = logging.getLogger(__name__)
 
@@ -232,7 +233,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
     def _quarantine(self, episode: ListedEpisode, reason: str, detail: str, evidence: Mapping[str, Any]) -> InputRow:
         self.writer.discard(episode.identity)  # written from files that changed meanwhile
         label, root = self.label(episode.source), parse_location(self.roots[episode.source])
-        self.writer.quarantine(episode.identity, label, reason, portable_text(detail, root, label), evidence)
+        self.writer.quarantine(episode.identity, label, reason, visible(portable_text(detail, root, label)), evidence)
         return self.row(episode.identity)
 
     def row(self, identity: str) -> InputRow:

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import NO_EMBODIMENT, TRAINING_SPLITS, Episode, Outcome, Split, TaskFamily
-from worldline_core.data.guards.rejection import RejectedInputError, collect_faults
+from worldline_core.data.guards.rejection import RejectedInputError, check_texts, collect_faults
 from worldline_core.data.guards.source_paths import SourceFolder
 from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.frames import MadeFrames
@@ -22,6 +22,7 @@ from worldline_core.errors import CalibrationError, ConfigError
 from worldline_core.geometry.cameras import Fit
 from worldline_core.geometry.embodiment import check_embodiment_name
 from worldline_core.geometry.lens import Distortion, DistortionModel
+from worldline_core.untrusted_text import printable
 
 Masks = np.ndarray | MadeFrames
 EVALUATION_LAYOUTS = ("droid annotation", "robotwin")
@@ -54,6 +55,11 @@ class LoadedEpisode:
     clips: Mapping[str, VideoClip] = field(default_factory=dict)
     thing_labels: Callable[[str], Masks | None] = lambda view: None
     absent: Mapping[str, RejectedInputError] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raises: RejectedInputError (invalid_text): texts of every source pass here, before anything is stored."""
+        views = (*self.views, *self.absent, *self.episode.cameras)
+        check_texts({**self.episode.described(), "views": views}, f"episode {self.episode.episode_id}")
 
     def each_image(self, view: str) -> Iterator[np.ndarray]:
         """uint8 (H, W, 3) RGB per frame.
@@ -148,7 +154,7 @@ class SourceConfigBase(StrictModel):
 
     @property
     def label(self) -> str:
-        return self.name or self.path.name
+        return self.name or printable(self.path.name)
 
     def includes(self, episode_id: str) -> bool:
         """True if the configuration asks for this episode."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from worldline_core.errors import DataError
 from worldline_core.store.remote import is_transient
+from worldline_core.untrusted_text import unusable_text
 
 Reason = Literal[
     "truncated_video",
@@ -24,6 +25,7 @@ Reason = Literal[
     "too_large",
     "changed_while_reading",
     "invalid_id",
+    "invalid_text",
     "nan_state",
     "joint_out_of_range",
     "invalid_gripper",
@@ -157,6 +159,22 @@ def check_shape(what: str, where: object, found: Sequence[int], wanted: Sequence
             got=tuple(found),
             evidence={"shape": list(found)},
         )
+
+
+def check_texts(texts: Mapping[str, object], where: object) -> None:
+    """Raises: RejectedInputError (invalid_text) naming the first entry whose text is no valid Unicode."""
+    for name, value in texts.items():
+        found = unusable_text(value)
+        if found is not None:
+            raise RejectedInputError(
+                "invalid_text",
+                f"Text of {name} cannot be stored",
+                where=where,
+                expected="valid Unicode, without halves of surrogate pairs",
+                got=found,
+                next_step="correct the text in the recording's metadata",
+                evidence={"field": name},
+            )
 
 
 def check_finite(name: str, values: np.ndarray, where: object) -> None:

@@ -28,6 +28,7 @@ from worldline_core.store.remote import AnyPath, list_files, parse_location, pro
 type FileState = tuple[int, int, int, int] | None
 
 _LONGEST_STEM = 200
+_DIGEST_AT_END = re.compile("-[0-9a-f]{16}$")
 
 _opened: ContextVar[dict[Path, FileState] | None] = ContextVar("opened", default=None)
 """State of every local file of the present episode, as it was when it was first opened."""
@@ -256,13 +257,14 @@ def fill_template(template: str, **values: int | str) -> str:
 def safe_stem(name: str) -> str:
     """Any name as the beginning of a file name; different names give different stems.
 
-    Other characters than letters, digits, - and _ become _; a digest ends every stem that is not the name itself.
+    Other characters than letters, digits, - and _ become _; a digest ends every stem that is not the name itself, and that
+    of a name that looks as if it ended in one.
     """
     stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
-    if stem == name and len(stem.encode()) <= _LONGEST_STEM:
+    if stem == name and len(stem.encode()) <= _LONGEST_STEM and not _DIGEST_AT_END.search(name):
         return stem
     kept = stem if len(stem.encode()) <= _LONGEST_STEM else stem[: _LONGEST_STEM // 4]
-    return f"{kept}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return f"{kept}-{hashlib.sha256(name.encode()).hexdigest()[:16]}"
 
 
 def safe_name(name: str, what: str) -> str:

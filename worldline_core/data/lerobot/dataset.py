@@ -8,7 +8,9 @@ v2.1: meta/info.json, meta/tasks.jsonl, meta/episodes.jsonl, and per episode one
 
 from __future__ import annotations
 
+import io
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
@@ -398,6 +400,14 @@ class LeRobotV3Dataset(LeRobotDataset):
         return decode_frames(self.clip(episode_index, key), indices)
 
 
+_HALF_PAIR = re.compile(rb"\\(?:u[dD][89a-fA-F][0-9a-fA-F]{2}|.)", re.DOTALL)
+"""An escape of JSON. Arrow refuses a whole file for one half of a surrogate pair; of the episode list numbers alone are read."""
+
+
+def _kept_escape(found: re.Match[bytes]) -> bytes:
+    return found[0] if len(found[0]) == 2 else b"?"
+
+
 class _Task(BaseModel):
     task_index: int
     task: Any
@@ -416,7 +426,7 @@ class LeRobotV21Dataset(LeRobotDataset):
         schema = pa.schema([(INDEX, pa.float64()), ("length", pa.float64())])
         with unreadable("File is not JSON lines", path, (pa.ArrowException, OSError, ValueError)):
             table = pyarrow.json.read_json(
-                regular_file(path, "Episode list"),
+                io.BytesIO(_HALF_PAIR.sub(_kept_escape, regular_file(path, "Episode list").read_bytes())),
                 read_options=pyarrow.json.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES),
                 parse_options=pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
             )

@@ -4,6 +4,7 @@ and what the configuration declares of them."""
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,6 +18,7 @@ from worldline_core.data.episodes.source import ForeignSourceConfig
 from worldline_core.data.guards.rejection import RejectedInputError, check_rate
 from worldline_core.data.guards.source_paths import AnyPath, inside, relative_name
 from worldline_core.data.video.clip import video_size
+from worldline_core.untrusted_text import printable
 
 MAX_LENGTH = 512
 _DIGITS = re.compile(r"(\d+)")
@@ -43,13 +45,7 @@ class EpisodeFiles[C: ForeignSourceConfig]:
         self.root = root
         names = [relative_name(file, root) for file in found]
         wanted = {file: "-".join([config.label, *map(printable, parts_of(file))]) for file in names}
-        count = Counter(wanted.values())
-        self.files = {
-            name
-            if count[name] == 1
-            else f"{name}-{hashlib.sha256(printable(str(file)).encode()).hexdigest()[:8]}": file
-            for file, name in wanted.items()
-        }
+        self.files = {identity: file for file, identity in unique_names(wanted).items()}
 
     def episode_ids(self) -> list[str]:
         return sorted(self.files, key=by_number)
@@ -95,6 +91,19 @@ class EpisodeFiles[C: ForeignSourceConfig]:
         )
 
 
+def unique_names(wanted: Mapping[PurePosixPath, str]) -> dict[PurePosixPath, str]:
+    """A name for each file, no two alike: the wanted one, and where several files want it, with digits of the digest of
+    the path's bytes behind it; all 64 where a name was chosen to meet 8."""
+    names, digits = dict(wanted), dict.fromkeys(wanted, 0)
+    while len(set(names.values())) < len(names):
+        count = Counter(names.values())
+        for file in [file for file, name in names.items() if count[name] > 1]:
+            digits[file] = 64 if digits[file] else 8
+            digest = hashlib.sha256(os.fsencode(file)).hexdigest()
+            names[file] = f"{wanted[file]}-{digest[: digits[file]]}"
+    return names
+
+
 def timed_video_size(path: AnyPath, fps: float) -> tuple[int, int]:
     """(height, width) of a video.
 
@@ -103,11 +112,6 @@ def timed_video_size(path: AnyPath, fps: float) -> tuple[int, int]:
     height, width, rate = video_size(path)
     check_rate(rate, fps, path, tolerance=0.02)
     return height, width
-
-
-def printable(name: str) -> str:
-    """A path whose bytes are no UTF-8 as text that can be stored."""
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def by_number(episode_id: str) -> list[int | str]:

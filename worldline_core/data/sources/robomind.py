@@ -26,7 +26,7 @@ from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.source import EmbodimentName, ForeignSourceConfig, GripperRange, LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside
-from worldline_core.data.sources.episode_files import EpisodeFiles, printable
+from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.sources.hdf5 import (
     ArmPlace,
     Channels,
@@ -37,6 +37,7 @@ from worldline_core.data.sources.hdf5 import (
     require_h5py,
 )
 from worldline_core.data.sources.video_folder import caption_table
+from worldline_core.untrusted_text import printable
 
 LayoutName = Literal[
     "h5_franka_1rgb",

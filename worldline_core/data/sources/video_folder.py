@@ -9,13 +9,13 @@ of one folder share a scene: they may be cuts of one recording, and a split by v
 
 from __future__ import annotations
 
+import csv
+import json
+from collections.abc import Iterable
 from pathlib import PurePosixPath
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.json
 from pydantic import Field
 
 from worldline_core.config import StrictModel
@@ -23,35 +23,39 @@ from worldline_core.data.episodes.source import ForeignSourceConfig, LoadedEpiso
 from worldline_core.data.guards.plain_files import read_text
 from worldline_core.data.guards.rejection import RejectedInputError, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, regular_file
-from worldline_core.data.sources.episode_files import EpisodeFiles, printable
+from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.video.clip import VideoClip, frame_times, video_size
+from worldline_core.untrusted_text import printable
 
 
 def caption_table(path: AnyPath, video_key: str, caption_key: str) -> dict[str, str]:
     """Captions by the video's path in the folder, from a CSV file with a header, or JSON lines.
 
+    A text that is no valid Unicode is kept as it is: it costs its own episode.
+
     Raises: RejectedInputError: missing_file, special_file; unreadable for a table that is damaged, lacks a column or a
         text, or has two captions for one video.
     """
     file = regular_file(path, "Table of captions")
-    schema = pa.schema([(video_key, pa.string()), (caption_key, pa.string())])
-    with unreadable("Table of captions cannot be read", path, (pa.ArrowException, ValueError, OSError)):
-        if path.suffix.lower() == ".csv":
-            table = pyarrow.csv.read_csv(
-                file,
-                parse_options=pyarrow.csv.ParseOptions(newlines_in_values=True),
-                convert_options=pyarrow.csv.ConvertOptions(column_types=schema, include_columns=schema.names),
-            )
-        else:
-            options = pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore")
-            table = pyarrow.json.read_json(file, parse_options=options)
+    with (
+        unreadable("Table of captions cannot be read", path, (csv.Error, ValueError, OSError, RecursionError)),
+        file.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as lines,
+    ):
+        rows: Iterable[Any] = (
+            csv.DictReader(lines, strict=True)
+            if path.suffix.lower() == ".csv"
+            else (json.loads(line) for line in lines if line.strip())
+        )
         captions: dict[str, str] = {}
-        for row in table.to_pylist():
-            if None in row.values():
-                raise ValueError(f"a row lacks a text: {row}")
+        for number, row in enumerate(rows, 1):
+            texts = (row.get(video_key), row.get(caption_key)) if isinstance(row, dict) else (None,)
+            if not all(isinstance(text, str) for text in texts):
+                raise ValueError(f"row {number} lacks a text {video_key} or {caption_key}: {ascii(row)[:200]}")
             video, caption = row[video_key].removeprefix("./"), " ".join(row[caption_key].split())
             if captions.setdefault(video, caption) != caption:
                 raise ValueError(f"two captions for {video}")
+    if not captions:
+        raise RejectedInputError("unreadable", "Table of captions cannot be read", where=path, got="no row")
     return captions
 
 
