@@ -9,7 +9,7 @@ distill = ArtifactTask(
     function="worldline_core.distillation.distill:distill",
     config="worldline_core.distillation.distill_config:DistillConfig",
     inputs=("tracks", "episodes", "stage2", "tokenizer"),
-    optional_inputs=("latents",),
+    optional_inputs=("latents", "causal"),
     distributed=True,
 )
 

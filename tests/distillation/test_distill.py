@@ -181,6 +181,28 @@ def test_the_head_alone_is_distilled_and_said(inputs: dict[str, Path], tmp_path:
     assert read_checkpoint_info(tmp_path / "out").views == ("head",)
 
 
+def test_a_causal_model_goes_on_beside_its_teacher(finished: Finished, tmp_path: Path, make_model: Callable) -> None:
+    given = finished.inputs | {"causal": finished.output}
+    other = config().model_copy(update={"sigmas": (1.0, 0.9, 0.8, 0.6, 0.0)})
+    distill(other, given, tmp_path / "out")
+    before, after = read_checkpoint_info(finished.output), read_checkpoint_info(tmp_path / "out" / "teacher_forcing")
+    assert after.metadata["start"] == {"kind": "causal", "weights_sha256": before.weights_sha256}
+    assert after.causal == other.spec != before.causal
+    wider = make_model(0, intermediate_size=40)
+    save_checkpoint(tmp_path / "wide", wider, kind="causal", action_contract=before.contract, causal=before.causal)
+    with pytest.raises(
+        CheckpointError, match=r"(?s)Stage II model of its own form.*wide: intermediate_size.*got: .*40"
+    ):
+        distill(config(), given | {"causal": tmp_path / "wide"}, tmp_path / "no")
+    meant = before.contract.model_copy(update={"fps": 5.0})
+    save_checkpoint(tmp_path / "rate", make_model(0), kind="causal", action_contract=meant, causal=before.causal)
+    with pytest.raises(CheckpointError, match=r"(?s)contract differs.*fps.*expected: .*5\.0.*got: .*8\.0"):
+        distill(config(), given | {"causal": tmp_path / "rate"}, tmp_path / "no")
+    save_checkpoint(tmp_path / "two", make_model(0), kind="stage2", action_contract=before.contract)
+    with pytest.raises(CheckpointError, match=r"(?s)wrong kind.*causal.*stage2"):
+        distill(config(), given | {"causal": tmp_path / "two"}, tmp_path / "no")
+
+
 def test_a_finished_run_is_read_not_repeated(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*args: object, **kwargs: object) -> None:
         raise RuntimeError("trained again")

@@ -224,6 +224,36 @@ def test_stage2_goes_on_with_maps_of_the_same_meaning_only(
         train_stage2(stage2(2), {**world.inputs, "stage1": tmp_path / "stage2"}, tmp_path / "out")
 
 
+@pytest.mark.parametrize(
+    ("known", "told"),
+    [
+        (None, r"does not say which embodiments it saw; it now learns ['square']"),
+        ({"ur5e": 2}, "saw ['ur5e']; it now learns ['square']"),
+        ({"square": 1, "ur5e": 2}, None),
+    ],
+)
+def test_stage2_goes_on_with_another_robot_and_says_so(
+    world: Any,
+    model_config: MakeConfig,
+    make_contract: Callable[..., ActionContract],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    known: dict[str, int] | None,
+    told: str | None,
+) -> None:
+    model = WorldModel(model_config(towers="generation"))
+    model.initialise(torch.Generator().manual_seed(0))
+    facts = {} if known is None else {"embodiments": known}
+    contract = make_contract(sigma_px_ref=60.0, tokenizer="synthetic", grid_size=(4, 4))
+    save_checkpoint(tmp_path / "before", model, kind="stage2", action_contract=contract, metadata=facts)
+    train_stage2(stage2(2), {**world.inputs, "stage1": tmp_path / "before"}, tmp_path / "after")
+    after = load_checkpoint(tmp_path / "after")[1]
+    assert after.metadata["start"]["kind"] == "stage2"
+    assert set(after.metadata["embodiments"]) == {"square"}
+    assert ("it now learns" in caplog.text) is (told is not None)
+    assert told is None or told in caplog.text
+
+
 def test_controls_of_whole_intervals_reach_the_model_from_a_checkpoint_that_knew_none(
     world: Any, stage1_folder: Path, tmp_path: Path
 ) -> None:

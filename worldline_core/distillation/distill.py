@@ -72,7 +72,8 @@ LPIPS_OFF = "off: no LPIPS weights configured"
 def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Distill `stage2` on `tracks` and `episodes`; `tokenizer` decodes frames for the perceptual term.
 
-    Clips are cached `latents`, or frames that `tokenizer` encodes on the way (the trajectories keep their latents).
+    Clips are cached `latents`, or frames that `tokenizer` encodes on the way (the trajectories keep their latents). With
+    `causal`, a causal model of that Stage II model's form goes on: step 1 starts from its weights.
 
     Raises:
         CheckpointError: the checkpoint is not of Stage II, or its action maps and latents are not those given here.
@@ -113,6 +114,9 @@ class DistillationRun:
                 expected=info.views,
                 got=config.views,
             )
+        self.start = Path(inputs.get("causal", self.stage2))
+        if self.start != self.stage2:
+            self._check_continued(read_checkpoint_info(self.start))
         native = info.config.native_size
         self.episodes = episodes = EpisodeSet.open(Path(inputs["episodes"]))
         tracks = ActionTracks.open(Path(inputs["tracks"]), None if native is None else episodes)
@@ -134,10 +138,27 @@ class DistillationRun:
         """Folder of a step's checkpoint; the last step's is the result itself."""
         return self.output if step == STEPS[-1] else self.output / step
 
+    def _check_continued(self, causal: CheckpointInfo) -> None:
+        """Raises: CheckpointError: the causal model has another form or contract than the Stage II model."""
+        causal.contract.require(where=self.stage2, **self.info.contract.model_dump())
+        ours, theirs = (info.config.model_dump(exclude={"towers"}) for info in (self.info, causal))
+        differing = [name for name in ours if ours[name] != theirs[name]]
+        if differing:
+            raise CheckpointError(
+                "A causal model goes on beside a Stage II model of its own form",
+                where=f"{self.start}: {', '.join(differing)}",
+                expected={name: ours[name] for name in differing},
+                got={name: theirs[name] for name in differing},
+                next_step="give the Stage II model that it was distilled from, or leave out the input causal",
+            )
+        if causal.causal != self.config.spec:
+            logger.warning("The causal model goes on with other blocks: %s, now %s.", causal.causal, self.config.spec)
+
     def teacher_forcing(self) -> dict[str, float]:
-        """Step 1, from the Stage II model."""
+        """Step 1, from the Stage II model, or from a causal one that goes on."""
         settings, work = self.config.teacher_forcing, self._work(STEPS[0])
-        model, info = self._model(self.stage2, settings.trainer, expect_kind="stage2")
+        kind = "stage2" if self.start == self.stage2 else "causal"
+        model, info = self._model(self.start, settings.trainer, expect_kind=kind)
         views = {"view_weights": settings.view_weights, "single_view_factor": settings.single_view_factor}
         plan = batch_plan(settings.trainer, work)
         sampler = self._sampler(settings.trainer, self.config.clips.model_copy(update=views), plan)

@@ -5,6 +5,8 @@ Successes and failures are trained alike; no outcome label reaches the model.
 
 from __future__ import annotations
 
+import logging
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,8 @@ from worldline_core.training.stage import Stage
 from worldline_core.training.trainer import ParameterGroup
 from worldline_core.training.training_config import Stage2Config
 from worldline_core.training.video_teacher import load_teacher
+
+logger = logging.getLogger(__name__)
 
 
 def stage2_groups(model: WorldModel, action_multiplier: float) -> list[ParameterGroup]:
@@ -47,7 +51,8 @@ def stage2_model_config(config: Stage2Config, start: WorldModelConfig) -> WorldM
 
 
 def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    """Train on ``episodes`` and ``tracks`` from the checkpoint ``stage1``; ``teacher`` for the relational terms.
+    """Train on ``episodes`` and ``tracks`` from the checkpoint ``stage1``, a base, Stage I or Stage II one; ``teacher`` for the
+    relational terms. A Stage II model goes on with maps of the same meaning, of any embodiment; one that is new to it is said.
 
     Clips are cached ``latents``, or frames that ``tokenizer`` encodes on the way.
 
@@ -95,6 +100,15 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         kept = {"sigma_px_ref", "tokenizer", "fps"}
         learnt.require_tracks((row.episode_id for row in stage.rows), tracks)
         learnt.require(where=inputs["tracks"], **contract.model_dump(include=kept))
+    seen = Counter(row.embodiment for row in stage.training_rows)
+    if learnt is not None:
+        known = before.metadata.get("embodiments")
+        told = "does not say which embodiments it saw" if known is None else f"saw {sorted(known)}"
+        new = sorted(name for name in seen if known is None or name not in known)
+        if new:
+            logger.warning("The Stage II model that training goes on from %s; it now learns %s.", told, new)
+        if learnt.grid_size != contract.grid_size:
+            logger.warning("It saw latents of %s, and now sees %s.", learnt.grid_size, contract.grid_size)
     loader = stage.loader(tracks=tracks)
     objective = FlowMatchingObjective(
         model,
@@ -105,7 +119,10 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     )
     groups = stage2_groups(model, config.action_multiplier)
     result = stage.train(objective, groups, loader)
-    facts = {"start": {"kind": stage.parent_kind, "weights_sha256": stage.start}}
+    facts = {
+        "start": {"kind": stage.parent_kind, "weights_sha256": stage.start},
+        "embodiments": dict(sorted(seen.items())),
+    }
     counts = stage.save(result, kind="stage2", action_contract=contract, facts=facts)
     trained = sum(value.numel() for group in groups for value in group.parameters.values())
     return {**counts, "trained_parameters": trained, **result.metrics}
