@@ -64,6 +64,7 @@ def write(
     *,
     leave_out: tuple[int, ...] = (),
     format_name: str = "h264",
+    shown: list[int] | None = None,
 ) -> None:
     """Two seconds: a head camera (PNG or video), joints with an unset velocity, a moving head, a tool pose."""
 
@@ -97,10 +98,11 @@ def write(
             data = {"data": toy.png(coloured(number)), "format": "png"}
             message = stamped("CompressedImage", number / 30, frame_id="camera", **data)
         else:
-            message = stamped(
-                "CompressedVideo", number / 30, frame_id="camera", data=packets[number], format=format_name
-            )
-        sent.append((number / 30, "/image", message))
+            stamp = (shown[number] if shown else number) / 30
+            message = stamped("CompressedVideo", stamp, frame_id="camera", data=packets[number], format=format_name)
+        # B-frames reach the recorder when the last picture that they lean on was encoded.
+        behind = max(n - i for i, n in enumerate(shown)) if shown else 0
+        sent.append(((number + behind) / 30, "/image", message))
     for number in range(200):
         time = number / 100
         joints = [{"name": name, "position": value} for name, value in zip("ab", toy.joints(time), strict=True)]
@@ -249,7 +251,7 @@ def test_video_that_does_not_decode_is_refused(tmp_path: Path, toy: Any, foxglov
         foxglove,
         [packet if i != 20 else b"\x00\x00\x01\x09" for i, packet in enumerate(packets)],
     )
-    with pytest.raises(RejectedInputError, match=r"Video (frames are missing or damaged|cannot be decoded)") as caught:
+    with pytest.raises(RejectedInputError, match=r"Video frames depend on a message that is missing") as caught:
         load(declared(tmp_path)).frames("head")
     assert caught.value.reason == "truncated_video"
     write(tmp_path / "b.mcap", toy, foxglove, packets, format_name="vp9")
@@ -259,3 +261,116 @@ def test_video_that_does_not_decode_is_refused(tmp_path: Path, toy: Any, foxglov
     write(tmp_path / "c.mcap", toy, foxglove, no_keys[:60])
     with pytest.raises(RejectedInputError, match="No key frame comes before"):
         load(declared(tmp_path), "toy-c").frames("head")
+
+
+def with_b_frames(codec: str, parameters: str) -> tuple[list[bytes], list[int]]:
+    """Sixty messages in the order of decoding, and the number of the picture in each."""
+    encoder: Any = av.CodecContext.create(codec, "w")
+    encoder.width, encoder.height, encoder.pix_fmt = 64, 48, "yuv420p"
+    encoder.framerate, encoder.time_base = 30, Fraction(1, 30)
+    name = "x265-params" if codec == "libx265" else "x264-params"
+    encoder.options = {"crf": "10", name: f"keyint=15:min-keyint=15:scenecut=0:b-adapt=0:{parameters}"}
+    packets: list[Any] = []
+    for number in range(60):
+        frame = av.VideoFrame.from_ndarray(coloured(number), format="rgb24").reformat(format="yuv420p")
+        frame.pts = number
+        packets += encoder.encode(frame)
+    packets += encoder.encode(None)
+    shown = [packet.pts for packet in packets]
+    assert sorted(shown) == list(range(60)) != shown
+    return [bytes(packet) for packet in packets], shown
+
+
+B_FRAMES = [
+    ("libx264", "h264", "bframes=3:b-pyramid=none"),
+    ("libx264", "h264", "bframes=7:b-pyramid=normal"),
+    ("libx264", "h264", "bframes=2:open-gop=1"),
+    ("libx265", "h265", "bframes=3:log-level=none"),
+    ("libx265", "h265", "bframes=4:open-gop=1:log-level=none"),
+]
+
+
+@pytest.mark.parametrize(("codec", "name", "parameters"), B_FRAMES)
+def test_b_frames_are_decoded_as_logged_and_ordered_by_their_stamps(
+    tmp_path: Path, toy: Any, foxglove: dict[str, Any], codec: str, name: str, parameters: str
+) -> None:
+    packets, shown = with_b_frames(codec, parameters)
+    write(tmp_path / "a.mcap", toy, foxglove, packets, format_name=name, shown=shown)
+    frames = load(declared(tmp_path)).frames("head").astype(int)
+    assert len(frames) == 60
+    assert np.abs(frames.mean(axis=(1, 2, 3)) - (20 + 3 * np.arange(60))).max() < 1.5
+    if parameters != "bframes=2:open-gop=1":  # x264 writes its one IDR picture at the beginning then
+        ranges = {"by": "ranges", "ranges": [{"name": "late", "start_s": 1.25, "stop_s": 1.6}]}
+        late = load(declared(tmp_path, episodes=ranges), "toy-a-late")
+        means = late.frames("head").mean(axis=(1, 2, 3))
+        assert means[0] == pytest.approx(20 + 3 * 37.5, abs=5)
+        assert np.abs(means - means[0] - 3 * np.arange(late.episode.num_frames)).max() < 1.5
+    with pytest.raises(RejectedInputError, match=r"(?s)another order than their times.*set time: header") as caught:
+        load(declared(tmp_path, time="log")).frames("head")
+    assert caught.value.reason == "clock_skew"
+
+
+@pytest.mark.parametrize("lost", [21, 23, 24])
+def test_b_frames_before_a_lost_message_are_spoiled_too(
+    tmp_path: Path, toy: Any, foxglove: dict[str, Any], lost: int
+) -> None:
+    packets, shown = with_b_frames("libx264", "bframes=3:b-pyramid=none")
+    write(tmp_path / "a.mcap", toy, foxglove, packets, shown=shown, leave_out=(shown.index(lost),))
+    with pytest.raises(RejectedInputError, match="depend on a message that is missing") as caught:
+        load(declared(tmp_path))
+    assert caught.value.evidence["first_frame"] <= lost - 3
+
+
+def avcc(packet: bytes, size: int = 4) -> bytes:
+    """Annex B as in mp4."""
+    units = [unit.rstrip(b"\0") for unit in packet.replace(b"\0\0\0\1", b"\0\0\1").split(b"\0\0\1")[1:]]
+    return b"".join(len(unit).to_bytes(size) + unit for unit in units)
+
+
+@pytest.mark.parametrize("size", [4, 2])
+@pytest.mark.parametrize(("codec", "name"), [("libx264", "h264"), ("libx265", "h265")])
+def test_avcc_is_named(tmp_path: Path, toy: Any, foxglove: dict[str, Any], codec: str, name: str, size: int) -> None:
+    options = {"x265-params": "log-level=none:bframes=0:keyint=15"} if name == "h265" else {}
+    packets = [avcc(packet, size) for packet in annex_b(60, codec=codec, options=options)]
+    write(tmp_path / "a.mcap", toy, foxglove, packets, format_name=name)
+    with pytest.raises(RejectedInputError, match=rf"(?s)not in Annex B.*AVCC: lengths of {size} bytes.*mp4toannexb"):
+        load(declared(tmp_path)).frames("head")
+
+
+def without_sets(packet: bytes, name: str) -> tuple[bytes, bytes]:
+    """A message's parameter sets, and the rest."""
+    parts: tuple[list[bytes], list[bytes]] = [], []
+    for unit in packet.replace(b"\0\0\0\1", b"\0\0\1").split(b"\0\0\1")[1:]:
+        kind = (unit[0] >> 1) & 0x3F if name == "h265" else unit[0] & 0x1F
+        parts[kind not in ((32, 33, 34) if name == "h265" else (7, 8))].append(b"\0\0\0\1" + unit)
+    return b"".join(parts[0]), b"".join(parts[1])
+
+
+@pytest.mark.parametrize(("codec", "name"), [("libx264", "h264"), ("libx265", "h265")])
+@pytest.mark.parametrize("separate", [False, True])
+def test_parameter_sets_before_the_episode_are_used(
+    tmp_path: Path, toy: Any, foxglove: dict[str, Any], codec: str, name: str, separate: bool
+) -> None:
+    """They come once, with the file's first picture or in a message before it."""
+    options = {"x265-params": "log-level=none:bframes=0:keyint=15"} if name == "h265" else {}
+    packets = annex_b(60, codec=codec, options=options)
+    sets = without_sets(packets[0], name)[0]
+    assert sets
+    packets = [without_sets(packet, name)[1] if number else packet for number, packet in enumerate(packets)]
+    shown = None
+    if separate:
+        packets = [sets, without_sets(packets[0], name)[1], *packets[1:59]]
+        shown = [0, *range(59)]
+    write(tmp_path / "a.mcap", toy, foxglove, packets, format_name=name, shown=shown)
+    ranges = {"by": "ranges", "ranges": [{"name": "late", "start_s": 1.6, "stop_s": 1.9}]}
+    for each, identity in ((declared(tmp_path), "toy-a"), (declared(tmp_path, episodes=ranges), "toy-a-late")):
+        found = load(each, identity).frames("head").mean(axis=(1, 2, 3))
+        assert np.abs(found - found[0] - 3 * np.arange(len(found))).max() < 1.5
+        assert identity != "toy-a" or found[0] == pytest.approx(20, abs=1.5)
+    nowhere = [without_sets(packet, name)[1] for packet in packets]
+    write(
+        tmp_path / "a.mcap", toy, foxglove, [packet or nowhere[1] for packet in nowhere], format_name=name, shown=shown
+    )
+    with pytest.raises(RejectedInputError, match=r"Video|frames") as caught:
+        load(declared(tmp_path)).frames("head")
+    assert caught.value.reason == "truncated_video"

@@ -11,9 +11,9 @@ import re
 import struct
 import zlib
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -36,7 +36,14 @@ from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.guards.plain_files import decode_image
 from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
-from worldline_core.data.mcap.messages import IMAGE_KINDS, EncodedImage, Kind, MessageDecoder, RawImage
+from worldline_core.data.mcap.messages import (
+    IMAGE_KINDS,
+    VIDEO_CODECS,
+    EncodedImage,
+    Kind,
+    MessageDecoder,
+    RawImage,
+)
 from worldline_core.data.video.picture import Picture
 
 # What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
@@ -51,7 +58,7 @@ _LZ4_RATIO = 255
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
 _SMALLEST_BYTES = 2 * len(_MAGIC) + _FOOTER_BYTES
 _PNG = b"\x89PNG"
-_CODECS = {"h264": "h264", "h265": "hevc"}
+_MAX_PARAMETER_SETS = 64
 # ROS and Foxglove name -> bytes per pixel, and OpenCV's conversion to RGB.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
@@ -169,9 +176,21 @@ class McapFile:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, Kind, int, int | None, Any]]:
-        """(topic, kind, log time, header time or None, content) of these topics' messages with start <= log time < stop."""
+        """(topic, kind, log time, header time or None, content) of these topics' messages with start <= log time < stop.
+
+        Every message of a video is a picture: parameter sets in a message of their own are put before the next one.
+        """
+        held: dict[str, list[bytes]] = {}
         for schema, channel, record in self._records(topics, start_ns, stop_ns):
             kind, stamp_ns, value = self._decoder.decode(channel, schema, record.data)
+            if kind == "video":
+                value.check_video(f"{self.path}, topic {channel.topic}")
+                sets = held.setdefault(channel.topic, [])
+                if value.picture is None:
+                    sets[:] = [*sets, *value.parameter_sets()][-_MAX_PARAMETER_SETS:]
+                    continue
+                value = replace(value, data=b"".join([*sets, value.data])) if sets else value
+                sets.clear()
             yield channel.topic, kind, record.log_time, stamp_ns, value
 
     def streams(
@@ -200,7 +219,7 @@ class McapFile:
                 continue
             stream.frame = stream.frame or value.frame
             if kind == "video":
-                stream.key_frames.append(value.is_key_frame)
+                stream.key_frames.append(value.picture == "key")
         return streams
 
     def _records(
@@ -295,6 +314,8 @@ class ImageTrack:
         order: (n,) index in the file of the i-th message in time.
         chosen: (t,) index in time of each frame's image; ascending, an image may repeat.
         key_frames: (n,) frames of a video, in order of time, with which decoding can begin.
+        log_ns: (n,) log times of a video's frames, in order of time: with B-frames these are in another order, that of
+            decoding.
         camera: the images must have its size; None: any size.
     """
 
@@ -305,6 +326,7 @@ class ImageTrack:
     order: np.ndarray
     chosen: np.ndarray
     key_frames: np.ndarray | None = None
+    log_ns: np.ndarray | None = None
     camera: CameraTrack | None = None
 
     def frames(self) -> Iterator[np.ndarray]:
@@ -330,69 +352,115 @@ class ImageTrack:
             yield image
 
     def _images(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
-        for number, value in self._in_time(np.unique(self.chosen)):
+        numbers = np.unique(self.chosen)
+        for number, value in zip(numbers.tolist(), self._messages(self.order[numbers]), strict=True):
             place = f"{where}, image {number}"
             yield number, _raw_pixels(value, place) if isinstance(value, RawImage) else _picture_of(value, place)
 
     def _video(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
-        """Frames from the last key frame before the first chosen one on."""
+        """Frames from the last key frame before the first chosen one on, in order of time; none may be missing.
+
+        Messages are decoded in the order in which they were logged, and each picture has the number of its message.
+        """
         keys = np.flatnonzero([] if self.key_frames is None else self.key_frames[: self.chosen[0] + 1])
-        if not len(keys):
+        if not len(keys) or self.log_ns is None:
             what = "No key frame comes before the first frame of the episode"
             raise RejectedInputError("truncated_video", what, where=where, next_step="begin the episode later")
-        numbers = np.arange(keys[-1], self.chosen[-1] + 1)
-        expected = iter(numbers)
-        for number, image in _decoded(self._in_time(numbers), where):
-            if number != next(expected, None):
-                raise _lost_frame(f"{where}, frame {number}")
-            yield number, image
-        if next(expected, None) is not None:
-            raise _lost_frame(where)
+        first, last = int(keys[-1]), int(self.chosen[-1])
+        log_ns = int(self.log_ns[first])
+        logged = np.lexsort((self.order, self.log_ns))
+        place = np.empty_like(logged)
+        place[logged] = np.arange(len(logged))
+        numbers = logged[place[first] : place[first : last + 1].max() + 1]
+        packets = zip(numbers.tolist(), self._messages(self.order[numbers]), strict=True)
+        pictures = _decoded(packets, lambda: self._parameter_sets(log_ns), where)
+        expected, previous = first, -1
+        for number, image in pictures:
+            # Before the first: pictures that lean on an earlier key frame; after the last: what is shown later.
+            if first <= number <= last and number == expected > previous:
+                expected += 1
+                yield number, image
+            elif first <= number <= last or number < previous:
+                if number > previous and all(other != expected for other, _ in pictures):
+                    break
+                raise RejectedInputError(
+                    "clock_skew",
+                    "Pictures of a video come in another order than their times",
+                    where=f"{where}, frame {number}",
+                    expected="times of presentation in the headers of a video with B-frames",
+                    got=f"frame {expected} is shown after frame {max(number, previous)}",
+                    next_step="set time: header; or encode the video without B-frames",
+                )
+            previous = number
+        if expected <= last:
+            raise _lost_frame(f"{where}, frame {expected}")
 
-    def _in_time(self, numbers: np.ndarray) -> Iterator[tuple[int, Any]]:
-        """(index in time, content) of the messages with these indices, ascending."""
-        place = {int(message): number for number, message in enumerate(self.order)}
+    def _parameter_sets(self, log_ns: int) -> bytes:
+        """Those of the file up to a log time, the last ones last."""
+        found: dict[bytes, None] = {}
+        for *_, value in self.file.messages([self.topic], None, log_ns + 1):
+            for unit in value.parameter_sets():
+                found.pop(unit, None)
+                found[unit] = None
+                if len(found) > _MAX_PARAMETER_SETS:
+                    del found[next(iter(found))]
+        return b"".join(found)
+
+    def _messages(self, wanted: np.ndarray) -> Iterator[Any]:
+        """Contents of the messages with these indices in the file, in this order."""
+        indices = wanted.tolist()
         waiting: dict[int, Any] = {}
-        wanted = [int(number) for number in numbers]
-        needed, done = set(wanted), 0
+        needed, done = set(indices), 0
         for message, (*_, value) in enumerate(self.file.messages([self.topic], *self.around_ns)):
-            number = place.get(message, -1)
-            if number in needed:
-                waiting[number] = value
-            while done < len(wanted) and wanted[done] in waiting:
-                yield wanted[done], waiting.pop(wanted[done])
+            if message in needed:
+                waiting[message] = value
+            while done < len(indices) and indices[done] in waiting:
+                yield waiting.pop(indices[done])
                 done += 1
-            if done == len(wanted):
+            if done == len(indices):
                 return
         what = "File holds fewer images than when it was first read"
         where = f"{self.file.path}, topic {self.topic}"
-        raise RejectedInputError("changed_while_reading", what, where=where, expected=len(wanted), got=done)
+        raise RejectedInputError("changed_while_reading", what, where=where, expected=len(indices), got=done)
 
 
-def frames_after_loss(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray) -> np.ndarray:
+def frames_after_loss(
+    times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray, log_ns: np.ndarray | None = None
+) -> np.ndarray:
     """(n,) bool: video frames between a gap of more than 1.5 steps and the next key frame.
 
-    After a lost message a decoder returns wrong pictures, without an error, until the next key frame.
+    After a lost message a decoder returns wrong pictures, without an error, until the next key frame. B-frames before the
+    gap may depend on it too: as many as a picture is logged before its turn.
     """
     lost = np.concatenate([[False], np.diff(times_ns) > 1.5 * step_ns])
+    if log_ns is not None:
+        early = int((np.arange(len(lost)) - np.argsort(np.argsort(log_ns, kind="stable"))).max())
+        for gap in np.flatnonzero(lost):
+            lost[max(gap - early, 0) : gap] = True
     last_loss = np.maximum.accumulate(np.where(lost, np.arange(len(lost)), -1))
     last_key = np.maximum.accumulate(np.where(key_frames, np.arange(len(lost)), -1))
     return last_loss > last_key
 
 
-def _decoded(messages: Iterator[tuple[int, EncodedImage]], where: str) -> Iterator[tuple[int, np.ndarray]]:
-    """(index in time, RGB) of video messages, each one frame in Annex B."""
+def _decoded(
+    messages: Iterator[tuple[int, EncodedImage]], earlier_sets: Callable[[], bytes], where: str
+) -> Iterator[tuple[int, np.ndarray]]:
+    """(number, RGB) of video messages, each one frame in Annex B, in the order in which they are shown.
+
+    Args:
+        earlier_sets: parameter sets from before the first message, asked for where it has none.
+    """
     decoder: VideoCodecContext | None = None
     try:
-        for number, image in messages:
+        for place, (number, image) in enumerate(messages):
+            data = image.data
             if decoder is None:
-                if image.format not in _CODECS:
-                    what, expected = "Video codec is not supported", " or ".join(_CODECS)
-                    raise RejectedInputError("unknown_schema", what, where=where, expected=expected, got=image.format)
-                decoder = cast("VideoCodecContext", VideoCodecContext.create(_CODECS[image.format], "r"))
+                decoder = cast("VideoCodecContext", VideoCodecContext.create(VIDEO_CODECS[image.format], "r"))
                 decoder.thread_type = "NONE"
-            packet = av.Packet(image.data)
-            packet.pts = packet.dts = number
+                if not image.parameter_sets():
+                    data = earlier_sets() + data
+            packet = av.Packet(data)
+            packet.pts, packet.dts = number, place
             for frame in decoder.decode(packet):
                 yield _picture(frame, where)
         for frame in decoder.decode(None) if decoder is not None else ():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from functools import partial
@@ -62,6 +62,11 @@ SCHEMA_KINDS: dict[str, Kind] = {
 """Schemas that can be read, without `/msg`; Foxglove's may also come as `foxglove_msgs`."""
 
 
+VIDEO_CODECS = {"h264": "h264", "h265": "hevc"}
+"""Foxglove's names of codecs, and FFmpeg's."""
+_START_CODE = b"\0\0\1"
+
+
 @dataclass(frozen=True, slots=True)
 class EncodedImage:
     """A JPEG or PNG image, or one frame of a video in Annex B; `format` as in the message."""
@@ -70,25 +75,59 @@ class EncodedImage:
     data: bytes
     format: str
 
-    @property
-    def is_key_frame(self) -> bool:
-        """Whether decoding can begin with this frame: an IDR picture (H.264), or any random access point (H.265).
+    def units(self) -> Iterator[tuple[int, bytes]]:
+        """(type, bytes with a start code) of a video message's NAL units (ITU-T H.264 and H.265, 7.3 and annex B)."""
+        start = self.data.find(_START_CODE)
+        while 0 <= start < len(self.data) - 3:
+            stop = self.data.find(_START_CODE, start + 3)
+            header = self.data[start + 3]
+            yield (
+                ((header >> 1) & 0x3F if self.format == "h265" else header & 0x1F),
+                self.data[start : stop if stop > 0 else None],
+            )
+            start = stop
 
-        The first picture's NAL unit decides, not the parameter sets before it (ITU-T H.264 and H.265, 7.4).
+    @property
+    def picture(self) -> Literal["key", "other"] | None:
+        """Whether decoding can begin with this picture: an IDR picture (H.264), or any random access point (H.265).
+
+        None for a message of parameter sets alone. The first picture's NAL unit decides, not what comes before it.
         """
-        position = 0
-        while (position := self.data.find(b"\x00\x00\x01", position)) >= 0 and position + 3 < len(self.data):
-            header = self.data[position + 3]
-            if self.format == "h265":
-                kind = (header >> 1) & 0x3F
-                if kind < 32:
-                    return 16 <= kind <= 23
-            else:
-                kind = header & 0x1F
-                if 1 <= kind <= 5:
-                    return kind == 5
-            position += 3
-        return False
+        pictures = range(32) if self.format == "h265" else range(1, 6)
+        keys = range(16, 24) if self.format == "h265" else (5,)
+        first = next((kind for kind, _ in self.units() if kind in pictures), None)
+        return None if first is None else "key" if first in keys else "other"
+
+    def parameter_sets(self) -> list[bytes]:
+        """Sequence, picture and (H.265) video parameter sets of this message."""
+        wanted = (32, 33, 34) if self.format == "h265" else (7, 8)
+        return [unit for kind, unit in self.units() if kind in wanted]
+
+    def check_video(self, where: str) -> None:
+        """Raises: RejectedInputError (unknown_schema) for another codec than H.264 and H.265, or another form than Annex B."""
+        if self.format not in VIDEO_CODECS:
+            what, expected = "Video codec is not supported", " or ".join(VIDEO_CODECS)
+            raise RejectedInputError("unknown_schema", what, where=where, expected=expected, got=self.format)
+        if not re.match(rb"\x00\x00+\x01", self.data):
+            raise RejectedInputError(
+                "unknown_schema",
+                "Video messages are not in Annex B",
+                where=where,
+                expected="a start code (00 00 00 01) before every NAL unit",
+                got=f"AVCC: lengths of {self._length_bytes} bytes" if self._length_bytes else self.data[:8].hex(" "),
+                next_step="write the packets through FFmpeg's bitstream filter h264_mp4toannexb or hevc_mp4toannexb",
+            )
+
+    @property
+    def _length_bytes(self) -> int | None:
+        """Size of the lengths before the NAL units of mp4 (AVCC, HVCC); None where such lengths do not end with the data."""
+        for size in (4, 2, 1):
+            position = 0
+            while len(self.data) - position > size:
+                position += size + int.from_bytes(self.data[position : position + size])
+            if position == len(self.data) > 0:
+                return size
+        return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -276,8 +276,9 @@ class _Recording:
         """The chosen images, none of which is a video frame that depends on a lost message."""
         stream, arrivals = self.streams[self.config.views[view].image], self.images[view]
         keys = np.array(stream.key_frames, bool)[arrivals.order] if stream.key_frames else None
+        log_ns = np.array(stream.log_ns, np.int64)[arrivals.order]
         if keys is not None:
-            spoiled = frames_after_loss(arrivals.times_ns, arrivals.median_step_ns, keys)[chosen]
+            spoiled = frames_after_loss(arrivals.times_ns, arrivals.median_step_ns, keys, log_ns)[chosen]
             if spoiled.any():
                 first = int(np.argmax(spoiled))
                 raise RejectedInputError(
@@ -288,7 +289,9 @@ class _Recording:
                     next_step="cut the recording at the gap",
                     evidence={"first_frame": first, "frames": int(spoiled.sum())},
                 )
-        return ImageTrack(self.file, stream.topic, stream.kind, self.around_ns, arrivals.order, chosen, keys, camera)
+        return ImageTrack(
+            self.file, stream.topic, stream.kind, self.around_ns, arrivals.order, chosen, keys, log_ns, camera
+        )
 
     def _resampled(self, readings: TopicReadings, grid: np.ndarray) -> np.ndarray:
         signal = self.signals[readings]
