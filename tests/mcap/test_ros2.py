@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.source import LoadedEpisode
@@ -349,3 +351,17 @@ def test_an_empty_calibration_costs_the_view_its_camera_only(
     assert ("uncalibrated" in loaded.episode.conventions) is (why is not None)
     assert not loaded.distortions
     assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(loaded.episode.num_frames))
+
+
+def test_turned_stills_of_a_camera_are_refused(tmp_path: Path, toy: Any) -> None:
+    buffer, exif = io.BytesIO(), Image.Exif()
+    exif[0x0112] = 3
+    Image.fromarray(toy.picture(7)).save(buffer, "JPEG", exif=exif)
+    recording = toy.robot(1.0)
+    recording.change(
+        "/head/image/compressed",
+        lambda sent: (replace(s, message={**s.message, "format": "jpeg", "data": buffer.getvalue()}) for s in sent),
+    )
+    recording.write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path))
+    assert (error.reason, "orientation 3" in str(error)) == ("missing_calibration", True)

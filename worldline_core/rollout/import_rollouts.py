@@ -21,8 +21,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.orientation import UPRIGHT
 from worldline_core.data.guards.source_paths import find_files, relative_name
-from worldline_core.data.video.clip import VideoClip, frame_times, read_clip, video_size
+from worldline_core.data.video.clip import VideoClip, frame_times, read_clip, shown_size, video_size
 from worldline_core.errors import DataError
 from worldline_core.progress import with_progress
 from worldline_core.rollout.rollout_config import NAME_FIELD, ImportRolloutsConfig
@@ -166,7 +167,7 @@ def _check(
     for file in matched:
         position = episodes.position(file.episode_id)
         row = episodes.rows[position]
-        height, width, rate = video_size(folder / file.path)
+        rate, (height, width, _) = video_size(folder / file.path)[2], shown_size(folder / file.path)
         count = len(frame_times(folder / file.path))
         lengths[file.path] = count
         per_prediction[file.episode_id, file.seed].add(count)
@@ -210,12 +211,12 @@ def _write(
 ) -> None:
     """Write one file's views; every frame is decoded."""
     path, position = folder / file.path, episodes.position(file.episode_id)
-    height, width, _ = video_size(path)
+    height, width, orientation = shown_size(path)
     size = _recorded_size(episodes, position)
     views = config.shown if config.tiles else (file.view,)
     clip = VideoClip.whole_file(path, count, writer.fps)
     pictures = (picture.rgb for picture in read_clip(clip))
-    if config.tiles is None and (height, width) == size:
+    if config.tiles is None and (height, width, orientation) == (*size, UPRIGHT):
         with atomic_path(writer.root / video_path(file.episode_id, file.seed, file.view)) as temporary:
             shutil.copyfile(path, temporary)
         writer.register(file.episode_id, file.seed, file.view, count, size)

@@ -104,6 +104,7 @@ def prepare_episode(
             step,
             config.image_size,
             config.fit,
+            calibrated=view in episode.cameras,
         )
         for view in views
     }

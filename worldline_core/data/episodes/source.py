@@ -67,7 +67,7 @@ class LoadedEpisode:
         Raises: RejectedInputError, while it is iterated, for whatever cannot be read.
         """
         if view in self.clips:
-            yield from (picture.rgb for picture in read_clip(self.clips[view]))
+            yield from (picture.rgb for picture in read_clip(self.clips[view], calibrated=view in self.episode.cameras))
         else:
             yield from self.images(view)
 

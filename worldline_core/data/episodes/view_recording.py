@@ -23,6 +23,7 @@ from av.packet import Packet
 from av.video.stream import VideoStream
 
 from worldline_core.data.episodes.lerobot_writer import EpisodeVideo, ImageSampler
+from worldline_core.data.guards.orientation import UPRIGHT
 from worldline_core.data.guards.plain_files import expect_layout
 from worldline_core.data.guards.reader_process import still_reading
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
@@ -59,6 +60,7 @@ class RecordedView:
         clip: the encoded video, where the pictures are exactly its frames.
         step: every `step`-th picture is kept.
         image_size: (height, width) they are brought to by `fit`; None keeps theirs.
+        calibrated: whether the view has a camera: pictures of the clip that a display matrix turns are then refused.
     """
 
     images: Callable[[], Iterator[np.ndarray]]
@@ -67,6 +69,7 @@ class RecordedView:
     step: int = 1
     image_size: tuple[int, int] | None = None
     fit: Fit = "stretch"
+    calibrated: bool = False
 
     @classmethod
     def of(cls, frames: np.ndarray) -> RecordedView:
@@ -141,6 +144,8 @@ def _copied(
             return None
         for number, picture in enumerate(pictures):
             still_reading()
+            if number == 0 and picture.orientation != UPRIGHT:
+                return None  # pictures are stored upright, without a matrix
             small.add(picture.luma, full_range=picture.full_range)
             if sampler.wants(number):
                 sampler.add(picture.rgb)
@@ -176,7 +181,7 @@ def _encoded(
 def _pictures(recorded: RecordedView) -> Iterator[tuple[np.ndarray, bool, Callable[[], np.ndarray]]]:
     """Luma (H, W), whether it has the full range, and the picture in colour, which costs only when it is called."""
     if recorded.clip is not None:
-        for number, picture in enumerate(read_clip(recorded.clip)):
+        for number, picture in enumerate(read_clip(recorded.clip, calibrated=recorded.calibrated)):
             if picture.damaged:
                 raise damaged_frame(recorded.clip, picture, number)
             yield picture.luma, picture.full_range, lambda picture=picture: picture.rgb
@@ -235,7 +240,7 @@ def _write_copy(
         for number, packet in enumerate(chain(packets, (None,))):  # None: what the decoder still holds
             for frame in stream.codec_context.decode(packet):
                 picture = Picture(frame)
-                if picture.damaged or picture.size != size:
+                if picture.damaged or picture.stored_size != size:
                     raise damaged_frame(clip, picture, found)
                 yield picture
                 found += 1

@@ -29,8 +29,10 @@ def orientation_of(matrix: tuple[tuple[int, int], tuple[int, int]]) -> int:
     Raises: RejectedInputError (unreadable) for a matrix that does not turn by whole quarters.
     """
     values = np.asarray(matrix, dtype=np.float64)
-    (a, b), (c, d) = np.rint(values / (abs(values).max() or 1.0)).astype(int).tolist()
-    found = _ORIENTATIONS.get(((a, b), (c, d)))
+    values /= abs(values).max() or 1.0
+    (a, b), (c, d) = np.rint(values).astype(int).tolist()
+    whole = np.abs(values - np.rint(values)).max() < np.sin(np.deg2rad(1.0))
+    found = _ORIENTATIONS.get(((a, b), (c, d))) if whole else None
     if found is None:
         raise RejectedInputError(
             "unreadable",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -16,14 +17,16 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from PIL import Image
+from PIL import ExifTags, Image
 from pydantic import BaseModel, ValidationError
 
+from worldline_core.data.guards.orientation import QUARTER_TURNS, UPRIGHT, turned_view, upright
 from worldline_core.data.guards.rejection import (
     MAX_PIXELS,
     RejectedInputError,
     check_image_size,
     check_shape,
+    depth_picture,
     too_large,
     unreadable,
 )
@@ -168,18 +171,27 @@ _END_MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
 _LAST_BYTES = 256
 _SCAN = b"\xff\xda"
 _MAX_SCANS = 100
+_PNG_DEPTH, _PNG_GRAY, _DEPTH_BITS = 24, (0, 4), 16
+"""Place of the bits per channel in a PNG file, before the kind of colour; kinds of one channel."""
 
 
 def image_size(content: bytes, where: object) -> tuple[int, int]:
-    """(height, width) that a PNG or JPEG file states, without decoding it.
+    """(height, width) that a PNG or JPEG file is shown at, without decoding it.
 
-    Raises: RejectedInputError: too_large; unreadable for another format, a header that breaks off, an animation, an image
+    Raises: RejectedInputError: too_large; not_colour; unreadable for another format, a header that breaks off, an animation, an image
         without its end.
     """
+    height, width, orientation = _image_header(content, where)
+    return (width, height) if orientation in QUARTER_TURNS else (height, width)
+
+
+def _image_header(content: bytes, where: object) -> tuple[int, int, int]:
+    """Stored height and width, and orientation."""
     try:
         with Image.open(io.BytesIO(content), formats=tuple(_END_MARKS)) as image:
             (width, height), kind = image.size, "PNG" if image.format == "PNG" else "JPEG"
             animated = kind == "PNG" and getattr(image, "is_animated", False)
+            orientation = _exif_orientation(image)
     except Image.DecompressionBombError as error:
         raise too_large("Image has too many pixels", where=where, limit=MAX_PIXELS, got=str(error)) from error
     except Exception as error:
@@ -200,24 +212,40 @@ def image_size(content: bytes, where: object) -> tuple[int, int]:
             expected="one whole picture with the end mark of its format",
             got=f"{len(content)} bytes that end with {content[-8:].hex()}",
         )
-    return height, width
+    if kind == "PNG" and content[_PNG_DEPTH] == _DEPTH_BITS and content[_PNG_DEPTH + 1] in _PNG_GRAY:
+        raise depth_picture(where, f"a PNG of one channel of {_DEPTH_BITS} bits")
+    return height, width, orientation
 
 
-def decode_image(content: bytes, where: object, *, channels: str = "rgb") -> np.ndarray:
+def _exif_orientation(image: Image.Image) -> int:
+    if not image.info.get("exif"):
+        return UPRIGHT
+    try:
+        found = image.getexif().get(ExifTags.Base.Orientation, UPRIGHT)
+    except (ValueError, TypeError, LookupError, SyntaxError, OSError, OverflowError, struct.error):
+        return UPRIGHT  # of damaged notes no viewer turns a picture
+    return found if isinstance(found, int) and 1 <= found <= 8 else UPRIGHT
+
+
+def decode_image(content: bytes, where: object, *, channels: str = "rgb", calibrated: bool = False) -> np.ndarray:
     """uint8 (H, W, 3) of a PNG or JPEG file.
 
     Args:
         channels: "rgb", or "bgr" for OpenCV's order.
+        calibrated: whether the view has a camera; of a turned picture (EXIF) it is not known to which K belongs.
 
-    Raises: RejectedInputError: too_large by its header, unreadable.
+    Raises: RejectedInputError: too_large by its header, unreadable, not_colour; missing_calibration for a turned picture of
+        a calibrated view.
     """
-    height, width = image_size(content, where)
+    height, width, orientation = _image_header(content, where)
+    if calibrated and orientation != UPRIGHT:
+        raise turned_view(where, orientation)
     # Every scan of a progressive JPEG goes over the whole picture, however little it says; usual files have ten.
     if content.startswith(b"\xff\xd8") and (scans := content.count(_SCAN)) > _MAX_SCANS:
         raise too_large("Image has too many scans", where=where, limit=_MAX_SCANS, got=scans)
     with unreadable("Image cannot be decoded", where, (cv2.error,)):
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-    if image is None or image.shape[:2] not in ((height, width), (width, height)):  # EXIF may turn a JPEG
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None or image.shape[:2] != (height, width):
         raise RejectedInputError(
             "unreadable",
             "Image cannot be decoded",
@@ -225,15 +253,15 @@ def decode_image(content: bytes, where: object, *, channels: str = "rgb") -> np.
             expected=f"{width}x{height} as its header says",
             got="nothing" if image is None else f"{image.shape[1]}x{image.shape[0]}",
         )
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if channels == "rgb" else image
+    return upright(cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if channels == "rgb" else image, orientation)
 
 
-def read_image(path: AnyPath) -> np.ndarray:
+def read_image(path: AnyPath, *, calibrated: bool = False) -> np.ndarray:
     """uint8 (H, W, 3) RGB of a PNG or JPEG file.
 
-    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable.
+    Raises: RejectedInputError: missing_file, special_file, and as `decode_image`.
     """
     file = regular_file(path, "Image")
     with unreadable("Image cannot be read", path, (OSError,)):
         content = file.read_bytes()
-    return decode_image(content, path)
+    return decode_image(content, path, calibrated=calibrated)

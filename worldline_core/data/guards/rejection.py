@@ -19,6 +19,7 @@ Reason = Literal[
     "missing_column",
     "missing_view",
     "missing_calibration",
+    "not_colour",
     "unreadable",
     "path_traversal",
     "special_file",
@@ -130,6 +131,18 @@ def unreadable(what: str, where: object, faults: tuple[type[Exception], ...]) ->
             got=str(error),
             next_step="copy the file again; it may be damaged",
         ) from error
+
+
+def depth_picture(where: object, got: object) -> RejectedInputError:
+    """The rejection of depth where pictures in colour are expected."""
+    return RejectedInputError(
+        "not_colour",
+        "View holds depth, not colour",
+        where=where,
+        expected="pictures of 8 bits, or in colour",
+        got=got,
+        next_step="name the camera's colour stream instead",
+    )
 
 
 def too_large(what: str, *, where: object, limit: int, got: int | str, unit: str = "") -> RejectedInputError:

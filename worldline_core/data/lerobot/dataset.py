@@ -12,7 +12,7 @@ import io
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -39,6 +39,7 @@ VERSION = "v3.0"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 IMAGE_PREFIX = "observation.images."
+_DEPTH = "is_depth_map"
 
 
 class DatasetInfo(BaseModel):
@@ -143,6 +144,13 @@ def whole_number(row: dict[str, Any], key: str, where: object) -> int:
             got=repr(value),
         )
     return value
+
+
+def is_depth(feature: Mapping[str, Any]) -> bool:
+    """True if a camera's feature says that it holds depth, in any place where LeRobot's versions say it."""
+    notes = (feature, feature.get("info"), feature.get("video_info"))
+    said = (note.get(key) for note in notes if isinstance(note, Mapping) for key in note if str(key).endswith(_DEPTH))
+    return any(said)
 
 
 class LeRobotDataset(ABC):

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -33,6 +33,7 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 
 from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.data.guards.orientation import UPRIGHT, turned_view
 from worldline_core.data.guards.plain_files import decode_image
 from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
@@ -353,9 +354,10 @@ class ImageTrack:
 
     def _images(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
         numbers = np.unique(self.chosen)
+        still = partial(_picture_of, calibrated=self.camera is not None)
         for number, value in zip(numbers.tolist(), self._messages(self.order[numbers]), strict=True):
             place = f"{where}, image {number}"
-            yield number, _raw_pixels(value, place) if isinstance(value, RawImage) else _picture_of(value, place)
+            yield number, _raw_pixels(value, place) if isinstance(value, RawImage) else still(value, place)
 
     def _video(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
         """Frames from the last key frame before the first chosen one on, in order of time; none may be missing.
@@ -373,7 +375,7 @@ class ImageTrack:
         place[logged] = np.arange(len(logged))
         numbers = logged[place[first] : place[first : last + 1].max() + 1]
         packets = zip(numbers.tolist(), self._messages(self.order[numbers]), strict=True)
-        pictures = _decoded(packets, lambda: self._parameter_sets(log_ns), where)
+        pictures = _decoded(packets, lambda: self._parameter_sets(log_ns), where, calibrated=self.camera is not None)
         expected, previous = first, -1
         for number, image in pictures:
             # Before the first: pictures that lean on an earlier key frame; after the last: what is shown later.
@@ -443,7 +445,11 @@ def frames_after_loss(
 
 
 def _decoded(
-    messages: Iterator[tuple[int, EncodedImage]], earlier_sets: Callable[[], bytes], where: str
+    messages: Iterator[tuple[int, EncodedImage]],
+    earlier_sets: Callable[[], bytes],
+    where: str,
+    *,
+    calibrated: bool = False,
 ) -> Iterator[tuple[int, np.ndarray]]:
     """(number, RGB) of video messages, each one frame in Annex B, in the order in which they are shown.
 
@@ -462,18 +468,21 @@ def _decoded(
             packet = av.Packet(data)
             packet.pts, packet.dts = number, place
             for frame in decoder.decode(packet):
-                yield _picture(frame, where)
+                yield _picture(frame, where, calibrated=calibrated)
         for frame in decoder.decode(None) if decoder is not None else ():
-            yield _picture(frame, where)
+            yield _picture(frame, where, calibrated=calibrated)
     except av.error.FFmpegError as error:
         raise RejectedInputError("truncated_video", "Video cannot be decoded", where=where, got=str(error)) from error
 
 
-def _picture(frame: av.VideoFrame, where: str) -> tuple[int, np.ndarray]:
+def _picture(frame: av.VideoFrame, where: str, *, calibrated: bool) -> tuple[int, np.ndarray]:
     check_image_size(frame.width, frame.height, where)
     if frame.is_corrupt or frame.pts is None:
         raise _lost_frame(f"{where}, frame {frame.pts}")
-    return int(frame.pts), Picture(frame).rgb
+    picture = Picture(frame)
+    if calibrated and picture.orientation != UPRIGHT:
+        raise turned_view(where, picture.orientation)
+    return int(frame.pts), picture.rgb
 
 
 def _lost_frame(where: str) -> RejectedInputError:
@@ -481,7 +490,7 @@ def _lost_frame(where: str) -> RejectedInputError:
     return RejectedInputError("truncated_video", what, where=where, next_step=next_step)
 
 
-def _picture_of(image: EncodedImage, where: str) -> np.ndarray:
+def _picture_of(image: EncodedImage, where: str, *, calibrated: bool) -> np.ndarray:
     """RGB of a JPEG or PNG of 8 bits.
 
     A PNG of 16-bit grey (header: bit depth 16, colour type 0) is depth, and so is one behind the 12 bytes that ROS'
@@ -490,7 +499,7 @@ def _picture_of(image: EncodedImage, where: str) -> np.ndarray:
     data = image.data
     if _DEPTH.search(image.format) or (data[:4] == _PNG and data[24:26] == b"\x10\0") or data[12:16] == _PNG:
         raise _depth(where, f"{image.format!r} with a PNG of 16 bits" if _PNG in data[:16] else repr(image.format))
-    return decode_image(data, where)
+    return decode_image(data, where, calibrated=calibrated)
 
 
 def _depth(where: str, got: str) -> RejectedInputError:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -206,7 +206,7 @@ class EnerverseAcSource(EpisodeFiles[EnerverseAcSourceConfig]):
                     expected="one view in curate.sources[].views",
                     got=", ".join(config.views),
                 )
-            sizes = {config.views[0]: read_image(picture).shape[:2]}
+            sizes = {config.views[0]: read_image(picture, calibrated=True).shape[:2]}
         else:
             sizes = {view: timed_video_size(path, config.fps) for view, path in videos.items()}
             clips = {view: VideoClip.whole_file(path, length, config.fps) for view, path in videos.items()}
@@ -237,7 +237,7 @@ class EnerverseAcSource(EpisodeFiles[EnerverseAcSourceConfig]):
             conventions={"tool_offset_m": _TOOL_OFFSET_M, **fields.pop("posture", {}), **cameras.notes()},
             **fields,
         )
-        return LoadedEpisode(episode, config.views, lambda view: [read_image(picture)], clips=clips)
+        return LoadedEpisode(episode, config.views, lambda view: [read_image(picture, calibrated=True)], clips=clips)
 
 
 class AgibotGesimSource(EpisodeFiles[AgibotGesimSourceConfig]):
@@ -274,7 +274,7 @@ class AgibotGesimSource(EpisodeFiles[AgibotGesimSourceConfig]):
             conventions=conventions | cameras.notes(),
             **fields,
         )
-        return LoadedEpisode(episode, VIEWS, lambda view: map(read_image, images[view]))
+        return LoadedEpisode(episode, VIEWS, lambda view: map(partial(read_image, calibrated=True), images[view]))
 
 
 type Bundle = tuple[

@@ -286,8 +286,10 @@ Channels = Literal["as_written", "standard"]
 the files show red as blue, and OpenCV's own reading gives RGB back."""
 
 
-def hdf5_images(path: AnyPath, key: str, length: int, channels: Channels) -> Iterator[np.ndarray]:
-    """uint8 (H, W, 3) RGB, frame by frame.
+def hdf5_images(
+    path: AnyPath, key: str, length: int, channels: Channels, *, calibrated: bool = False
+) -> Iterator[np.ndarray]:
+    """uint8 (H, W, 3) RGB, frame by frame; `calibrated` as in `decode_image`.
 
     Raises: RejectedInputError, while it is iterated: missing_file, missing_column, length_mismatch, too_large (by the
         image's own header, before it is decoded), unreadable, path_traversal.
@@ -296,7 +298,8 @@ def hdf5_images(path: AnyPath, key: str, length: int, channels: Channels) -> Ite
     with open_hdf5(path) as file:
         for number, content in enumerate(file.image_files(key, length)):
             where = f"{path}, {key}, frame {number}"
-            image = decode_image(content, where, channels="bgr" if channels == "as_written" else "rgb")
+            order = "bgr" if channels == "as_written" else "rgb"
+            image = decode_image(content, where, channels=order, calibrated=calibrated)
             first = first or image.shape
             if image.shape != first:
                 raise RejectedInputError(

@@ -30,9 +30,16 @@ from worldline_core.data.episodes.source import (
     says_droid,
     sorted_views,
 )
-from worldline_core.data.guards.rejection import RATE_TOLERANCE, RejectedInputError, all_of, check_rate, collect_faults
+from worldline_core.data.guards.rejection import (
+    RATE_TOLERANCE,
+    RejectedInputError,
+    all_of,
+    check_rate,
+    collect_faults,
+    depth_picture,
+)
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
-from worldline_core.data.lerobot.dataset import DatasetInfo, LeRobotV3Dataset, LeRobotV21Dataset
+from worldline_core.data.lerobot.dataset import DatasetInfo, LeRobotV3Dataset, LeRobotV21Dataset, is_depth
 from worldline_core.data.sources.calibration_file import add_calibrated_view, read_calibration
 from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.errors import ConfigError, DataError
@@ -305,6 +312,8 @@ class LeRobotSource:
             if unknown:
                 expected, got = ", ".join(known), ", ".join(unknown)
                 raise ConfigError(f"The dataset has no {what} of this name", where=root, expected=expected, got=got)
+        if depth := [key for key in config.views if is_depth(features[key])]:
+            raise depth_picture(root, f"is_depth_map of {', '.join(depth)} in meta/info.json")
         self._columns = state_columns(config, features, str(root))
         self._calibration = lru_cache(maxsize=1)(lambda name: read_calibration(inside(root, name)))
 

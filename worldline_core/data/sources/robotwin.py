@@ -104,7 +104,9 @@ class RobotwinSource(EpisodeFiles[RobotwinSourceConfig]):
         return LoadedEpisode(
             episode,
             tuple(config.views),
-            lambda view: hdf5_images(path, f"observation/{config.views[view]}/rgb", length, "as_written"),
+            lambda view: hdf5_images(
+                path, f"observation/{config.views[view]}/rgb", length, "as_written", calibrated=True
+            ),
         )
 
     def _instruction(self, path: AnyPath) -> str:

@@ -22,7 +22,14 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 
-from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size, too_large
+from worldline_core.data.guards.orientation import UPRIGHT, turned_view
+from worldline_core.data.guards.rejection import (
+    MAX_PIXELS,
+    RejectedInputError,
+    check_image_size,
+    depth_picture,
+    too_large,
+)
 from worldline_core.data.guards.source_paths import AnyPath, local_file, regular_file
 from worldline_core.data.video.picture import Picture
 from worldline_core.errors import DataError
@@ -31,6 +38,8 @@ FRAME_TOLERANCE = 0.25
 """A decoded frame is the wanted one when their times differ by less than this share of a frame's duration."""
 _BOUNDED = {"max_pixels": str(MAX_PIXELS)}
 _MAX_STREAMS = 16
+_DEEP_GRAY = ("gray9", "gray1", "gray3", "grayf", "ya16")
+"""Beginnings of pixel formats of one channel with more than 8 bits."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +145,9 @@ def open_video(path: AnyPath) -> Iterator[tuple[InputContainer, VideoStream]]:
             if stream.codec_context is None:  # the type stubs know no such stream
                 raise undecodable(path, "a codec that this FFmpeg does not know")
             check_image_size(stream.width, stream.height, str(path))
+            pixel_format = str(stream.codec_context.pix_fmt)
+            if pixel_format.startswith(_DEEP_GRAY):
+                raise depth_picture(path, f"a video of {pixel_format}")
             claimed, size = stream.frames, file.stat().st_size
             if claimed > size:
                 raise too_large("Video claims more frames than it has bytes", where=path, limit=size, got=claimed)
@@ -149,13 +161,26 @@ def open_video(path: AnyPath) -> Iterator[tuple[InputContainer, VideoStream]]:
 
 
 def video_size(path: AnyPath) -> tuple[int, int, float]:
-    """(height, width, frames per second) from the container, without decoding.
+    """(height, width, frames per second) from the container, without decoding: not turned by a display matrix.
 
     Raises: DataError when the file is missing or not a video.
     """
     with open_video(path) as (_, stream):
         rate = stream.average_rate or stream.base_rate or Fraction(0)
         return stream.height, stream.width, float(rate)
+
+
+def shown_size(path: AnyPath) -> tuple[int, int, int]:
+    """(height, width, orientation as EXIF counts) of the first picture as it is shown.
+
+    Raises: RejectedInputError as `open_video`; truncated_video where there is no picture.
+    """
+    with open_video(path) as (container, stream):
+        frame = next(container.decode(stream), None)
+        if frame is None:
+            raise undecodable(path, "no frames")
+        picture = Picture(frame)
+        return *picture.size, picture.orientation
 
 
 def frame_times(path: AnyPath) -> np.ndarray:
@@ -206,16 +231,19 @@ def seek_before(container: InputContainer, stream: VideoStream, time: float) -> 
     yield from container.decode(stream)
 
 
-def read_clip(clip: VideoClip) -> Iterator[Picture]:
+def read_clip(clip: VideoClip, *, calibrated: bool = False) -> Iterator[Picture]:
     """The pictures of a clip in order, num_frames of them.
 
+    Args:
+        calibrated: whether the view has a camera; of turned pictures it is not known to which K belongs.
+
     Raises: RejectedInputError (missing_file, unreadable, too_large; truncated_video when frames are missing,
-        length_mismatch when the file has too many).
+        length_mismatch when the file has too many; missing_calibration for turned pictures of a calibrated view).
     """
-    if clip.from_time is None:
-        yield from _counted(clip)
-    else:
-        yield from _timed(clip)
+    for picture in _counted(clip) if clip.from_time is None else _timed(clip):
+        if calibrated and picture.orientation != UPRIGHT:
+            raise turned_view(clip.path, picture.orientation)
+        yield picture
 
 
 def _counted(clip: VideoClip) -> Iterator[Picture]:
@@ -290,7 +318,7 @@ def damaged_frame(clip: VideoClip, picture: Picture, number: int) -> RejectedInp
         "Frame is damaged" if picture.damaged else "Frame has another size than its video",
         where=f"{clip.path}, frame {number}",
         expected="a whole frame of the video's size",
-        got="one that the decoder had to make up in part" if picture.damaged else str(picture.size),
+        got="one that the decoder had to make up in part" if picture.damaged else str(picture.stored_size),
         next_step="copy the file again; it may be damaged",
         evidence={"frame": number, "decoded_frames": number, "expected_frames": clip.num_frames},
     )

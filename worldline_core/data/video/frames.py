@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from worldline_core.data.guards.plain_files import expect_layout
-from worldline_core.data.video.clip import VideoClip, decode_frames, read_clip, video_size
+from worldline_core.data.video.clip import VideoClip, decode_frames, read_clip, shown_size
 
 
 class Frames(Protocol):
@@ -41,8 +41,8 @@ class VideoFrames:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(n, h, w, 3), by the file's header."""
-        return len(self), *video_size(self._clip.path)[:2], 3
+        """(n, h, w, 3), by the file's first picture."""
+        return len(self), *shown_size(self._clip.path)[:2], 3
 
     def __iter__(self) -> Iterator[np.ndarray]:
         """Raises: as `read_clip`."""

@@ -48,9 +48,14 @@ class Picture:
         return orientation_of(((a, b), (c, d)))
 
     @property
+    def stored_size(self) -> tuple[int, int]:
+        """(height, width) before it is turned."""
+        return self._frame.height, self._frame.width
+
+    @property
     def size(self) -> tuple[int, int]:
         """(height, width) as it is shown."""
-        height, width = self._frame.height, self._frame.width
+        height, width = self.stored_size
         return (width, height) if self.orientation in QUARTER_TURNS else (height, width)
 
     @property

@@ -1,0 +1,248 @@
+"""Pictures that are stored turned or mirrored, and pictures of depth: one rule in every path.
+
+The display matrix is written into the mp4's track header byte by byte, so no tool's reading of angles takes part.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import struct
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from published_lerobot import FRAMES as LEROBOT_FRAMES
+from published_lerobot import HEIGHT, WIDTH, write_robocoin
+
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.plain_files import decode_image, image_size
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.video.clip import FrameDecoder, VideoClip, read_clip, shown_size
+from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.frames import VideoFrames
+from worldline_core.errors import DataError
+
+FRAMES, RATE = 5, 10
+# (a, b, c, d) of ISO/IEC 14496-12, 6.2.2: a stored point (x, y) is shown at (a x + c y, b x + d y).
+MATRICES = {
+    1: (1, 0, 0, 1), 2: (-1, 0, 0, 1), 3: (-1, 0, 0, -1), 4: (1, 0, 0, -1),
+    5: (0, 1, 1, 0), 6: (0, 1, -1, 0), 7: (0, -1, -1, 0), 8: (0, -1, 1, 0),
+}  # fmt: skip
+STORED = np.array(
+    [[(200, 30, 40), (30, 180, 60), (40, 60, 210)], [(230, 220, 40), (120, 120, 120), (20, 200, 220)]], np.uint8
+)
+
+
+def large(patches: np.ndarray) -> np.ndarray:
+    return patches.repeat(32, 0).repeat(32, 1)
+
+
+def as_shown(matrix: tuple[int, int, int, int]) -> np.ndarray:
+    """The patches where the matrix puts them."""
+    a, b, c, d = matrix
+    places = {(a * x + c * y, b * x + d * y): STORED[y, x] for y in range(2) for x in range(3)}
+    columns, rows = (sorted({place[i] for place in places}) for i in (0, 1))
+    return np.array([[places[x, y] for x in columns] for y in rows])
+
+
+def set_matrix(path: Path, matrix: tuple[float, float, float, float]) -> None:
+    """Write a display matrix into the header of every track."""
+    content = bytearray(path.read_bytes())
+    a, b, c, d = (round(value * 65536) for value in matrix)
+    position = 0
+    while (position := content.find(b"tkhd", position)) >= 0:
+        position += 4
+        content[position + 40 : position + 76] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+
+
+def turned_video(path: Path, matrix: tuple[float, float, float, float]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    encode_video(path, [large(STORED)] * FRAMES, RATE, crf=4)
+    set_matrix(path, matrix)
+    return path
+
+
+def off(frames: np.ndarray, patches: np.ndarray) -> int:
+    height, width = frames.shape[-3] // patches.shape[0], frames.shape[-2] // patches.shape[1]
+    centres = frames[..., height // 2 :: height, width // 2 :: width, :]
+    assert centres.shape[-3:] == patches.shape
+    return int(np.abs(centres.astype(int) - patches).max())
+
+
+@pytest.mark.parametrize("orientation", MATRICES)
+@pytest.mark.parametrize("image_size", [None, (96, 96)])
+def test_videos_are_turned_in_every_path_and_stored_upright(
+    tmp_path: Path, orientation: int, image_size: tuple[int, int] | None
+) -> None:
+    expected = as_shown(MATRICES[orientation])
+    path = turned_video(tmp_path / "raw" / "a.mp4", MATRICES[orientation])
+    if shutil.which("ffmpeg") is not None:
+        command = ["ffmpeg", "-v", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+        raw = subprocess.run(command, capture_output=True, check=True).stdout
+        assert off(np.frombuffer(raw, np.uint8).reshape(FRAMES, *large(expected).shape), expected) <= 3
+    clip = VideoClip.whole_file(path, FRAMES, RATE)
+    decoder = FrameDecoder()
+    trained = np.stack(list(decoder.frames(clip, range(FRAMES))))
+    decoder.close()
+    seen = list(read_clip(clip))
+    assert np.array_equal(np.stack([picture.rgb for picture in seen]), trained)
+    assert off(trained, expected) <= 3
+    assert seen[0].size == seen[0].luma.shape == trained.shape[1:3]
+    gray = cv2.cvtColor(trained[0], cv2.COLOR_RGB2GRAY)[16::32, 16::32]
+    assert np.abs((seen[0].luma[16::32, 16::32] - 16.0) * 255 / 219 - gray).max() <= 3
+    assert VideoFrames(clip).shape == (FRAMES, *large(expected).shape)
+    assert shown_size(path) == (*large(expected).shape[:2], orientation)
+
+    source = {"kind": "video_folder", "path": str(tmp_path / "raw"), "name": "web", "split": "train"}
+    config = CurateConfig.model_validate({"sources": [source], "image_size": image_size})
+    counts = curate(config, {}, tmp_path / "out")
+    copied = int(orientation == 1 and image_size is None)
+    assert counts["videos"] == {"copied": copied, "encoded": 1 - copied}
+    curated = EpisodeSet.open(tmp_path / "out")
+    assert off(curated.frames(0, "head"), expected) <= 3
+    with av.open(str(curated.clip(0, "head").path)) as container:
+        assert next(container.decode(video=0)).side_data.get("DISPLAYMATRIX") is None
+
+
+@pytest.mark.parametrize("angle_deg", [30.0, 45.0, 10.0])
+def test_a_video_that_is_shown_askew_is_refused(tmp_path: Path, angle_deg: float) -> None:
+    sine, cosine = np.sin(np.deg2rad(angle_deg)), np.cos(np.deg2rad(angle_deg))
+    path = turned_video(tmp_path / "a.mp4", (cosine, sine, -sine, cosine))
+    with pytest.raises(RejectedInputError, match="no whole quarter"):
+        _ = next(read_clip(VideoClip.whole_file(path, FRAMES, RATE))).rgb
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 2])
+@pytest.mark.parametrize("image_size", [None, (36, 64)])
+def test_a_camera_of_a_turned_video_is_refused_by_name(
+    tmp_path: Path, project_root: Path, orientation: int, image_size: tuple[int, int] | None
+) -> None:
+    import yaml
+
+    write_robocoin(tmp_path / "raw", episodes=2)
+    K = [[60.0, 0.0, 63.5], [0.0, 62.0, 35.5], [0.0, 0.0, 1.0]]
+    pose = np.eye(4).tolist()
+    entry = {"width": WIDTH, "height": HEIGHT, "K": K, "maps": "camera_to_base", "axes": "opencv", "T": pose}
+    (tmp_path / "raw/meta/calibration.json").write_text(json.dumps({"views": {"head": entry}}))
+    preset = yaml.safe_load((project_root / "configs/sources/robocoin.yaml").read_text())["curate"]["sources"][0]
+    (key,) = (key for key, view in preset["views"].items() if view == "head")
+    (video,) = (tmp_path / "raw").rglob(f"{key}/episode_000001.mp4")
+    set_matrix(video, MATRICES[orientation])
+    source = {**preset, "path": str(tmp_path / "raw"), "name": "coin", "collection": False}
+    declared = {**source, "calibration": "meta/calibration.json"}
+    config = CurateConfig.model_validate({"sources": [declared], "image_size": image_size, "near_duplicates": False})
+    counts = curate(config, {}, tmp_path / "out")
+    assert (counts["kept"], counts["reasons"]) == (1, {"missing_calibration": 1})
+    (row,) = EpisodeSet.open(tmp_path / "out").quarantine()
+    assert row.episode_id == "coin-000001"
+    assert f"orientation {orientation}" in row.detail
+    assert "write the pictures upright" in row.detail
+    # Without a camera it is turned like any other.
+    config = CurateConfig.model_validate({"sources": [source], "image_size": image_size, "near_duplicates": False})
+    assert curate(config, {}, tmp_path / "free")["kept"] == 2
+    assert EpisodeSet.open(tmp_path / "free").frames(1, "head").shape[0] == LEROBOT_FRAMES
+
+
+def with_exif(orientation: int, kind: str) -> bytes:
+    buffer, exif = io.BytesIO(), Image.Exif()
+    exif[0x0112] = orientation
+    options: dict[str, Any] = {"quality": 98, "subsampling": 0} if kind == "JPEG" else {}
+    Image.fromarray(large(STORED)).save(buffer, kind, exif=exif, **options)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+@pytest.mark.parametrize("orientation", MATRICES)
+def test_images_are_turned_as_exif_says(orientation: int, kind: str) -> None:
+    expected = as_shown(MATRICES[orientation])  # EXIF 2.32, 4.6.4: the same eight
+    content = with_exif(orientation, kind)
+    found = decode_image(content, "here")
+    assert off(found, expected) <= 4
+    assert np.array_equal(decode_image(content, "here", channels="bgr"), found[..., ::-1])
+    assert image_size(content, "here") == found.shape[:2] == large(expected).shape[:2]
+    if orientation == 1:
+        decode_image(content, "here", calibrated=True)
+        return
+    with pytest.raises(RejectedInputError, match=f"orientation {orientation}") as caught:
+        decode_image(content, "here", calibrated=True)
+    assert caught.value.reason == "missing_calibration"
+
+
+@pytest.mark.parametrize("value", [0, 9, 65535])
+def test_an_orientation_that_is_none_turns_nothing(value: int) -> None:
+    assert off(decode_image(with_exif(value, "JPEG"), "here", calibrated=True), STORED) <= 4
+
+
+def png(image: np.ndarray) -> bytes:
+    return bytes(cv2.imencode(".png", image)[1])
+
+
+def test_images_of_depth_are_no_pictures() -> None:
+    depth = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 50
+    with pytest.raises(RejectedInputError, match="depth, not colour") as caught:
+        decode_image(png(depth), "here")
+    assert caught.value.reason == "not_colour"
+    colour = np.stack([depth, depth, depth], axis=-1)
+    assert decode_image(png(colour), "here").shape == (24, 32, 3)  # 16 bits of colour are colour
+    assert decode_image(png((depth >> 8).astype(np.uint8)), "here").shape == (24, 32, 3)  # a grey camera
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixel_format"), [("ffv1", "gray16le"), ("libx265", "gray12le"), ("libx265", "gray10le")]
+)
+def test_a_video_of_depth_is_no_video(tmp_path: Path, codec: str, pixel_format: str) -> None:
+    path = tmp_path / "a.mkv"
+    options = {"x265-params": "log-level=none"} if codec == "libx265" else {}
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream(codec, rate=RATE, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, pixel_format
+        for number in range(3):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64), 4000 * number, np.uint16), format="gray16le")
+            frame = frame.reformat(format=pixel_format)
+            frame.pts = number
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    with pytest.raises(RejectedInputError, match=f"video of {pixel_format}"):
+        next(read_clip(VideoClip(path, 3, RATE)))
+
+
+SAYS_DEPTH: list[Callable[[dict[str, Any]], None]] = [
+    lambda feature: feature.update(info={"video.is_depth_map": True}),
+    lambda feature: feature.update(info={"is_depth_map": True}),
+    lambda feature: feature.update(video_info={"video.is_depth_map": True}),
+    lambda feature: feature.update(is_depth_map=True),
+]
+
+
+@pytest.mark.parametrize("say", SAYS_DEPTH)
+def test_a_depth_video_of_lerobot_is_refused_by_name(
+    tmp_path: Path, project_root: Path, say: Callable[[dict[str, Any]], None]
+) -> None:
+    import yaml
+
+    for name in ("one", "two"):
+        write_robocoin(tmp_path / "raw" / name)
+    path = tmp_path / "raw/two/meta/info.json"
+    preset = yaml.safe_load((project_root / "configs/sources/robocoin.yaml").read_text())["curate"]["sources"][0]
+    key = next(iter(preset["views"]))
+    info = json.loads(path.read_text())
+    say(info["features"][key])
+    path.write_text(json.dumps(info))
+    source = {**preset, "path": str(tmp_path / "raw"), "name": "coin", "collection": True}
+    counts = curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "out")
+    assert counts["reasons"]["not_colour"] == 1
+    alone = {**source, "path": str(tmp_path / "raw/two"), "collection": False}
+    with pytest.raises(DataError, match="depth, not colour") as caught:
+        curate(CurateConfig.model_validate({"sources": [alone]}), {}, tmp_path / "alone")
+    assert key in str(caught.value)
