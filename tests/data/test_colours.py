@@ -166,7 +166,7 @@ def test_video_messages_have_their_colours(tmp_path: Path, codec: str, full: boo
         for number, packet in enumerate(packets):
             yield number, EncodedImage("", bytes(packet), kind)
 
-    found = [image for _, image in _decoded(messages(), "here")]
+    found = [image for _, image in _decoded(messages(), bytes, "here")]
     assert found
     assert max(map(off, found)) <= TOLERANCE
 
