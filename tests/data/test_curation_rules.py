@@ -21,7 +21,7 @@ from worldline_core.data.curation.source_table import read_source_table, write_s
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.errors import ConfigError
+from worldline_core.errors import ConfigError, DataError
 
 Make = Callable[..., tuple]
 SIZE = (64, 96)
@@ -231,3 +231,17 @@ def test_the_clip_sampler_follows_these_weights(tmp_path: Path) -> None:
     drawn = [clip.episode_id for index in range(80) for clip in sampler.clips(index).clips]
     share = sum(name.startswith("small") for name in drawn) / len(drawn)
     assert share == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / len(drawn)))
+
+
+def test_one_scene_is_split_by_episode_or_refused(tmp_path: Path) -> None:
+    raw = record(tmp_path / "raw", [room(n, f"e{n}", outcome=("success", "failure")[n % 2]) for n in range(12)])
+    given: dict[str, Any] = {"image_size": None, "near_duplicates": False}
+    with pytest.raises(
+        DataError, match=r"(?s)holds nothing out.*got: 12 of 12 episodes in train, of 1 scene\n.*by: episode"
+    ):
+        curate(config(raw, splits={"by": "scene", "test": 0.2, "seed": 1}, **given), {}, tmp_path / "scene")
+    counts = curate(config(raw, splits={"by": "episode", "test": 0.2}, **given), {}, tmp_path / "out")
+    assert counts["splits"] == {"test": 2, "train": 9, "validation": 1}
+    rows = EpisodeSet.open(tmp_path / "out").rows
+    assert {row.outcome for row in rows if row.split == "test"} == {"success", "failure"}
+    assert EpisodeSet.open(tmp_path / "out").episode(0).split == rows[0].split

@@ -12,10 +12,10 @@ from itertools import batched
 from pathlib import Path
 from typing import Any, ClassVar
 
-from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits
 from worldline_core.data.curation.episode_checks import check_episode
 from worldline_core.data.curation.recorded_episode import TRIMMED, prepare_episode, trimmed
-from worldline_core.data.curation.rules import decided_rows
+from worldline_core.data.curation.rules import check_held_out, decided_rows, drawn_episodes
 from worldline_core.data.curation.source_table import write_source_table, write_source_weights
 from worldline_core.data.episodes.episode_index import QuarantineRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set_writer import VIDEOS_FILE, EpisodeSetWriter
@@ -72,6 +72,10 @@ def curate(
         pieces = [piece for episodes in listed for piece in batched(episodes, mapper.episodes_per_shard)]
         map_episodes(mapper, work, pieces)
         _quarantine_duplicates_and_leaks(work, listed)
+        if isinstance(config.splits, DrawnSplits) and config.splits.by == "episode":
+            work.writer.assign_splits(drawn_episodes(config.splits, work.writer.kept()))
+        kept = work.writer.kept()
+        check_held_out(config, [part["split"] for part in kept], len({part["scene"] for part in kept}))
         write_account(output, [work.row(identity) for identity in identities])
         work.writer.close()
     rows, rejected = read_index(output), read_quarantine(output)

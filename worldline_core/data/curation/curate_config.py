@@ -18,33 +18,33 @@ from worldline_core.geometry.cameras import Fit
 AVAILABLE = "available"
 
 
-class SceneSplits(StrictModel):
-    """Scenes are drawn into test, validation and train by a hash of (seed, scene).
+class DrawnSplits(StrictModel):
+    """Test, validation and train are drawn: scenes by a hash of (seed, scene), or episodes, evenly over tasks and outcomes.
 
     Recordings for evaluation only keep the split that their source declares.
     """
 
-    by: Literal["scene"]
-    test: float = Field(default=0.1, ge=0, lt=1, description="share of the scenes that test")
-    validation: float = Field(default=0.05, ge=0, lt=1, description="share of the scenes that validate")
+    by: Literal["scene", "episode"]
+    test: float = Field(default=0.1, ge=0, lt=1, description="share of the scenes or episodes that test")
+    validation: float = Field(default=0.05, ge=0, lt=1, description="share of those that validate")
     seed: int = 0
     patterns: dict[str, Split] = Field(default={}, description="scene name pattern -> split, before the draw")
 
     @model_validator(mode="after")
-    def _leaves_training(self) -> SceneSplits:
+    def _leaves_training(self) -> DrawnSplits:
         if self.test + self.validation >= 1:
             raise ValueError(f"test + validation leave nothing to train on: {self.test} + {self.validation}")
         return self
 
 
 def _kind(value: Any) -> str:
-    return "scene" if isinstance(value, SceneSplits) or (isinstance(value, Mapping) and "by" in value) else "patterns"
+    return "drawn" if isinstance(value, DrawnSplits) or (isinstance(value, Mapping) and "by" in value) else "patterns"
 
 
 Splits = Annotated[
-    Annotated[dict[str, Split], Tag("patterns")] | Annotated[SceneSplits, Tag("scene")], Discriminator(_kind)
+    Annotated[dict[str, Split], Tag("patterns")] | Annotated[DrawnSplits, Tag("drawn")], Discriminator(_kind)
 ]
-"""Scene name pattern -> split, or {by: scene, ...}. A pattern table cannot hold a scene that is named "by"."""
+"""Scene name pattern -> split, or {by: scene | episode, ...}. A pattern table cannot hold a scene that is named "by"."""
 
 
 class LeakageConfig(StrictModel):
@@ -84,7 +84,7 @@ class CurateConfig(StrictModel):
     )
     splits: Splits = Field(
         default={},
-        description="scene name pattern -> split, first match wins, else the source's; or {by: scene, test: 0.1,"
+        description="scene name pattern -> split, first match wins, else the source's; or {by: scene | episode, test: 0.1,"
         " validation: 0.05, seed: 0}",
     )
     near_duplicates: bool = Field(default=True, description="quarantine copies that were encoded, resized or cut again")

@@ -12,7 +12,7 @@ from itertools import islice
 
 import numpy as np
 
-from worldline_core.data.curation.curate_config import CurateConfig, SceneSplits
+from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits
 from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode, Split
 from worldline_core.data.episodes.instructions import with_instruction
 from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, LoadedEpisode, Masks, says_droid
@@ -156,20 +156,29 @@ def described(
     return result
 
 
-def with_split(episode: Episode, splits: Mapping[str, Split] | SceneSplits) -> Episode:
+def with_split(episode: Episode, splits: Mapping[str, Split] | DrawnSplits) -> Episode:
     """The episode in the split that the configuration gives its scene; without a rule its source's."""
-    patterns = splits.patterns if isinstance(splits, SceneSplits) else splits
-    named = next((split for pattern, split in patterns.items() if fnmatchcase(episode.scene, pattern)), None)
+    named = _named_split(episode.scene, splits)
     if named is not None:
         return replace(episode, split=named)
-    if not isinstance(splits, SceneSplits):
+    if not isinstance(splits, DrawnSplits) or not is_drawn(episode.scene, episode.split, episode.conventions, splits):
         return episode
-    if episode.split in _KEPT_SPLITS or episode.conventions.get("layout") in EVALUATION_LAYOUTS:
-        return episode
-    return replace(episode, split=drawn_split(episode.scene, splits))
+    # By episode: once all of them are known (`rules.drawn_episodes`).
+    return replace(episode, split=drawn_split(episode.scene, splits) if splits.by == "scene" else "train")
 
 
-def drawn_split(scene: str, splits: SceneSplits) -> Split:
+def _named_split(scene: str, splits: Mapping[str, Split] | DrawnSplits) -> Split | None:
+    patterns = splits.patterns if isinstance(splits, DrawnSplits) else splits
+    return next((split for pattern, split in patterns.items() if fnmatchcase(scene, pattern)), None)
+
+
+def is_drawn(scene: str, split: str, conventions: Mapping[str, object], splits: DrawnSplits) -> bool:
+    """Whether the draw decides the split, not a pattern or the source."""
+    kept = split in _KEPT_SPLITS or conventions.get("layout") in EVALUATION_LAYOUTS
+    return not kept and _named_split(scene, splits) is None
+
+
+def drawn_split(scene: str, splits: DrawnSplits) -> Split:
     """The split of a scene: a uniform number in [0, 1) from SHA-256 of "seed:scene", against the shares."""
     number = int.from_bytes(sha256(f"{splits.seed}:{scene}".encode()).digest()[:8]) / 2**64
     if number < splits.test:

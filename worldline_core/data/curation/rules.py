@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from worldline_core.data.curation.curate_config import CurateConfig, LeakageConfig
+from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits, LeakageConfig
 from worldline_core.data.curation.near_duplicates import find_near_duplicates
+from worldline_core.data.curation.recorded_episode import is_drawn
+from worldline_core.data.episodes.episode import Split
 from worldline_core.data.episodes.episode_index import QuarantineRow
 from worldline_core.data.episodes.fingerprint import Fingerprint
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
+
+logger = logging.getLogger(__name__)
 
 LEARNING = ("train", "validation")
 TESTING = ("test", "ood_test")
@@ -83,6 +89,8 @@ def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> tuple
             frame_distance_bits=round(found.frame_distance, 4),
         )
     kept = [position for position in range(len(parts)) if position not in rows]
+    if isinstance(config.splits, DrawnSplits) and config.splits.by == "episode":
+        return [rows[position] for position in sorted(rows)], []  # scenes are shared by intention
     check_scenes_disjoint([parts[position] for position in kept])
     views = [
         SceneView(part["episode_id"], part["scene"], part["split"], prints[position].views[part["primary_view"]].first)
@@ -93,6 +101,64 @@ def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> tuple
     if config.leakage.action == "quarantine":
         rows.update(_leaking(parts, kept, leaks))
     return [rows[position] for position in sorted(rows)], leaks
+
+
+def drawn_episodes(splits: DrawnSplits, parts: Sequence[Described]) -> dict[str, Split]:
+    """Splits by episode: shares of the set, spread evenly over its tasks and, within each, over outcomes.
+
+    A share that is asked for is at least one episode. Neither the label of an outcome nor the order of ``parts`` matters,
+    only who shares it.
+
+    Raises: DataError when nothing is left to train on.
+    """
+    strata: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for part in parts:
+        if is_drawn(part["scene"], part["split"], part["conventions"], splits):
+            task = strata.setdefault((part["task_family"], part["instruction"]), {})
+            task.setdefault(part["outcome"], []).append(part["episode_id"])
+
+    def number(name: str) -> bytes:
+        return sha256(f"{splits.seed}:{name}".encode()).digest()
+
+    groups = [
+        sorted((sorted(ids, key=number) for ids in task.values()), key=lambda g: number(g[0]))
+        for _, task in sorted(strata.items())
+    ]
+    order = [name for task in groups for group in task for name in group]
+    drawn: dict[str, Split] = {name: "train" for name in order}  # noqa: C420  # whose type would be str
+    counts = {name: max(1, round(len(order) * share)) for name, share in _shares(splits)} if order else {}
+    if order and sum(counts.values()) >= len(order):
+        raise DataError(
+            "Too few episodes for the splits", where="curate.splits", expected=f"more than {sum(counts.values())}",
+            got=len(order), next_step="record more, or set a share to 0",
+        )  # fmt: skip
+    for split, count in counts.items():
+        left = [name for name in order if drawn[name] == "train"]
+        drawn |= {left[(2 * k + 1) * len(left) // (2 * count)]: split for k in range(count)}
+    return drawn
+
+
+def check_held_out(config: CurateConfig, splits: Sequence[str], scenes: int) -> None:
+    """Say, before anything is trained, that a set holds nothing out.
+
+    Raises: DataError when a draw was asked for that holds something out.
+    """
+    if set(splits) != {"train"}:
+        return
+    if isinstance(config.splits, DrawnSplits) and any(_shares(config.splits)):
+        raise DataError(
+            "The draw holds nothing out",
+            where="curate.splits",
+            expected=", ".join(f"{name} {share}" for name, share in _shares(config.splits)),
+            got=f"{len(splits)} of {len(splits)} episodes in train, of {scenes} scene{'s' * (scenes != 1)}",
+            next_step="draw by: episode, or give scenes their splits by patterns",
+        )
+    logger.warning("All episodes are in split train: nothing is held out (curate.splits: {by: episode} draws some)")
+
+
+def _shares(splits: DrawnSplits) -> list[tuple[Split, float]]:
+    shares: list[tuple[Split, float]] = [("test", splits.test), ("validation", splits.validation)]
+    return [(name, share) for name, share in shares if share > 0]
 
 
 def check_scenes_disjoint(parts: Sequence[Described]) -> None:

@@ -29,6 +29,7 @@ from worldline_core.data.episodes.episode import (
     CameraTrack,
     Episode,
     EpisodeDescription,
+    Split,
 )
 from worldline_core.data.episodes.episode_index import (
     INDEX_FILE,
@@ -280,6 +281,13 @@ class EpisodeSetWriter:
         files = sorted(path for path in self._rejected.glob("*.json") if not path.name.startswith("."))
         rows = [QuarantineRow(**json.loads(path.read_text())) for path in files]
         return sorted(rows, key=lambda row: row.episode_id)
+
+    def assign_splits(self, splits: Mapping[str, Split]) -> None:
+        """Give added episodes their splits, where these depend on the whole set."""
+        for part in self.kept():
+            split = splits.get(part["episode_id"], part["split"])
+            if split != part["split"]:
+                write_json_atomic(part.folder / "part.json", part.description | {"split": split})
 
     def discard(self, episode_id: str) -> None:
         """Take back an added episode (before it is quarantined instead)."""
