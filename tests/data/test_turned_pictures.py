@@ -21,6 +21,7 @@ import pytest
 from PIL import Image
 from published_lerobot import FRAMES as LEROBOT_FRAMES
 from published_lerobot import HEIGHT, WIDTH, write_robocoin
+from pydantic import ValidationError
 
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
@@ -30,7 +31,7 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import FrameDecoder, VideoClip, read_clip, shown_size
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.frames import VideoFrames
-from worldline_core.errors import DataError
+from worldline_core.errors import ConfigError, DataError
 
 FRAMES, RATE = 5, 10
 # (a, b, c, d) of ISO/IEC 14496-12, 6.2.2: a stored point (x, y) is shown at (a x + c y, b x + d y).
@@ -246,3 +247,32 @@ def test_a_depth_video_of_lerobot_is_refused_by_name(
     with pytest.raises(DataError, match="depth, not colour") as caught:
         curate(CurateConfig.model_validate({"sources": [alone]}), {}, tmp_path / "alone")
     assert key in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"image_size": (63, 96)},
+        {"image_size": (64, 95)},
+        {"sources": [{"kind": "episode_set", "path": "raw", "image_size": (63, 95)}]},
+    ],
+)
+def test_odd_sizes_with_yuv420p_are_one_error_before_work_begins(changes: dict[str, Any]) -> None:
+    values = {"sources": [{"kind": "episode_set", "path": "raw"}], **changes}
+    CurateConfig.model_validate(values)  # yuv444p holds them
+    with pytest.raises(ValidationError, match=r"yuv420p needs even sides: .*image_size 6[34]x9[56]"):
+        CurateConfig.model_validate({**values, "pixel_format": "yuv420p"})
+
+
+def test_recordings_of_odd_sizes_with_yuv420p_end_the_run_once(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        (tmp_path / "raw").mkdir(exist_ok=True)
+        encode_video(
+            tmp_path / "raw" / f"{name}.mp4", [np.full((63, 95, 3), 90, np.uint8)] * 3, RATE, pixel_format="yuv444p"
+        )
+    source = {"kind": "video_folder", "path": str(tmp_path / "raw"), "name": "web", "split": "train"}
+    values = {"sources": [source], "pixel_format": "yuv420p", "video_mode": "encode"}
+    with pytest.raises(ConfigError, match="cannot be encoded as yuv420p") as caught:
+        curate(CurateConfig.model_validate(values), {}, tmp_path / "out.partial")
+    assert ".partial" not in str(caught.value)
+    assert "63x95" in str(caught.value)

@@ -122,6 +122,15 @@ class CurateConfig(StrictModel):
             raise ValueError("fps and stride both say how frames are thinned: give one of them")
         return self
 
+    @model_validator(mode="after")
+    def _even_sides(self) -> CurateConfig:
+        sizes = {"image_size": self.image_size}
+        sizes |= {f"sources[{n}].image_size": source.image_size for n, source in enumerate(self.sources)}
+        odd = [f"{name} {size[0]}x{size[1]}" for name, size in sizes.items() if size and (size[0] % 2 or size[1] % 2)]
+        if self.pixel_format == "yuv420p" and odd:
+            raise ValueError(f"yuv420p needs even sides: {', '.join(odd)}; choose others, or pixel_format yuv444p")
+        return self
+
     @property
     def recordings(self) -> dict[int, str]:
         """Names of the run's own recordings, by the number of the source that reads each."""

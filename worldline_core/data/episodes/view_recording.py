@@ -38,6 +38,7 @@ from worldline_core.data.video.clip import (
 )
 from worldline_core.data.video.encoder import Encoding, VideoEncoder, frame_rate, length_prefixed, new_mp4
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, write_thumbnails
+from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import Fit, ImageTransform
 
 VideoMode = Literal["auto", "encode"]
@@ -166,6 +167,7 @@ def _encoded(
                 image = rgb()
                 if encoder is None or transform is None:
                     transform = ImageTransform.of(image.shape[:2]).fitted(recorded.image_size, recorded.fit)
+                    _check_even_sides(transform.image_size, video.pixel_format, path.stem)
                     encoder = writing.enter_context(VideoEncoder(path, transform.image_size, fps, video))
                 image = transform.frames(image[None])[0]
                 if sampler.wants(encoder.count):
@@ -176,6 +178,18 @@ def _encoded(
     if transform is None:
         raise RejectedInputError("truncated_video", "View has no pictures", where=path.stem)
     return transform, "h264", video.pixel_format
+
+
+def _check_even_sides(size: tuple[int, int], pixel_format: str, view: str) -> None:
+    """Raises: ConfigError for pictures that the configured format cannot hold, as all recordings of this size."""
+    if pixel_format == "yuv420p" and (size[0] % 2 or size[1] % 2):
+        raise ConfigError(
+            "Pictures of an odd size cannot be encoded as yuv420p",
+            where=f"pixel_format, met in view {view}",
+            expected="even height and width",
+            got=f"{size[0]}x{size[1]}",
+            next_step="set image_size to even sides, or pixel_format to yuv444p",
+        )
 
 
 def _pictures(recorded: RecordedView) -> Iterator[tuple[np.ndarray, bool, Callable[[], np.ndarray]]]:
