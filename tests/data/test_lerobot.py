@@ -144,7 +144,7 @@ def test_v21_is_read_with_declared_units_and_missing_episodes_are_listed(tmp_pat
 
 def test_undeclared_or_unknown_things_are_refused(tmp_path: Path) -> None:
     v21_dataset(tmp_path / "v21", {0: 6})
-    with pytest.raises(ConfigError, match=r"(?s)no video key.*observation\.images\.cam"):
+    with pytest.raises(ConfigError, match=r"(?s)no camera.*observation\.images\.cam"):
         curate(source(tmp_path / "v21", views={"observation.images.top": "head"}), {}, tmp_path / "out")
     with pytest.raises(ValueError, match="angle_unit"):
         source(tmp_path / "v21", angle_unit=None)

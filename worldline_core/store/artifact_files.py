@@ -173,6 +173,13 @@ def digest_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def leads_out(path: Path, root: Path) -> bool:
+    """True if a path ends outside of a folder. Snapshots of the Hub's cache may use the blobs of their own repository."""
+    target, root = path.resolve(), root.resolve()
+    blobs = [each.parent / "blobs" for each in root.parents if each.name == "snapshots"]
+    return not any(target.is_relative_to(folder) for folder in (root, *blobs[:1]))
+
+
 def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
     """The files of a folder's content, sorted: all but the manifest and the volatile folder, or ``everything``.
 
@@ -186,7 +193,7 @@ def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
         ours = relative[0] == VOLATILE_FOLDER or relative == (MANIFEST_NAME,)
         if (ours and not everything) or path.is_dir():
             continue
-        if path.is_symlink() and not path.resolve().is_relative_to(root):
+        if path.is_symlink() and leads_out(path, root):
             raise ArtifactError("A symbolic link leads out of the folder", where=path, got=path.resolve())
         files.append(path)
     return files

@@ -48,6 +48,8 @@ def parse_json(text: str | bytes, where: object) -> Any:
     Raises: RejectedInputError (unreadable).
     """
     # ValueError: of the decoder, of UTF-8, of a key given twice, of a number with too many digits.
+    # A byte order mark is no part of JSON, but Windows' editors write one.
+    text = text.removeprefix("\ufeff") if isinstance(text, str) else text.removeprefix(b"\xef\xbb\xbf")
     with unreadable("File is not valid JSON", where, (ValueError, RecursionError)):
         return json.loads(text, object_pairs_hook=_without_repetition)
 

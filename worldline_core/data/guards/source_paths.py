@@ -23,6 +23,7 @@ from upath import UPath
 from worldline_core.data.guards.reader_process import still_reading
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.store.artifact_files import leads_out
 from worldline_core.store.remote import AnyPath, list_files, parse_location, process_cache, remote_kind
 
 type FileState = tuple[int, int, int, int] | None
@@ -103,7 +104,7 @@ def inside[P: AnyPath](root: P, relative: str) -> P:
     pure = PurePosixPath(relative)
     leaves = pure.is_absolute() or "\0" in relative
     if isinstance(root, Path):
-        leaves = leaves or not (root / relative).resolve().is_relative_to(root.resolve())
+        leaves = leaves or leads_out(root / relative, root)
     else:
         leaves = leaves or "://" in relative or "\\" in relative or ".." in pure.parts
     if leaves:

@@ -8,27 +8,37 @@ v2.1: meta/info.json, meta/tasks.jsonl, meta/episodes.jsonl, and per episode one
 
 from __future__ import annotations
 
+import codecs
 import io
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.json
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from worldline_core.data.guards.plain_files import column_names, read_json, read_json_lines, read_table, validated
+from worldline_core.data.guards.plain_files import (
+    column_names,
+    decode_image,
+    image_size,
+    read_json,
+    read_json_lines,
+    read_table,
+    validated,
+)
 from worldline_core.data.guards.rejection import RejectedInputError, check_length, unreadable
 from worldline_core.data.guards.source_paths import (
     AnyPath,
     fill_template,
     find_files,
     inside,
+    is_file,
     regular_file,
     relative_name,
 )
@@ -42,6 +52,11 @@ IMAGE_PREFIX = "observation.images."
 _DEPTH = "is_depth_map"
 
 
+def _without_fraction(value: object) -> object:
+    """30 for 30.0, which pandas and JavaScript make of whole numbers; anything else as it is."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
 class DatasetInfo(BaseModel):
     """`meta/info.json`: the keys that are read here; there may be others."""
 
@@ -52,9 +67,17 @@ class DatasetInfo(BaseModel):
     features: dict[str, dict[str, Any]]
     data_path: str | None = None
     video_path: str | None = None
-    chunks_size: int = Field(default=1000, ge=1)
+    chunks_size: Annotated[int, BeforeValidator(_without_fraction)] = Field(default=1000, ge=1)
     robot_type: Any = None
     repo_id: Any = None
+    storage_format: Any = None
+
+
+_NEXT_STEPS = {
+    "v3.0": "set kind: lerobot_v3",
+    "v2.1": "set kind: lerobot_v21",
+    "v2.0": "convert it with LeRobot 0.3.3's lerobot.datasets.v21.convert_dataset_v20_to_v21, and set kind: lerobot_v21",
+}
 
 
 def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> DatasetInfo:
@@ -65,11 +88,44 @@ def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> DatasetI
     where = f"{root}, meta/info.json"
     info = validated(DatasetInfo, read_json(root / "meta" / "info.json"), where, "meta/info.json")
     if info.codebase_version != version:
-        raise DataError("Dataset has another version", where=str(root), expected=version, got=info.codebase_version)
+        raise DataError(
+            "Dataset has another version",
+            where=str(root),
+            expected=version,
+            got=info.codebase_version,
+            next_step=_NEXT_STEPS.get(
+                info.codebase_version, "convert it with LeRobot's own converters to v2.1 or v3.0"
+            ),
+        )
+    if info.storage_format not in (None, "parquet"):
+        raise DataError(
+            "Dataset is stored in another format",
+            where=where,
+            expected="storage_format: parquet",
+            got=info.storage_format,
+            next_step="export it as a LeRobotDataset of Parquet files with the tool that wrote it",
+        )
     missing = sorted(set(keys) - info.model_fields_set)
     if missing:
         raise DataError("meta/info.json lacks a key", where=where, expected=", ".join(missing))
     return info
+
+
+def check_files(root: AnyPath, cameras: Sequence[str]) -> None:
+    """Raises: DataError naming all files that a dataset of version 3 needs and that are not there, those of videos too."""
+    features = read_info(root, VERSION).features if is_file(root / "meta" / "info.json") else None
+    missing = ["meta/info.json"] if features is None else []
+    missing += [] if is_file(root / "meta" / "tasks.parquet") else ["meta/tasks.parquet"]
+    missing += [f"{name}/*/*.parquet" for name in ("meta/episodes", "data") if not find_files(root / name, "*.parquet")]
+    if missing:
+        for key in cameras:
+            if (features or {}).get(key, {}).get("dtype") != "image" and not find_files(root / "videos" / key, "*.mp4"):
+                missing.append(f"videos/{key}/*/*.mp4")
+        raise DataError(
+            "Files of the dataset are missing",
+            where=", ".join(f"{root}/{name}" for name in missing),
+            next_step="copy or download the dataset again, as a whole",
+        )
 
 
 INDEX = "episode_index"
@@ -132,9 +188,7 @@ def whole_number(row: dict[str, Any], key: str, where: object) -> int:
 
     Raises: RejectedInputError: missing_column, or unreadable for what is no whole number from 0 on.
     """
-    value = row.get(key)
-    if isinstance(value, float) and value.is_integer():
-        value = int(value)
+    value = _without_fraction(row.get(key))
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_INDEX:
         raise RejectedInputError(
             "unreadable" if key in row else "missing_column",
@@ -172,8 +226,13 @@ class LeRobotDataset(ABC):
         self.features = self.info.features
 
     @property
-    def video_keys(self) -> list[str]:
-        return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
+    def camera_keys(self) -> list[str]:
+        """Features that are pictures, in videos or in the data files."""
+        return [key for key, feature in self.features.items() if feature.get("dtype") in ("video", "image")]
+
+    def has_video(self, key: str) -> bool:
+        """False for a camera whose pictures are in the data files."""
+        return self.features.get(key, {}).get("dtype") != "image"
 
     @cached_property
     @abstractmethod
@@ -185,12 +244,47 @@ class LeRobotDataset(ABC):
     def tasks(self) -> dict[int, str]:
         """Instruction by task_index."""
 
-    @abstractmethod
     def column(self, episode_index: int, name: str) -> np.ndarray:
         """One data column of an episode: (N,) or (N, D).
 
         Raises: DataError when the file or column is missing, or another length than listed.
         """
+        where, values = self.values(episode_index, name)
+        return _numeric_column(values, len(values), where)
+
+    @abstractmethod
+    def values(self, episode_index: int, name: str) -> tuple[str, pa.ChunkedArray]:
+        """One data column of an episode as it is stored, and what to call it.
+
+        Raises: DataError as `column`.
+        """
+
+    def image(self, episode_index: int, key: str, frame: int) -> bytes:
+        """One PNG or JPEG of a camera whose pictures are in the data files, as `datasets.Image` stores them.
+
+        Raises: RejectedInputError: missing_view where the files have no such column; missing_file, unreadable.
+        """
+        try:
+            where, column = self.values(episode_index, key)
+        except RejectedInputError as error:
+            if error.reason != "missing_column":
+                raise
+            raise RejectedInputError(
+                "missing_view", "Episode has no such images", where=self.root, expected=key
+            ) from error
+        value = column[frame].as_py()
+        content, path = (value.get("bytes"), value.get("path")) if isinstance(value, dict) else (value, None)
+        if content is None and isinstance(path, str):
+            return regular_file(inside(self.root, path), "Image").read_bytes()
+        if not isinstance(content, bytes):
+            raise RejectedInputError(
+                "unreadable",
+                "Frame holds no image",
+                where=f"{where}, frame {frame}",
+                expected="bytes of a PNG or JPEG, or the path of one",
+                got=column.type,
+            )
+        return content
 
     @abstractmethod
     def clip(self, episode_index: int, key: str) -> VideoClip:
@@ -206,9 +300,17 @@ class LeRobotDataset(ABC):
         """
         return self.episodes.row(episode_index)
 
-    def video_size(self, episode_index: int, key: str) -> tuple[int, int, float]:
-        """(height, width, frames per second) that the container states."""
-        return video_size(self.clip(episode_index, key).path)
+    def image_size(self, episode_index: int, key: str) -> tuple[int, int]:
+        """(height, width) that the video, or the first image, states."""
+        if self.has_video(key):
+            return video_size(self.clip(episode_index, key).path)[:2]
+        return image_size(self.image(episode_index, key, 0), f"{self.root}, episode {episode_index}, {key}, frame 0")
+
+    def images(self, episode_index: int, key: str) -> Iterator[np.ndarray]:
+        """uint8 (H, W, 3) RGB of each frame of a camera whose pictures are in the data files."""
+        for frame in range(self._number(self.row(episode_index), "length")):
+            where = f"{self.root}, episode {episode_index}, {key}, frame {frame}"
+            yield decode_image(self.image(episode_index, key, frame), where)
 
     def _number(self, row: dict[str, Any], key: str) -> int:
         return whole_number(row, key, f"{self.root}, episode {row[INDEX]}")
@@ -247,16 +349,16 @@ class LeRobotV3Dataset(LeRobotDataset):
         label = "task" if "task" in column_names(path) else "__index_level_0__"
         table = read_table(path, ["task_index", label])
         try:
-            texts = [str(text) for text in table[label].to_pylist()]
+            texts = ["" if text is None else str(text) for text in table[label].to_pylist()]
         except UnicodeDecodeError as error:  # Parquet declares UTF-8 and checks nothing
             raise DataError("Task list holds text that is no UTF-8", where=str(path), got=str(error)) from error
         return dict(zip(table["task_index"].to_pylist(), texts, strict=True))
 
-    def column(self, episode_index: int, name: str) -> np.ndarray:
+    def values(self, episode_index: int, name: str) -> tuple[str, pa.ChunkedArray]:
         where, rows = self._rows(episode_index)
         if name not in rows.column_names:
             raise RejectedInputError("missing_column", "Data file lacks a column", where=where, expected=name)
-        return _numeric_column(rows[name], len(rows), f"{where}, column {name}")
+        return f"{where}, column {name}", rows[name]
 
     def _rows(self, episode_index: int) -> tuple[str, pa.Table]:
         """An episode's rows in the order of `index`, found by `episode_index`, and what to call them.
@@ -434,7 +536,11 @@ class LeRobotV21Dataset(LeRobotDataset):
         schema = pa.schema([(INDEX, pa.float64()), ("length", pa.float64())])
         with unreadable("File is not JSON lines", path, (pa.ArrowException, OSError, ValueError)):
             table = pyarrow.json.read_json(
-                io.BytesIO(_HALF_PAIR.sub(_kept_escape, regular_file(path, "Episode list").read_bytes())),
+                io.BytesIO(
+                    _HALF_PAIR.sub(
+                        _kept_escape, regular_file(path, "Episode list").read_bytes().removeprefix(codecs.BOM_UTF8)
+                    )
+                ),
                 read_options=pyarrow.json.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES),
                 parse_options=pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
             )
@@ -446,14 +552,14 @@ class LeRobotV21Dataset(LeRobotDataset):
         tasks: dict[int, str] = {}
         for row in read_json_lines(path):
             task = validated(_Task, row, path, "Row of the task list")
-            tasks[task.task_index] = str(task.task)
+            tasks[task.task_index] = "" if task.task is None else str(task.task)
         return tasks
 
     def _episode_path(self, template: str | None, episode_index: int, **values: str) -> AnyPath:
         chunk = episode_index // self.info.chunks_size
         return self._path(template or "", episode_chunk=chunk, episode_index=episode_index, **values)
 
-    def column(self, episode_index: int, name: str) -> np.ndarray:
+    def values(self, episode_index: int, name: str) -> tuple[str, pa.ChunkedArray]:
         path = self._episode_path(self.info.data_path, episode_index)
         length = self._number(self.row(episode_index), "length")
         if self._checked != episode_index:
@@ -465,7 +571,9 @@ class LeRobotV21Dataset(LeRobotDataset):
                 raise _contradiction(path, f"{INDEX} {episode_index}", f"{INDEX} {', '.join(map(str, others[:5]))}")
             _check_numbering(numbering, path, frame_index=0)
             self._checked = episode_index
-        return _numeric_column(read_table(path, [name])[name], length, f"{path}, column {name}")
+        values = read_table(path, [name])[name]
+        check_length("Data file", path, states=length, unit="rows", found=len(values))
+        return f"{path}, column {name}", values
 
     def clip(self, episode_index: int, key: str) -> VideoClip:
         path = self._episode_path(self.info.video_path, episode_index, video_key=key)

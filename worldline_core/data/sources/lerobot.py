@@ -39,7 +39,7 @@ from worldline_core.data.guards.rejection import (
     depth_picture,
 )
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
-from worldline_core.data.lerobot.dataset import DatasetInfo, LeRobotV3Dataset, LeRobotV21Dataset, is_depth
+from worldline_core.data.lerobot.dataset import DatasetInfo, LeRobotV3Dataset, LeRobotV21Dataset, check_files, is_depth
 from worldline_core.data.sources.calibration_file import add_calibrated_view, read_calibration
 from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.errors import ConfigError, DataError
@@ -97,7 +97,7 @@ class LeRobotSourceConfig(ForeignSourceConfig):
     kind: Literal["lerobot_v21", "lerobot_v3"]
     embodiment: EmbodimentName = Field(description="a robot of `worldline embodiment list`, or none: Stage I")
     angle_unit: Literal["rad", "deg"] = Field(description="unit of the joint columns")
-    views: dict[str, str] = Field(description="video key of the dataset -> view, for example {...cam_high: head}")
+    views: dict[str, str] = Field(description="camera of the dataset -> view, for example {...cam_high: head}")
     grippers: dict[str, GripperRange] = Field(
         default={}, description="state column -> its readings when closed and open; without `arms`"
     )
@@ -133,13 +133,24 @@ class LeRobotSourceConfig(ForeignSourceConfig):
 
 
 def flat_names(feature: Mapping[str, Any]) -> list[str]:
-    """Column names of a feature, as far as it has some: a list, a list of one list, or a dict of a list."""
-    names = feature.get("names") or []
+    """Column names of a feature, as far as it has some: a list, groups of them one after the other, or name -> place.
+
+    Names that several groups have begin with their group's.
+    """
+    named = _grouped(feature.get("names"))
+    plain = [name for _, name in named]
+    return plain if len(set(plain)) == len(plain) else [f"{group}/{name}" if group else name for group, name in named]
+
+
+def _grouped(names: Any, group: str = "") -> list[tuple[str, str]]:
     if isinstance(names, dict):
-        names = next(iter(names.values()), [])
-    if names and isinstance(names, list) and isinstance(names[0], list):
-        names = names[0]
-    return [str(name) for name in names] if isinstance(names, list) else []
+        if names and all(isinstance(place, int) for place in names.values()):
+            return [(group, str(name)) for name in sorted(names, key=names.__getitem__)]
+        return [each for key, value in names.items() for each in _grouped(value, str(key))]
+    if isinstance(names, list):
+        parts = [_grouped(name, group) if isinstance(name, list | dict) else [(group, str(name))] for name in names]
+        return [each for part in parts for each in part]
+    return []
 
 
 def places(choice: ColumnChoice, features: Features, where: str) -> list[int]:
@@ -289,6 +300,8 @@ class LeRobotSource:
         self._config = config
         self._root = root
         self._label = label or config.label
+        if config.kind == "lerobot_v3":
+            check_files(root, list(config.views))
         self._dataset = LeRobotV21Dataset(root) if config.kind == "lerobot_v21" else LeRobotV3Dataset(root)
         features = self._dataset.features
         self._evaluation_only = config.evaluation_only or _is_droid(config, root, self._dataset.info)
@@ -301,18 +314,20 @@ class LeRobotSource:
                 next_step="set the source's split, or name datasets that are not DROID otherwise",
             )
         columns = [name for name in (config.task_column, config.success_column) if name is not None]
-        videos = self._dataset.video_keys
+        cameras = self._dataset.camera_keys
+        # A dataset may lack some views (`views: available`); one that has none is of another configuration.
+        views = {} if set(config.views) & set(cameras) else config.views
         names = flat_names(features.get("observation.state", {}))
         for what, wanted, known in (
-            ("video key", config.views, videos),
+            ("camera", views, cameras),
             ("state column", config.grippers, names),
             ("feature", columns, list(features)),
         ):
             unknown = sorted(set(wanted) - set(known) - {"task_index"})
             if unknown:
-                expected, got = ", ".join(known), ", ".join(unknown)
+                expected, got = ", ".join(known) or f"a dataset with a {what}", ", ".join(unknown)
                 raise ConfigError(f"The dataset has no {what} of this name", where=root, expected=expected, got=got)
-        if depth := [key for key in config.views if is_depth(features[key])]:
+        if depth := [key for key in config.views if is_depth(features.get(key, {}))]:
             raise depth_picture(root, f"is_depth_map of {', '.join(depth)} in meta/info.json")
         self._columns = state_columns(config, features, str(root))
         self._calibration = lru_cache(maxsize=1)(lambda name: read_calibration(inside(root, name)))
@@ -325,20 +340,36 @@ class LeRobotSource:
         index = int(episode_id.rsplit("-", 1)[1])
         key_of = {view: key for key, view in config.views.items()}
 
-        def clip_of(view: str) -> VideoClip:
-            clip = dataset.clip(index, key_of[view])
+        def read_view(view: str) -> VideoClip | None:
+            key = key_of[view]
+            if key not in dataset.features:
+                known = ", ".join(dataset.camera_keys)
+                raise RejectedInputError(
+                    "missing_view", "Dataset has no such camera", where=self._root, expected=key, got=known
+                )
+            if not dataset.has_video(key):
+                dataset.image_size(index, key)
+                return None
+            clip = dataset.clip(index, key)
             rate = video_size(clip.path)[2]
             check_rate(rate, dataset.fps, f"{episode_id}, view {view}", tolerance=RATE_TOLERANCE * dataset.fps)
             return clip
 
         faults: list[RejectedInputError] = []
-        clips, absent = sorted_views(key_of, clip_of, faults)
+        views, absent = sorted_views(key_of, read_view, faults)
         with collect_faults(faults):
             times = dataset.column(index, "timestamp").reshape(-1).astype(np.float64)
-            cameras = self._cameras(index, {view: key_of[view] for view in clips}, len(times))
+            cameras = self._cameras(index, {view: key_of[view] for view in views}, len(times))
             episode = self._episode(episode_id, index, times, cameras)
             if not faults:
-                return LoadedEpisode(episode, tuple(clips), distortions=cameras.lenses, clips=clips, absent=absent)
+                return LoadedEpisode(
+                    episode,
+                    tuple(views),
+                    images=lambda view: dataset.images(index, key_of[view]),
+                    distortions=cameras.lenses,
+                    clips={view: clip for view, clip in views.items() if clip is not None},
+                    absent=absent,
+                )
         raise all_of([*faults, *absent.values()], f"episode {episode_id}")
 
     def _episode(self, episode_id: str, index: int, times: np.ndarray, cameras: RecordedCameras) -> Episode:
@@ -414,7 +445,7 @@ class LeRobotSource:
                 cameras,
                 view,
                 entries[view],
-                image_size=self._dataset.video_size(index, key_of[view])[:2],
+                image_size=self._dataset.image_size(index, key_of[view]),
                 num_frames=length,
                 read_feature=lambda feature: self._dataset.column(index, feature),
                 where=where,
@@ -431,10 +462,9 @@ def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: DatasetInfo) -> 
 class LeRobotCollection:
     """Datasets of one layout; each has its own scene unless the configuration names one.
 
-    A dataset that cannot be opened is listed as one input, and is quarantined; what the configuration itself gets wrong of
-    any of them stops the listing.
+    A dataset that cannot be opened, or that the configuration does not fit, is listed as one input, and is quarantined.
 
-    Raises: ConfigError as `LeRobotSource`.
+    Raises: ConfigError as `LeRobotSource` where the configuration fits none of them.
     """
 
     looked_for = (
@@ -451,16 +481,30 @@ class LeRobotCollection:
 
     def episode_ids(self) -> list[str]:
         listed: list[str] = []
+        misfits: list[ConfigError] = []
         for label in sorted(self._roots):
             try:
                 listed += self._open(label).episode_ids()
-            except DataError:
+            except (DataError, ConfigError) as error:
                 listed.append(label)
+                misfits += [error] if isinstance(error, ConfigError) else []
+        if misfits and set(listed) <= set(self._roots):
+            raise misfits[0]  # and none could be opened
         return listed
 
     def load(self, episode_id: str) -> LoadedEpisode:
         if episode_id in self._roots:
-            self._open(episode_id).episode_ids()  # raises what the listing met
+            try:
+                self._open(episode_id).episode_ids()  # raises what the listing met
+            except ConfigError as error:
+                raise RejectedInputError(
+                    "missing_column",
+                    error.what,
+                    where=error.where,
+                    expected=error.expected,
+                    got=error.got,
+                    next_step=error.next_step or "give this dataset its own source",
+                ) from error
         return self._open(episode_id.rsplit("-", 1)[0]).load(episode_id)
 
 
