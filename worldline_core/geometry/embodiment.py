@@ -20,6 +20,7 @@ from worldline_core.config import CONFIG_ROOT, StrictModel, read_yaml, validate
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.transforms import pose_from_quaternion_wxyz, rotation_deviation
 
+MAX_DESCRIPTION_BYTES = 16 << 20
 QUATERNION_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's length from 1 that is taken for rounding and normalised away."""
 EMBODIMENT_ROOT = CONFIG_ROOT / "embodiments"
@@ -302,7 +303,7 @@ def read_description(embodiment: Embodiment) -> str:
 
     Raises:
         UnavailableError: the file is not there; the message says how to get it.
-        DataError: it is no UTF-8.
+        DataError: it is far larger than a description, or no UTF-8.
     """
     description, path = embodiment.description, embodiment.description_path
     if not path.is_file():
@@ -312,6 +313,9 @@ def read_description(embodiment: Embodiment) -> str:
             expected=description.file,
             next_step=how_to_get(embodiment),
         )
+    if (size := path.stat().st_size) > MAX_DESCRIPTION_BYTES:
+        limit = f"at most {MAX_DESCRIPTION_BYTES:,} bytes"
+        raise DataError("Kinematic description is too large", where=path, expected=limit, got=size)
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:

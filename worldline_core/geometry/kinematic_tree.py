@@ -1,9 +1,9 @@
 """A robot as a tree of bodies and joints, read from MJCF or URDF without MuJoCo, in float64 (`pytorch_kinematics` reads
 URDF in float32, and MJCF with MuJoCo only). Tests compare both readers with MuJoCo itself.
 
-MJCF: nested bodies and sites with pos and quat, hinge and slide joints, joint defaults by class. URDF: links, joints, origins
-and axes; a `mimic` joint is a joint of its own, listed among the embodiment's finger joints. All that decides a pose and is
-not read is refused by name.
+MJCF: nested bodies and sites with pos and quat, euler, axisangle, xyaxes or zaxis, hinge and slide joints, joint defaults by
+class, the compiler's angle and eulerseq. URDF: links, joints, origins and axes; a `mimic` joint is a joint of its own, listed
+among the embodiment's finger joints. All else that decides a pose is refused by name.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from worldline_core.errors import DataError
 from worldline_core.geometry.transforms import rotation_about_axis, rotation_from_euler_fixed_xyz
 
 _UNDECLARED_PREFIX = re.compile(r"</?([A-Za-z_][\w.-]*):|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=")
+MAX_BODIES, MAX_DEPTH = 5_000, 200
+"""Bodies, links and sites of one description, and how many hang below each other; robots have some hundreds."""
 _URDF_KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": None}
 _MJCF_KINDS = {"hinge": "revolute", "slide": "prismatic"}
 
@@ -65,9 +67,10 @@ def mounted(tree: TreeBody, T_world_root: Mapping[str, np.ndarray]) -> TreeBody:
 
 
 def parse_xml(text: str, where: object) -> ET.Element:
-    """Root of an XML text.
+    """Root of an XML text, comments dropped.
 
-    Descriptions made by xacro often keep a prefix whose namespace they no longer declare; it is declared here.
+    Descriptions made by xacro often keep a prefix whose namespace they no longer declare (`drake:acceleration`);
+    ROS and MuJoCo read those, so they are declared here.
 
     Raises: DataError when the text is not XML.
     """
@@ -87,6 +90,16 @@ def parse_xml(text: str, where: object) -> ET.Element:
     raise DataError("Kinematic description is not XML", where=where, got=str(problem))
 
 
+def _check_size[T](root: T, children: Callable[[T], Iterable[T]], where: object) -> None:
+    """Raises: DataError for more bodies or deeper chains than readers of trees, which call themselves, can take."""
+    level, bodies, depth = [root], 1, 1
+    while level := [child for element in level for child in children(element)]:
+        bodies, depth = bodies + len(level), depth + 1
+        if bodies > MAX_BODIES or depth > MAX_DEPTH:
+            limit = f"at most {MAX_BODIES:,} bodies, {MAX_DEPTH} below each other"
+            raise DataError("Kinematic description is too large", where=where, expected=limit, got=(bodies, depth))
+
+
 def _check_names(tree: TreeBody, where: object) -> None:
     """Raises: DataError when two joints have one name: a column of the state would turn both."""
     joints = Counter(joint.name for body in tree.walk() for joint in body.joints)
@@ -95,7 +108,10 @@ def _check_names(tree: TreeBody, where: object) -> None:
 
 
 def _numbers(text: str, count: int, where: object) -> np.ndarray:
-    """(count,) float64 from an attribute. Raises: DataError for another count, or a value that is not a finite number."""
+    """(count,) float64 from an attribute.
+
+    Raises: DataError for another number of values, or one that is not a finite number.
+    """
     try:
         values = np.array([float(value) for value in text.split()], dtype=np.float64)
     except ValueError as error:
@@ -106,7 +122,10 @@ def _numbers(text: str, count: int, where: object) -> np.ndarray:
 
 
 def _unit(vector: np.ndarray, where: object) -> np.ndarray:
-    """The vector at length 1. Raises: DataError when it is zero."""
+    """The vector at length 1.
+
+    Raises: DataError when it is zero.
+    """
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         raise DataError("A direction of length zero", where=where, expected="a vector that is not zero")
@@ -129,6 +148,8 @@ def read_mjcf(text: str, where: object) -> TreeBody:
                 where=where,
                 next_step="write the file out flat (mujoco.mj_saveLastXML)",
             )
+    for part, tags in ((worldbody, ("body", "site")), (root, ("default",))):
+        _check_size(part, lambda element, tags=tags: (child for child in element if child.tag in tags), where)
     tree = _MjcfReader(root, where).body(worldbody, "world", None)
     _check_names(tree, where)
     return tree
@@ -138,7 +159,13 @@ class _MjcfReader:
     """Reader of an MJCF; holds what bodies inherit: the compiler's settings and the joint defaults by class."""
 
     def __init__(self, root: ET.Element, where: object) -> None:
+        compiler = root.find("compiler")
+        settings = {} if compiler is None else compiler.attrib
         self.where = where
+        self.to_radians = 1.0 if settings.get("angle", "degree") == "radian" else math.pi / 180
+        self.eulerseq = settings.get("eulerseq", "xyz")
+        if not re.fullmatch("[xyzXYZ]{3}", self.eulerseq):
+            raise DataError("Not a sequence of axes", where=f"{where}: eulerseq", expected="xyz", got=self.eulerseq)
         self.joint_defaults: dict[str, dict[str, str]] = {}
         for default in root.findall("default"):
             self._read_defaults(default, {}, "main")
@@ -189,18 +216,34 @@ class _MjcfReader:
         return TreeJoint(name, kind, axis, _numbers(values.get("pos", "0 0 0"), 3, place))
 
     def _pose(self, element: ET.Element) -> np.ndarray:
-        """T_parent_body from pos and quat."""
+        """T_parent_body from pos and whichever of the five forms of orientation the element has."""
         place = f"{self.where}: {element.tag} {element.get('name', '')}"
-        if others := [form for form in ("euler", "axisangle", "xyaxes", "zaxis") if form in element.attrib]:
-            raise DataError(
-                "MJCF orientation is not supported here", where=place, expected="quat", got=others[0],
-                next_step="write the file out flat (mujoco.mj_saveLastXML)",
-            )  # fmt: skip
+        given = element.attrib
         T = np.eye(4)
-        T[:3, 3] = _numbers(element.get("pos", "0 0 0"), 3, place)
-        w, *xyz = _unit(_numbers(element.get("quat", "1 0 0 0"), 4, place), place)
-        # Through axis and angle: digests of action tracks hold the last bit of this.
-        T[:3, :3] = rotation_about_axis(np.array(xyz), 2 * math.atan2(float(np.linalg.norm(xyz)), float(w)))
+        T[:3, 3] = _numbers(given.get("pos", "0 0 0"), 3, place)
+        if "quat" in given:
+            w, *xyz = _unit(_numbers(given["quat"], 4, place), place)
+            # Through axis and angle: digests of action tracks hold the last bit of this.
+            T[:3, :3] = rotation_about_axis(np.array(xyz), 2 * math.atan2(float(np.linalg.norm(xyz)), float(w)))
+        elif "euler" in given:
+            for letter, angle in zip(self.eulerseq, _numbers(given["euler"], 3, place) * self.to_radians, strict=True):
+                turn = rotation_about_axis(np.eye(3)["xyz".index(letter.lower())], float(angle))
+                # Lower case: about the moving axes; upper case: about the fixed ones.
+                T[:3, :3] = T[:3, :3] @ turn if letter.islower() else turn @ T[:3, :3]
+        elif "axisangle" in given:
+            *axis, angle = _numbers(given["axisangle"], 4, place)
+            T[:3, :3] = rotation_about_axis(np.asarray(axis), float(angle) * self.to_radians)
+        elif "xyaxes" in given:
+            axes = _numbers(given["xyaxes"], 6, place)
+            x = _unit(axes[:3], place)
+            y = _unit(axes[3:] - (axes[3:] @ x) * x, place)
+            T[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
+        elif "zaxis" in given:
+            z = _unit(_numbers(given["zaxis"], 3, place), place)
+            axis = np.cross([0.0, 0.0, 1.0], z)
+            sine = float(np.linalg.norm(axis))
+            axis = axis if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+            T[:3, :3] = rotation_about_axis(axis, math.atan2(sine, float(z[2])))
         return T
 
 
@@ -232,6 +275,7 @@ def read_urdf(text: str, where: object) -> TreeBody:
     if len(roots) != 1:
         raise DataError("A URDF has one root link", where=where, expected="one without a parent", got=f"{roots[:8]}")
     root = bodies[roots[0]]
+    _check_size(root, lambda body: body.children, where)
     _check_names(root, where)
     if (reached := sum(1 for _ in root.walk())) != len(bodies):
         raise DataError("Links form a circle", where=where, got=f"{reached} of {len(bodies)} reached from {roots}")
