@@ -37,6 +37,7 @@ from worldline_core.store.remote import AnyPath, file_system, first_line, list_f
 from worldline_core.store.store import folder_lock
 
 FILE_LIST = "worldline_files.json"
+MAX_LIST_BYTES = 256 << 20
 _BATCH_FILES = 32
 _HUB_LOCATION = re.compile(r"hf://datasets/(?P<id>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?/?")
 
@@ -261,7 +262,9 @@ class _Place:
     def file_list(self) -> FileList:
         """The list of files at the place."""
         source = str(self.location / FILE_LIST)
-        content = with_retries(lambda: file_system(self.location).cat_file(source), source)
+        content = with_retries(lambda: file_system(self.location).cat_file(source, end=MAX_LIST_BYTES + 1), source)
+        if len(content) > MAX_LIST_BYTES:
+            raise ArtifactError("List of files is too large", where=source, expected=f"at most {MAX_LIST_BYTES} bytes")
         try:
             return FileList.model_validate_json(content)
         except ValidationError as error:

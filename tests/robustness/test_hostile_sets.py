@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tools.corrupted import lerobot_v21
+from worldline_core import publishing
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, write_index
@@ -102,6 +103,18 @@ def test_lists_that_are_none(content: bytes, place: Path, tmp_path: Path) -> Non
     (place / FILE_LIST).write_bytes(content)
     with pytest.raises(ArtifactError, match="List of files is damaged"):
         pull(str(place), tmp_path / "back")
+
+
+def test_a_list_is_read_up_to_its_bound_only(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(publishing, "MAX_LIST_BYTES", (place / FILE_LIST).stat().st_size)
+    pull(str(place), tmp_path / "whole")
+    monkeypatch.setattr(publishing, "MAX_LIST_BYTES", 1000)
+    with (place / FILE_LIST).open("r+b") as stream:
+        stream.truncate(3 << 30)  # sparse; read whole it would not fit into the tests' memory
+    with pytest.raises(ArtifactError, match="List of files is too large"):
+        pull(str(place), tmp_path / "back")
+    with pytest.raises(ArtifactError, match="List of files is too large"):
+        push(tmp_path / "whole", str(place))
 
 
 def test_two_who_pull_into_one_folder_at_once(place: Path, published: Path, tmp_path: Path) -> None:
