@@ -21,6 +21,7 @@ from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import unpack
 from worldline_core.rollout.observation import Camera
 from worldline_core.rollout.recorded_starts import RecordedStarts
+from worldline_core.serving import app
 from worldline_core.serving.app import server_token
 from worldline_core.serving.client import RemoteSimulation, SimulatorClient
 from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig
@@ -250,6 +251,27 @@ def test_who_may_connect(serving: Callable, monkeypatch: pytest.MonkeyPatch) -> 
         server_token(ServeConfig(host="0.0.0.0"))  # noqa: S104  # pyright: ignore[reportCallIssue]
     monkeypatch.setenv(TOKEN_VARIABLE, "abc\r\n")  # no header can carry the end of a line
     assert server_token(ServeConfig(host="0.0.0.0")) == "abc"  # noqa: S104  # pyright: ignore[reportCallIssue]
+
+
+def test_connections_that_say_nothing_are_closed_and_bounded(
+    serving: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(app, "TAKE_S", 0.3)
+    with serving(max_connections=4) as url:
+        host, _, port = url.removeprefix("ws://").partition(":")
+        slow = [socket.create_connection((host, int(port))) for _ in range(7)]
+        for connection in slow:
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX: ")
+        with SimulatorClient(url) as client:  # the eighth
+            with pytest.raises(httpx.TransportError):  # as many as there may be
+                httpx.get(url.replace("ws", "http") + "/healthz")
+            begin = time.monotonic()
+            for connection in slow:
+                connection.settimeout(5)
+                assert connection.recv(100) == b""
+            assert time.monotonic() - begin < 2
+            assert httpx.get(url.replace("ws", "http") + "/healthz").is_success
+            client.start(EPISODE)  # a websocket stays
 
 
 def test_another_server_is_no_simulator() -> None:

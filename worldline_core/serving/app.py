@@ -14,6 +14,7 @@ import secrets
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
+from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
 import uvicorn
@@ -24,6 +25,7 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.pages.page import render
@@ -33,8 +35,11 @@ from worldline_core.serving.play_session import PlaySession
 from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig, is_loopback
 from worldline_core.serving.session_host import SessionHost, error_message
 
+if TYPE_CHECKING:
+    from asyncio import Transport
+
 TAKE_S = 30.0
-"""Seconds within which a client must take a reply."""
+"""Seconds within which a client must take a reply, and send the head of a request."""
 OPEN_PATHS = ("/healthz", "/play")
 """Paths without a token: they reveal nothing of sessions. The page connects with the token in its own address."""
 
@@ -167,6 +172,34 @@ class Gate:
         return None
 
 
+def patient_http(most: int, patience_s: float) -> type[H11Protocol]:
+    """Uvicorn's HTTP protocol with bounds that it lacks, so that silent connections cannot keep others out.
+
+    Args:
+        most: connections at a time, websockets too; others are closed at once.
+        patience_s: a connection that is neither answered nor sends the head of a request is closed after once to twice
+            this time.
+    """
+
+    class PatientHttp(H11Protocol):
+        def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            if len(self.connections) > most:
+                transport.abort()
+            else:
+                self.loop.call_later(patience_s, self._give_up, self.cycle)
+
+        def _give_up(self, before: object) -> None:
+            if self.transport.is_closing() or self.transport.get_protocol() is not self:
+                return  # gone, or a websocket by now
+            if self.cycle is before and (before is None or self.cycle.response_complete):
+                self.transport.close()
+            else:
+                self.loop.call_later(patience_s, self._give_up, self.cycle)
+
+    return PatientHttp
+
+
 def server_token(config: ServeConfig) -> str | None:
     """The token that clients must show, from the environment.
 
@@ -206,7 +239,7 @@ def make_server(world: WorldLine, config: ServeConfig, token: str | None) -> uvi
     host = SessionHost(world, config)
     host.warm_up()
     settings = uvicorn.Config(
-        make_app(host, token), config.host, config.port, limit_concurrency=2 * config.max_connections, ws="websockets-sansio", ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
+        make_app(host, token), config.host, config.port, http=patient_http(2 * config.max_connections, TAKE_S), ws="websockets-sansio", ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
         timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning", server_header=False,
     )  # fmt: skip
     return uvicorn.Server(settings)
