@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import errno
+import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from tasks.execution.artifact_task import TaskCall
 from worldline_core.report.progress import FinishedStep, write_finished_page, write_progress_page
+
+logger = logging.getLogger(__name__)
 
 REFRESH_SECONDS = 10.0
 LATEST_REPORT = Path("report", "latest")
@@ -52,7 +57,8 @@ class RunPage:
         if error is not None:
             self._write(failed=str(error) or type(error).__name__)
         elif self._report is not None:
-            write_finished_page(self.folder, self._report)
+            with _unless_read_only():
+                write_finished_page(self.folder, self._report)
 
     def finished(self, call: TaskCall, folder: Path, *, cached: bool) -> None:
         """Note that a call has its artifact."""
@@ -78,7 +84,18 @@ class RunPage:
                 self._write()
 
     def _write(self, failed: str = "") -> None:
-        with self._change:
+        with self._change, _unless_read_only():
             to_come = [name for name in self._calls if name not in self._done and name not in self._running]
             elapsed = time.monotonic() - self._began
             write_progress_page(self.folder, list(self._done.values()), list(self._running), to_come, elapsed, failed)
+
+
+@contextmanager
+def _unless_read_only() -> Iterator[None]:
+    """A run that finds everything in a store that it may not write has no page."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
+            raise
+        logger.warning("no page of this run: %s", error)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 from PIL import Image
@@ -17,6 +18,7 @@ from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from flows.pipeline import prepare
+from tasks.execution import run_page
 from tasks.execution.artifact_task import variant
 from tasks.execution.chain import outline
 from tasks.execution.prefect_artifacts import show_in_prefect
@@ -52,6 +54,19 @@ def run(store: Path, chain: Callable[..., None], *arguments: str, page: bool = F
         return run.artifacts
 
     return some_calls()
+
+
+def test_a_store_that_may_not_be_written_serves_a_finished_run(
+    storage: Path, two_calls: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> NoReturn:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    done = run(storage, two_calls)
+    monkeypatch.setattr(run_page, "write_progress_page", refuse)
+    assert run(storage, two_calls, page=True) == done
+    with pytest.raises(DataError, match="cannot work"):
+        run(storage, two_calls, "broken", page=True)
 
 
 def test_a_call_starts_when_its_inputs_are_finished_and_is_found_the_second_time(
