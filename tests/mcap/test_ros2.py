@@ -365,3 +365,86 @@ def test_turned_stills_of_a_camera_are_refused(tmp_path: Path, toy: Any) -> None
     recording.write(tmp_path / "a.mcap")
     error = rejection(toy.declared(tmp_path))
     assert (error.reason, "orientation 3" in str(error)) == ("missing_calibration", True)
+
+
+def zeroed(sent: Any) -> Any:
+    """The message of a second publisher, which has heard nothing yet."""
+    key = "position" if "position" in sent.message else "data"
+    return replace(sent, message={**sent.message, key: [0.0] * len(sent.message[key])})
+
+
+@pytest.mark.parametrize(
+    ("topic", "among", "what"),
+    [
+        ("/joint_states", lambda sent, toy: [x for s in sent for x in (s, zeroed(s))], "Messages of one time"),
+        ("/joint_states", lambda sent, toy: [x for s in sent for x in (s, toy.shifted(zeroed(s), 0.005))], "to and fro"),
+        ("/joint_states", lambda sent, toy: [zeroed(s) if i % 4 == 1 else s for i, s in enumerate(sent)], "to and fro"),
+        ("/joint_states", lambda sent, toy: [zeroed(s) if i % 4 > 1 else s for i, s in enumerate(sent)], "to and fro"),
+        ("/command", lambda sent, toy: [zeroed(s) if i % 2 else s for i, s in enumerate(sent)], "to and fro"),
+        ("/command", lambda sent, toy: [zeroed(s) if i % 9 == 3 else s for i, s in enumerate(sent)], "to and fro"),
+        ("/joint_states", lambda sent, toy: [
+            replace(s, message={**s.message, "position": [0.0, 0.0, 2.0]}) if i == 150 else s for i, s in enumerate(sent)
+        ], "cannot be interpolated"),
+    ],
+)  # fmt: skip
+def test_two_publishers_of_one_topic_are_refused(tmp_path: Path, toy: Any, topic: str, among: Any, what: str) -> None:
+    recording = toy.robot()
+    recording.change(topic, lambda sent: among(sent, toy))
+    recording.write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path))
+    assert (error.reason, what in error.what) == ("conflicting_messages", True), str(error)
+    assert topic in str(error)
+
+
+def test_two_publishers_of_one_transform_are_refused(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot()
+
+    def stale(sent: Any) -> Any:
+        (transform,) = sent.message["transforms"]
+        return replace(sent, message={"transforms": [{**transform, "transform": first}]})
+
+    first = next(s for s in recording.sent if s.topic == "/tf").message["transforms"][0]["transform"]
+    recording.change("/tf", lambda sent: [stale(s) if i % 2 else s for i, s in enumerate(sent)])
+    recording.write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path))
+    assert (error.reason, "base_link -> wrist" in str(error)) == ("conflicting_messages", True)
+
+
+def test_one_publisher_is_not_taken_for_two(tmp_path: Path, toy: Any) -> None:
+    """Noise, repeated messages, commands that step, and grippers that are switched."""
+    rng = np.random.default_rng(2)
+
+    def noisy(sent: Any) -> Any:
+        position = (np.array(sent.message["position"]) + rng.normal(0, 0.002, 3)).tolist()
+        return replace(sent, message={**sent.message, "position": position})
+
+    recording = toy.robot()
+    recording.change("/joint_states", lambda sent: [x for s in map(noisy, sent) for x in (s, s)])
+    steps = [[0.6 * (i // 25 % 2), 0.1, 0.04 * (i // 10 % 2)] for i in range(150)]
+    recording.change(
+        "/command",
+        lambda sent: [replace(s, message={**s.message, "data": d}) for s, d in zip(sent, steps, strict=True)],
+    )
+    recording.write(tmp_path / "a.mcap")
+    assert load(toy.declared(tmp_path)).episode.num_frames == 90
+
+
+@pytest.mark.parametrize(
+    "topics", [("/tf",), ("/head/image/compressed",), ("/joint_states", "/wrist/image/compressed")]
+)
+def test_stamps_of_zero_name_their_topics(tmp_path: Path, toy: Any, topics: tuple[str, ...]) -> None:
+    def unstamped(sent: Any) -> Any:
+        if sent.topic != "/tf":
+            return toy.shifted(sent, 0, at_ns=0)
+        (transform,) = sent.message["transforms"]
+        header = {**transform["header"], "stamp": {"sec": 0, "nanosec": 0}}
+        return replace(sent, message={"transforms": [{**transform, "header": header}]})
+
+    recording = toy.robot()
+    for topic in topics:
+        recording.change(topic, lambda sent: map(unstamped, sent))
+    recording.write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path))
+    assert (error.reason, error.what) == ("clock_skew", "Messages have no header time")
+    assert all(topic in str(error.where) for topic in topics)
+    assert "set time: log" in str(error)

@@ -44,6 +44,7 @@ Reason = Literal[
     "time_gap",
     "clock_jump",
     "clock_skew",
+    "conflicting_messages",
     "changing_calibration",
     "too_short",
     "duplicate",

@@ -17,9 +17,12 @@ from worldline_core.data.mcap.resampling import (
     Clocks,
     TransformTree,
     add_camera,
+    check_alternation,
     check_gaps,
+    check_interpolation,
     checked_poses,
     in_order,
+    in_order_with_values,
     instants,
     nearest,
     resampled,
@@ -82,6 +85,7 @@ class _Recording:
             None if start is None else max(start - _READING_MARGIN_NS, 0),
             None if stop is None else stop + _READING_MARGIN_NS,
         )
+        self.measured = [arm.state for arm in config.arms]
         self.streams = self._read_streams()
         self.clocks = clocks = Clocks(config, self.streams, file.path)
         self.start_ns, self.stop_ns = (None if t is None else t - clocks.header_to_log_ns for t in (start, stop))
@@ -155,8 +159,8 @@ class _Recording:
     def _ordered(self, stream: Stream, values: np.ndarray, taken: list[int] | None = None) -> _Signal:
         """Values (n, d) of the taken messages (default: all) in order of time."""
         times = self.clocks.times_ns(stream)
-        arrivals = in_order(times if taken is None else times[taken], self.at(stream.topic))
-        return _Signal(stream.topic, arrivals.times_ns, values[arrivals.order])
+        times = times if taken is None else times[taken]
+        return _Signal(stream.topic, *in_order_with_values(times, values, self.at(stream.topic)))
 
     def _tool(self, topic: str) -> tuple[_Signal, str]:
         """Poses (n, 7) of a topic, and the frame that they are given in."""
@@ -297,10 +301,26 @@ class _Recording:
         signal = self.signals[readings]
         return resampled(signal.times_ns, signal.values, grid, hold=readings.resample == "hold")
 
+    def _check_values(self, arm: ArmReadings, grid: np.ndarray) -> None:
+        """Readings around the episode, in radians and as openings, come from one publisher and can be interpolated."""
+        for readings in (arm.joints, arm.gripper):
+            signal, where = self.signals[readings], self.at(readings.topic)
+            first, last = np.searchsorted(signal.times_ns, grid[[0, -1]]).tolist()
+            used = slice(max(first - 1, 0), last + 1)
+            times, values = signal.times_ns[used], signal.values[used]
+            if readings is arm.gripper:  # which may be switched: it has no speed
+                check_alternation(times, arm.gripper.range.opening(values)[0], where)
+                continue
+            values = np.deg2rad(values) if arm.joints.unit == "deg" else values
+            check_alternation(times, values, where, share=0.01 if arm in self.measured else 0.05)
+            if readings.resample == "linear":
+                check_interpolation(times, values, where)
+
     def arm_vectors(self, arms: Iterable[ArmReadings], grid: np.ndarray) -> tuple[np.ndarray, int]:
         """(t, J) joints [rad] and opening of each arm, and how many openings lay outside of 0..1."""
         columns, outside = [], 0
         for arm in arms:
+            self._check_values(arm, grid)
             joints, fingers = self._resampled(arm.joints, grid), self._resampled(arm.gripper, grid)
             opening, beyond = arm.gripper.range.opening(fingers.mean(axis=1))
             columns += [np.deg2rad(joints) if arm.joints.unit == "deg" else joints, opening[:, None]]

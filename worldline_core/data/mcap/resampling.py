@@ -7,6 +7,7 @@ smallest differences disagree were stamped by clocks that disagree (Paxson 1998)
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -23,6 +24,11 @@ from worldline_core.geometry.cameras import ImageTransform
 from worldline_core.geometry.lens import distortion_from_ros, is_fisheye
 from worldline_core.geometry.transforms import pose_from_rotation, rigid_inverse
 
+MAX_INTERPOLATION_ERROR = 0.1
+"""Between two joint readings [rad, m]; 10 Hz and 80 rad/s^2 make as much."""
+_SAME_VALUE = 1e-3
+"""Messages of one time that differ by less [rad, m] say the same: a simulation sends several per tick of its clock."""
+_FEWEST_FOR_ALTERNATION = 8
 MAX_DISORDER_S = 1.0
 """A message that comes later than this behind a younger one was stamped by a clock that was set back."""
 
@@ -42,18 +48,19 @@ class Clocks:
         if config.time == "log":
             return
         least_ms: dict[str, float] = {}
+        # A simulated clock is 0 once, a driver that sets none writes 0 always.
+        unset = {topic: count for topic, stream in streams.items() if (count := _without_time(stream)) > 1}
+        if unset:
+            raise RejectedInputError(
+                "clock_skew",
+                "Messages have no header time",
+                where=f"{where}, topic {', '.join(unset)}",
+                got=", ".join(f"0 in {count} of {len(streams[topic].log_ns)}" for topic, count in unset.items()),
+                next_step="set time: log",
+            )
         for stream in streams.values():
             if not stream.has_header or stream.kind == "calibration":
                 continue
-            unset = sum(not stamp for stamp in stream.stamps_ns)
-            if unset > 1:  # a simulated clock is 0 once, a driver that sets none writes 0 always
-                raise RejectedInputError(
-                    "clock_skew",
-                    "Messages have no header time",
-                    where=f"{where}, topic {stream.topic}",
-                    got=f"0 in {unset} of {len(stream.stamps_ns)}",
-                    next_step="set time: log",
-                )
             delay = np.array(stream.log_ns, np.int64) - np.array(stream.stamps_ns, np.int64)
             least_ms[stream.topic] = float(delay.min() - config.offset_ns(stream.topic)) / 1e6
         if not least_ms:
@@ -77,6 +84,15 @@ class Clocks:
         if self.config.time == "header" and stream.has_header:
             return np.array(stream.stamps_ns, np.int64) + self.config.offset_ns(stream.topic)
         return np.array(stream.log_ns, np.int64) - self.header_to_log_ns
+
+
+def _without_time(stream: Stream) -> int:
+    """How many messages state the time 0; of transforms those of one frame, as one that came once stays."""
+    if stream.kind == "transforms":
+        children = Counter(each.child for transforms in stream.values for each in transforms if not each.stamp_ns)
+        return max(children.values(), default=0)
+    unset = stream.stamps_ns.count(0)
+    return 0 if stream.kind == "calibration" else unset
 
 
 @dataclass(frozen=True)
@@ -111,6 +127,92 @@ def in_order(times_ns: np.ndarray, where: str) -> Arrivals:
     times, order = np.unique(times_ns, return_index=True)
     steps = np.diff(times)
     return Arrivals(times, order, float(np.median(steps)) if len(steps) else 0.0)
+
+
+@np.errstate(invalid="ignore", over="ignore")  # values that are not finite are refused later
+def in_order_with_values(times_ns: np.ndarray, values: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and values (n, d) in order of time, each time once.
+
+    Raises: RejectedInputError: clock_jump; conflicting_messages for one time with different values.
+    """
+    arrivals = in_order(times_ns, where)
+    kept = values[arrivals.order][np.searchsorted(arrivals.times_ns, times_ns)]
+    empty = np.isnan(kept) & np.isnan(values)
+    differs = ~((np.abs(kept - values) <= _SAME_VALUE) | (kept == values) | empty).all(axis=1)
+    if differs.any():
+        raise _conflict(
+            "Messages of one time have different values",
+            where=f"{where}, message {int(np.argmax(differs))}",
+            got=f"{int(differs.sum())} messages, by up to {np.nanmax(np.abs(kept - values)):.3f}",
+            evidence={"messages": int(differs.sum())},
+        )
+    return arrivals.times_ns, values[arrivals.order]
+
+
+def _conflict(what: str, *, where: str, got: str, evidence: Mapping[str, float]) -> RejectedInputError:
+    return RejectedInputError(
+        "conflicting_messages",
+        what,
+        where=where,
+        expected="one publisher",
+        got=got,
+        next_step="record the topic with one publisher, or declare another topic (a command that steps: resample: hold)",
+        evidence=evidence,
+    )
+
+
+@np.errstate(invalid="ignore", over="ignore")  # values that are not finite are refused later
+def check_alternation(times_ns: np.ndarray, values: np.ndarray, where: str, *, share: float | None = None) -> None:
+    """Refuses values (n, d) at ascending times that jump to and fro as those of two publishers do.
+
+    Half of all values differ by more than 0.01 from both neighbours, which agree; or, with `share`, so many jumps of more
+    than 0.05, faster than 100 per second^2, are taken back within four messages.
+
+    Raises: RejectedInputError (conflicting_messages).
+    """
+    count = len(values)
+    if count < _FEWEST_FOR_ALTERNATION:
+        return
+    jumps = np.diff(values, axis=0)
+
+    def taken_back(after: int) -> np.ndarray:
+        """(n - 1, d) jumps whose end returns to their beginning so many messages later."""
+        back = np.full(jumps.shape, np.inf)
+        back[: count - 1 - after] = np.abs(values[1 + after :] - values[: count - 1 - after])
+        return back < np.abs(jumps) / 2
+
+    at_once = (taken_back(1) & (np.abs(jumps) > 0.01)).any(axis=1)
+    fast = np.abs(jumps) > max(0.05, 100 * float(np.median(np.diff(times_ns)) / 1e9) ** 2)
+    soon = (np.logical_or.reduce([taken_back(after) for after in range(1, 5)]) & fast).any(axis=1)
+    alternates = at_once.sum() >= (count - 2) / 2 or (share is not None and soon.sum() >= max(3, share * count))
+    if alternates:
+        found = int(max(at_once.sum(), soon.sum()))
+        raise _conflict(
+            "Values of a topic jump to and fro, as those of two publishers",
+            where=where,
+            got=f"{found} of {count} messages, by up to {np.nanmax(np.abs(jumps[at_once | soon])):.3f}",
+            evidence={"messages": found},
+        )
+
+
+@np.errstate(invalid="ignore", over="ignore")  # values that are not finite are refused later
+def check_interpolation(times_ns: np.ndarray, values: np.ndarray, where: str) -> None:
+    """Raises: RejectedInputError (conflicting_messages) where values (n, d) between two messages are uncertain by more than
+    MAX_INTERPOLATION_ERROR: by h^2 / 8 times the second derivative (the larger one of both messages)."""
+    if len(values) < 3:
+        return
+    steps = (np.diff(times_ns) / 1e9)[:, None]
+    bends = np.abs(np.diff(np.diff(values, axis=0) / steps, axis=0)) / ((steps[1:] + steps[:-1]) / 2)
+    bends = np.nan_to_num(np.concatenate([bends[:1], bends, bends[-1:]]))
+    errors = (steps**2 / 8 * np.maximum(bends[1:], bends[:-1])).max(axis=1)
+    worst = int(np.argmax(errors))
+    if errors[worst] > MAX_INTERPOLATION_ERROR:
+        raise _conflict(
+            "Values of a topic cannot be interpolated",
+            where=f"{where}, {(times_ns[worst] - times_ns[0]) / 1e9:.3f} s after its first message",
+            got=f"an error of about {errors[worst]:.3f}, allowed {MAX_INTERPOLATION_ERROR}",
+            evidence={"error": float(errors[worst]), "limit": MAX_INTERPOLATION_ERROR},
+        )
 
 
 def check_gaps(
@@ -178,6 +280,10 @@ def checked_poses(poses: Sequence[tuple[float, ...]], reason: Reason, where: str
     values = np.array(poses, np.float64)
     if not (np.isfinite(values).all() and (np.linalg.norm(values[:, 3:], axis=1) > 1e-6).all()):
         raise RejectedInputError(reason, "Pose is not finite or has a quaternion without direction", where=where)
+    # Of one length, and of the sign that follows the pose before, so that neighbours can be compared.
+    values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    turned = (values[1:, 3:] * values[:-1, 3:]).sum(axis=1) < 0
+    values[1:, 3:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
     return values
 
 
@@ -202,8 +308,9 @@ class _Edge:
         values = checked_poses(self.values, "invalid_extrinsics", self.where)
         if not self.moving:
             return np.array(self.times_ns[-1:], np.int64), values[-1:]
-        arrivals = in_order(np.array(self.times_ns, np.int64), self.where)
-        return arrivals.times_ns, values[arrivals.order]
+        times_ns, values = in_order_with_values(np.array(self.times_ns, np.int64), values, self.where)
+        check_alternation(times_ns, values, self.where)
+        return times_ns, values
 
 
 class TransformTree:
