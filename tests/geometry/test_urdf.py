@@ -97,6 +97,8 @@ JOINT = "<joint name='{}' type='{}'><parent link='{}'/><child link='{}'/>{}</joi
         ),
         (robot(JOINT.format("j", "floating", "a", "b", "")), r"Joint is not supported[\s\S]*joint j[\s\S]*floating"),
         (robot(JOINT.format("j", "revolute", "a", "b", "<axis xyz='0 0 0'/>")), "direction of length zero"),
+        (robot(JOINT.format("j", "revolute", "a", "b", "<axis xyz='1e200 0 1e200'/>")), "length inf"),
+        (robot(JOINT.format("j", "prismatic", "a", "b", "<axis xyz='0 1e-200 0'/>")), "length 0"),
         (
             robot(JOINT.format("j", "revolute", "a", "b", "<origin xyz='0 0'/>")),
             r"joint j, origin[\s\S]*3 finite numbers",

@@ -232,12 +232,28 @@ def test_misuse_is_refused_and_changes_nothing(causal: WorldLine, starts: list[S
     arms = load_embodiment(ROBOT)
     for column, value, message in (
         (0, 45.0, r"(?s)beyond its limit.*state at the start.*left/.*got: 45;"),  # degrees
-        (arms.gripper_column(arms.arms[1]), 80.0, r"(?s)gripper is far beyond.*clip 0, arm right.*opening of 80"),
+        (arms.gripper_column(arms.arms[1]), 80.0, r"(?s)gripper is far beyond.*row 0, arm right.*opening of 80"),
     ):
         state = start.controls[0].astype(np.float64)
         state[column] = value
         with pytest.raises(DataError, match=message):
             start.begin(causal, state=state)
-    small = replace(start, images={view: image[:32] for view, image in start.images.items()})
+    state = start.controls[0].astype(np.float64)
+    for changes, message in (
+        ({"state": state + (np.arange(14) == arms.gripper_column(arms.arms[0])) * (2.0 - state)}, "opening of 2"),
+        ({"state": state.astype(complex)}, "array of numbers"),
+        ({"state": np.ma.masked_greater(state, 0.0)}, "masked values"),
+        ({"state": [str(value) for value in state]}, "array of numbers"),
+        ({"seed": 1.5}, r"(?s)Not a seed.*1\.5"), ({"seed": True}, "Not a seed"), ({"seed": [-1]}, "Not a seed"),
+    ):  # fmt: skip
+        with pytest.raises(DataError, match=message):
+            start.begin(causal, **changes)
+    with pytest.raises(DataError, match="Not a seed"):
+        simulation.fork(2, seeds=[1, False])
+    for commands in (np.degrees(rows + 0.2), rows * 100, rows.astype(complex), np.ma.masked_greater(rows, 0.0)):
+        with pytest.raises(DataError, match=r"beyond its|array of numbers"):
+            simulation.step(commands)
+    assert simulation.num_frames == 1
+    small = replace(start, images={view: image[:104] for view, image in start.images.items()})
     with pytest.raises(DataError, match="same views at one size"):
         causal.start([start.images, small.images], start.cameras, embodiment=ROBOT, state=start.controls[0])

@@ -150,9 +150,30 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
     refused("images are not those of the model's views", images={"left_wrist": observed.images["left_wrist"]})
     refused("cameras are not those of the images", cameras={})
     refused("RGB and of one size", images=observed.images | {"head": observed.images["head"][:8]})
-    refused(r"(?s)camera without a pose.*head", cameras=observed.cameras | {"head": Camera(np.eye(3))})
-    refused("camera pose has a wrong shape", cameras=observed.cameras | {"head": Camera(np.eye(3), np.eye(3))})
+    refused(r"(?s)camera without a pose.*head", cameras=observed.cameras | {"head": Camera(observed.cameras["head"].K)})
+    refused(
+        "camera pose has a wrong shape",
+        cameras=observed.cameras | {"head": Camera(observed.cameras["head"].K, np.eye(3))},
+    )
     head = observed.cameras["head"]
+    assert head.T_base_camera is not None
+    for factor in (1000.0, 1e38):
+        pose = head.T_base_camera.copy()
+        pose[:3, 3] *= factor
+        cameras = observed.cameras | {"head": Camera(head.K, pose)}
+        refused(r"(?s)too far from the robot.*head", CalibrationError, cameras=cameras)
+    for factor in (0.5, 2.0, 10 / 3):
+        cameras = observed.cameras | {"head": Camera(np.diag([factor, factor, 1.0]) @ head.K, head.T_base_camera)}
+        refused(r"(?s)another image size.*head", CalibrationError, cameras=cameras)
+    grippers = np.isin(np.arange(14), [6, 13])
+    for controls in (
+        np.degrees(observed.controls), observed.controls * 100, observed.controls.astype(complex),
+        np.where(grippers, 2.0, observed.controls), np.ma.masked_less(observed.controls, 0.0),
+    ):  # fmt: skip
+        refused(r"beyond its|array of numbers", controls=controls)
+    for seed in (1.5, True, "1", -1):
+        refused("Not a seed", seed=seed)
+    refused("arrays of uint8", images=observed.images | {"head": observed.images["head"] / 255})
     for K in (np.full((3, 3), np.nan), np.zeros((3, 3)), np.diag([80.0, -80.0, 1.0])):
         cameras = observed.cameras | {"head": Camera(K, head.T_base_camera)}
         refused(r"(?s)camera matrix is not usable.*head", CalibrationError, cameras=cameras)

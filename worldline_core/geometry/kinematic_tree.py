@@ -124,11 +124,17 @@ def _numbers(text: str, count: int, where: object) -> np.ndarray:
 def _unit(vector: np.ndarray, where: object) -> np.ndarray:
     """The vector at length 1.
 
-    Raises: DataError when it is zero.
+    Raises: DataError when it is zero, or so long or short that its square is no number.
     """
     length = float(np.linalg.norm(vector))
-    if length == 0.0:
-        raise DataError("A direction of length zero", where=where, expected="a vector that is not zero")
+    if not 1e-100 < length < 1e100:
+        expected = "a vector that is not zero, and not beyond 1e100"
+        raise DataError(
+            "A direction of length zero, or without a usable one",
+            where=where,
+            expected=expected,
+            got=f"length {length:g}",
+        )
     return vector / length
 
 

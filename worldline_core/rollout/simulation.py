@@ -30,7 +30,16 @@ from worldline_core.geometry.embodiment import Embodiment, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.tokenizers import VideoDecoder, VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.model.world_model_config import ActionContract
-from worldline_core.rollout.observation import Camera, image_size, project_controls
+from worldline_core.rollout.observation import (
+    COMMAND_OPENING,
+    COMMAND_TOLERANCE_RAD,
+    Camera,
+    check_controls,
+    checked_seeds,
+    image_size,
+    project_controls,
+    real_numbers,
+)
 from worldline_core.rollout.robot import CommandedRobot
 from worldline_core.rollout.samplers import BlockCausalSimulator, FullClipSampler
 
@@ -153,9 +162,6 @@ def encode_images(tokenizer: VideoTokenizer, images: Float[Tensor, "b v 3 h w"])
     return rearrange(latents, "(b v) c 1 h w -> b v c h w", v=images.shape[1])
 
 
-START_TOLERANCE_RAD, START_OPENING_RANGES = 0.5, 1.5
-"""A recorded start may be a little beyond the limits; one that is further out, or a gripper that is further than one range
-outside of its own, is in another unit or of another robot."""
 USUAL_CLIP_FRAMES = 33
 """Clip length of a stepped Stage II model without ``clip_frames``: the paper's."""
 
@@ -184,27 +190,17 @@ class Starts:
         self.images = [images] if isinstance(images, Mapping) else list(images)
         count = len(self.images)
         self.cameras = [cameras] * count if isinstance(cameras, Mapping) else list(cameras)
-        self.seeds = [seeds] * count if isinstance(seeds, int) else list(seeds)
+        self.seeds = checked_seeds(seeds, count)
         known = isinstance(embodiment, ArmKinematics)
         self.kinematics = embodiment if known else ArmKinematics(load_embodiment(embodiment))
-        rows = np.atleast_1d(np.asarray(state, dtype=np.float64))
+        rows = np.atleast_1d(real_numbers(state, "the state at the start"))
         self.state = np.repeat(rows[None], count, axis=0) if rows.ndim == 1 else rows
         given = {"images": count, "cameras": len(self.cameras), "seeds": len(self.seeds), "state": len(self.state)}
         if count == 0 or len(set(given.values())) > 1:
             raise DataError(
                 "The starts of a simulation do not fit together", expected="one of each per clip", got=given
             )
-        self.kinematics.embodiment.check_limits(self.state, "the state at the start", START_TOLERANCE_RAD)
-        opening = self.kinematics.gripper(self.state).numpy()
-        if (beyond := (np.abs(opening - 0.5) > START_OPENING_RANGES)).any():
-            row, arm = np.argwhere(beyond)[0]
-            raise DataError(
-                "A gripper is far beyond its range",
-                where=f"the state at the start, clip {row}, arm {self.kinematics.embodiment.arms[arm].name}",
-                expected="0 (closed) to 1 (open), in the units of the embodiment's file",
-                got=f"an opening of {opening[row, arm]:g}",
-                next_step="check the gripper's units and its column",
-            )
+        check_controls(self.kinematics, self.state, "the state at the start")
         sizes = {image_size(*pair) for pair in zip(self.images, self.cameras, strict=True)}
         if len(sizes) > 1 or len({frozenset(start) for start in self.images}) > 1:
             raise DataError(
@@ -304,7 +300,7 @@ class Simulation:
             Of every clip, ``uint8 (n, H, W, 3)`` by view. After an error the simulation is as it was before the call.
 
         Raises:
-            DataError: the shape is another one, or a command is not finite.
+            DataError: the shape is another one, or a command is not finite or in another unit.
         """
         commands = self._checked(controls)
         robot, executed, states = self._robot.follow(commands)
@@ -345,6 +341,7 @@ class Simulation:
             raise DataError("No such clips in the simulation", expected=f"some of 0..{len(self) - 1}", got=index[:8])
         if seeds is not None and len(seeds) != len(index):
             raise DataError("One seed for each clip is needed", expected=len(index), got=len(seeds))
+        seeds = None if seeds is None else checked_seeds(seeds, len(index))
         other = copy(self)
         other._session = self._session.select(index, seeds)
         other._starts, other._robot = self._starts.select(index), self._robot.select(index)
@@ -363,7 +360,7 @@ class Simulation:
         return self._starts.project(clip, np.stack((*known, *rows)), self.fps)
 
     def _checked(self, controls: np.ndarray) -> np.ndarray:
-        commands = np.asarray(controls, dtype=np.float64)
+        commands = real_numbers(controls, "controls of a step")
         commands = commands[None] if commands.ndim == 2 and len(self) == 1 else commands
         wanted = (len(self), self.frames_per_step, self.embodiment.state_size)
         if commands.shape != wanted:
@@ -381,4 +378,7 @@ class Simulation:
                 expected="finite numbers",
                 got=float(commands[clip, row, column]),
             )
+        for clip, rows in enumerate(commands):
+            where = f"controls of a step, clip {clip}"
+            check_controls(self._starts.kinematics, rows, where, COMMAND_TOLERANCE_RAD, COMMAND_OPENING)
         return commands

@@ -22,7 +22,15 @@ from worldline_core.model.pretrained import load_model_tokenizer, pretrained_fol
 from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.observation import Camera, image_size, ordered_views, project_controls
+from worldline_core.rollout.observation import (
+    Camera,
+    check_controls,
+    checked_seeds,
+    image_size,
+    ordered_views,
+    project_controls,
+    real_numbers,
+)
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts
 
@@ -145,24 +153,26 @@ class WorldLine:
             ``uint8 (frames, H, W, 3)`` per view, the observed frame first, at ``image_size``.
 
         Raises:
-            DataError: the views are not the model's, a shape does not fit, or the number of frames is not 1 + k whole
-                units.
+            DataError: the views are not the model's, a shape does not fit, the number of frames is not 1 + k whole units,
+                or controls are in another unit.
             CalibrationError: a camera cannot be used.
             ConfigError: there is no such embodiment.
         """
         views = self.chosen_views(images)
-        rows, unit = np.asarray(controls, np.float64), self.frames_per_unit
+        rows, unit = real_numbers(controls, "controls"), self.frames_per_unit
         if len(rows) <= unit or (len(rows) - 1) % unit:
             raise DataError(
                 "The model predicts one observed frame and whole units", expected=f"1 + k * {unit} rows of controls",
                 got=len(rows), next_step=f"give {1 + max(1, (len(rows) - 1) // unit) * unit} rows",
             )  # fmt: skip
         kinematics = ArmKinematics(load_embodiment(embodiment))
+        check_controls(kinematics, rows, "controls")
+        seeds = checked_seeds(seed, 1)
         tracks = project_controls(
             cameras, image_size(images, cameras), kinematics, controls=rows, fps=self.contract.fps
         )
         first = torch.stack([frames_to_video(images[view][None], self.image_size)[:, 0] for view in views])
-        pieces = [clips[0] for clips in self.stream(first[None], [tracks], tracks.num_frames, [seed], views=views)]
+        pieces = [clips[0] for clips in self.stream(first[None], [tracks], tracks.num_frames, seeds, views=views)]
         return {view: np.concatenate([piece[view] for piece in pieces]) for view in views}
 
     def start(

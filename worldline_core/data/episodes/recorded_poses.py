@@ -27,6 +27,8 @@ from worldline_core.geometry.transforms import (
 )
 
 REPAIRED = "rotations_repaired"
+MAX_DISTANCE = 1e5
+"""Of a camera from its base, in metres, or in millimetres that are still to be converted."""
 
 
 @contextmanager
@@ -59,7 +61,12 @@ def camera_pose(
     Raises: RejectedInputError (invalid_extrinsics) with the deviation, when one is not rigid.
     """
     with rejected_as("invalid_extrinsics", where, {"view": view, **_deviation(matrices)}):
-        return CameraPose.of(matrices, extrinsics=extrinsics, axes=axes, where=f"view {view}")
+        pose = CameraPose.of(matrices, extrinsics=extrinsics, axes=axes, where=f"view {view}")
+        if (furthest := float(np.abs(matrices[..., :3, 3]).max(initial=0.0))) > MAX_DISTANCE:
+            raise CalibrationError(
+                "A camera is too far away", where=f"view {view}", expected=f"at most {MAX_DISTANCE:g}", got=furthest
+            )
+        return pose
 
 
 class RecordedCameras:
