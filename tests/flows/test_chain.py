@@ -96,6 +96,20 @@ def test_shipped_rollout_needs_a_shipped_model() -> None:
         load_config(PipelineConfig, preset="tiny", overrides=["models.stage2=null"])
 
 
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("encode_latents.views=[head]", "'left_wrist', 'right_wrist'.*encode_latents.views leaves out"),
+        ("train_stage2.clips.view_weights={head: 1.0}", "'left_wrist', 'right_wrist'.*view_weights leaves out"),
+        ("encode_latents.views=[head, left_wrist]", "'right_wrist'.*set distill.views"),
+    ],
+)
+def test_views_of_distillation_are_checked_before_any_training(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config(PipelineConfig, preset="smoke", overrides=[override])
+    load_config(PipelineConfig, preset="smoke", overrides=[override, "distill.views=[head]"])
+
+
 def test_inputs_are_checked_where_a_task_is_called() -> None:
     config = PipelineConfig.load("smoke")
     with pytest.raises(ConfigError, match=r"missing \['episodes'\], unknown \['recordings'\]"):

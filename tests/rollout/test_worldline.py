@@ -12,7 +12,7 @@ from worldline_core import Camera, WorldLine
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import CalibrationError, CheckpointError, ConfigError, DataError
+from worldline_core.errors import CalibrationError, CheckpointError, ConfigError, DataError, UnavailableError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import load_checkpoint
@@ -191,3 +191,12 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
 def test_a_name_that_the_package_lacks_is_an_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'Simulator'"):
         __import__("worldline_core").Simulator  # noqa: B018
+
+
+def test_a_gpu_that_is_not_here_is_said_before_anything_is_loaded(
+    models: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for device in ("cuda", "cuda:1"):
+        with pytest.raises(UnavailableError, match=rf"(?s)No GPU.*device={device}.*next step: device=cpu"):
+            WorldLine.from_pretrained(models / "causal", device=device)

@@ -12,6 +12,7 @@ add one.
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -44,6 +45,7 @@ from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes
 from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
 
+logger = logging.getLogger(__name__)
 FINDINGS_FILE = "findings.parquet"
 
 
@@ -239,6 +241,9 @@ def filter_episodes(
     write_table_atomic(output / FINDINGS_FILE, pa.Table.from_pylist(findings, schema=row_schema(FindingRow)))
     write_quarantine(output, rejected)
     write_index(output, rows)
+    fit = Counter(row.stage2_reason for row in rows)
+    reasons = ", ".join(f"{reason} {count}" for reason, count in sorted((r, n) for r, n in fit.items() if r))
+    logger.info("fit for Stage II: %d of %d%s", fit[None], len(rows), reasons and f" ({reasons})")
     return {
         "found": len(episodes),
         "kept": len(kept),

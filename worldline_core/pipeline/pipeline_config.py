@@ -189,6 +189,20 @@ class PipelineConfig(StrictModel):
             )
         return self
 
+    @model_validator(mode="after")
+    def _distilled_views_are_trained(self) -> PipelineConfig:
+        """What distillation would refuse after Stage II, and what latents lack."""
+        wanted = self.distill.views
+        known = {"train_stage2.clips.view_weights": self.train_stage2.clips.shown_views(wanted)}
+        if not isinstance(self.distill.input, FrameInput):
+            known["encode_latents.views"] = self.encode_latents.views
+        for key, views in known.items():
+            if missing := [view for view in wanted if view not in views]:
+                raise ValueError(
+                    f"distill.views asks for {missing}, which {key} leaves out: set distill.views to the others"
+                )
+        return self
+
 
 _OUTSIDE = {
     "models.tokenizer": "download the folder vae of nvidia/Cosmos3-Nano, in diffusers format",

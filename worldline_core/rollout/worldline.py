@@ -14,7 +14,7 @@ from torch import Tensor
 
 from worldline_core.actions.action_maps import render_action_maps, stack_controls
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, native_vectors
-from worldline_core.errors import CheckpointError, DataError
+from worldline_core.errors import CheckpointError, DataError, UnavailableError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
@@ -117,9 +117,14 @@ class WorldLine:
 
         Raises:
             CheckpointError: a folder is not what it should be, or tokenizer or decoder are not the model's.
-            UnavailableError: the hub does not give it.
+            UnavailableError: the hub does not give it, or the device is not there.
             ConfigError: fewer than one step.
         """
+        if device.startswith("cuda") and not torch.cuda.is_available():
+            raise UnavailableError(
+                "No GPU that torch can use is here", where=f"device={device}", expected="a GPU and torch with CUDA",
+                got=f"torch {torch.__version__}", next_step="device=cpu, or `worldline doctor`",
+            )  # fmt: skip
         folder = pretrained_folder(folder)
         kinds: tuple[CheckpointKind, ...] = ("stage2", "causal") if expect_kind is None else (expect_kind,)
         model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation", dtype=getattr(torch, weights))

@@ -54,9 +54,12 @@ class ClipSampling(StrictModel):
 
     def needed_views(self, views: Sequence[str]) -> tuple[str, ...]:
         """Those of a model's views that every episode must have."""
+        return tuple(view for view in self.shown_views(views) if view not in self.optional_views)
+
+    def shown_views(self, views: Sequence[str]) -> tuple[str, ...]:
+        """Those of a model's views that clips may have."""
         weights = self.view_weights
-        shown = [view for view in views if weights is None or weights.get(JOINT, 0) > 0 or weights.get(view, 0) > 0]
-        return tuple(view for view in shown if view not in self.optional_views)
+        return tuple(view for view in views if weights is None or weights.get(JOINT, 0) > 0 or weights.get(view, 0) > 0)
 
 
 class ReadingConfig(StrictModel):

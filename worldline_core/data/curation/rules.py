@@ -125,8 +125,9 @@ def drawn_episodes(splits: DrawnSplits, parts: Sequence[Described]) -> dict[str,
         for _, task in sorted(strata.items())
     ]
     order = [name for task in groups for group in task for name in group]
-    drawn: dict[str, Split] = {name: "train" for name in order}  # noqa: C420  # whose type would be str
-    counts = {name: max(1, round(len(order) * share)) for name, share in _shares(splits)} if order else {}
+    drawn: dict[str, Split] = {}
+    drawn.update({name: "train" for name in order})  # noqa: C420  # whose values would be str
+    counts: dict[Split, int] = {name: max(1, round(len(order) * share)) for name, share in _shares(splits) if order}
     if order and sum(counts.values()) >= len(order):
         raise DataError(
             "Too few episodes for the splits", where="curate.splits", expected=f"more than {sum(counts.values())}",
@@ -134,7 +135,7 @@ def drawn_episodes(splits: DrawnSplits, parts: Sequence[Described]) -> dict[str,
         )  # fmt: skip
     for split, count in counts.items():
         left = [name for name in order if drawn[name] == "train"]
-        drawn |= {left[(2 * k + 1) * len(left) // (2 * count)]: split for k in range(count)}
+        drawn.update({left[(2 * k + 1) * len(left) // (2 * count)]: split for k in range(count)})
     return drawn
 
 
