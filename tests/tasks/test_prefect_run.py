@@ -15,6 +15,7 @@ from PIL import Image
 from prefect import flow
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowFilter, FlowFilterName
+from prefect.client.schemas.sorting import ArtifactSort
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from flows.pipeline import prepare
@@ -112,7 +113,9 @@ def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path
 
     shown()
     with get_client(sync_client=True) as client:
-        found = {artifact.key: artifact.data for artifact in client.read_artifacts()}
+        found = {
+            artifact.key: artifact.data for artifact in client.read_artifacts(sort=ArtifactSort.CREATED_DESC)[::-1]
+        }
     assert (tmp_path / "latest" / "index.html").as_uri() in str(found["report"])
     row = {"metric": "planning/N=32/causal/success", "mean": 0.75, "95 % from": 0.5, "to": 1.0, "trajectories": 9}
     assert json.loads(str(found["metrics"])) == [row]

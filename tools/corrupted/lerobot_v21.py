@@ -267,6 +267,10 @@ def _copy(base: _Episode, episode: _Episode) -> None:
     for source, target in zip((base.table, *base.videos), (episode.table, *episode.videos), strict=True):
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
+    table = pq.read_table(episode.table)
+    numbers = pa.array(np.full(len(table), episode.index))
+    place = table.schema.get_field_index("episode_index")
+    pq.write_table(table.set_column(place, "episode_index", numbers), episode.table)
 
 
 def _write_meta(root: Path, listed: list[dict[str, Any]]) -> None:
