@@ -114,5 +114,5 @@ def test_an_episode_without_a_prediction_is_named(tmp_path: Path) -> None:
 
 
 def test_file_names_are_safe() -> None:
-    assert re.fullmatch(r"a_b_c____d-[0-9a-f]{8}", safe_stem("a/b c:../d"))
+    assert re.fullmatch(r"a_b_c____d-[0-9a-f]{16}", safe_stem("a/b c:../d"))
     assert len({safe_stem(name) for name in ("run 1", "run_1", "run.1")}) == 3
