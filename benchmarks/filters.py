@@ -1,4 +1,4 @@
-"""How well the filters find injected faults: precision, recall and F1 of every reason.
+"""Detection of injected faults by the filters: precision, recall and F1 of every reason.
 
     python benchmarks/filters.py [--part report|tuning] [--recordings FOLDER] [--clips 100] [--processes 2]
 

@@ -220,7 +220,7 @@ def test_every_file_has_an_id_of_its_own(tmp_path: Path, names: list[str]) -> No
     assert {str(file) for file in source.files.values()} == set(names)
 
 
-def test_a_name_that_nobody_else_wants_stays() -> None:
+def test_a_unique_name_stays() -> None:
     files = {PurePosixPath(f"{n}.mp4"): f"web-{n}" for n in range(3)}
     assert unique_names(files) == files
 

@@ -49,7 +49,7 @@ def piped(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> 
 
 
 def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What the project said; other libraries' threads may log meanwhile."""
+    """Log lines of the project; other libraries' threads may log meanwhile."""
     return [record.getMessage() for record in caplog.records if record.name.startswith("worldline_core")]
 
 

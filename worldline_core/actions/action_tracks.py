@@ -85,7 +85,7 @@ def project_tools(
     parts = []
     for start in range(0, frames, FRAMES_AT_ONCE):
         piece = slice(start, start + FRAMES_AT_ONCE)
-        # What is given once, for all frames, has no frame axis or one of length 1.
+        # Cameras given once for all frames have no frame axis, or one of length 1.
         cut_K, cut_cameras = (x[piece] if x.ndim == 4 and len(x) == frames else x for x in (K, T_base_camera))
         parts.append(_project(T_base_tool[piece], gripper[piece], cut_K, cut_cameras, image_size))
     return Projection(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Projection)})
@@ -98,7 +98,7 @@ def _project(
     eye = torch.eye(4, dtype=torch.float64, device=tools.device)
     calibrated = valid_intrinsics(intrinsics) & is_rigid(cameras)
     posed = torch.isfinite(tools).flatten(-2).all(-1)
-    # What is not known is replaced before any arithmetic, so that neither a value nor a gradient becomes NaN.
+    # Unknown poses are replaced before any arithmetic, so that neither a value nor a gradient becomes NaN.
     tools = torch.where(posed[..., None, None], tools, eye)
     cameras = torch.where(calibrated[..., None, None], cameras, eye)
     intrinsics = torch.where(calibrated[..., None, None], intrinsics, eye[:3, :3])
