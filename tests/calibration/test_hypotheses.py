@@ -160,3 +160,15 @@ def test_what_the_cameras_may_follow_is_printed(shared_data: Path, tmp_path: Pat
     assert "they may follow the commands: give the kinematics to see" in printed
     assert "without kinematics of agibot_g1" in printed
     assert json.loads((tmp_path / "out" / "diagnoses.json").read_text())["episodes"][0]["nearest"] == []
+
+
+@pytest.mark.parametrize("first", [{"camera_axes": "opengl"}, {"extrinsics_unit": "mm"}, {"angle_unit": "deg"}])
+@pytest.mark.parametrize(
+    "second", [INVERSE, RecordedConventions(extrinsics_unit="mm"), RecordedConventions(angle_unit="deg"), None]
+)
+def test_two_errors_at_once_are_judged(healthy: list, first: dict, second: RecordedConventions | None) -> None:
+    """Under some readings of these nothing of the robot is before the head camera (None: exchanged wrist extrinsics)."""
+    item = of_robot(healthy, "ur5e")
+    spoiled = corrupt(item.joints, RecordedConventions(**first))
+    spoiled = with_exchanged_extrinsics(spoiled) if second is None else corrupt(spoiled, second)
+    assert diagnose(spoiled, item.gray, item.kinematics, quick=True).verdict != "consistent"

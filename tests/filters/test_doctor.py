@@ -13,10 +13,12 @@ from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import ViewThumbnails
+from worldline_core.filters import filter as filter_module
 from worldline_core.filters.calibration import detect_mistake, kinematics_of
 from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig, FilterDoctorConfig
 from worldline_core.filters.signals import Signals, measure
+from worldline_core.filters.verdict import Finding
 
 CONFIG = FilterDoctorConfig()
 
@@ -73,3 +75,19 @@ def test_kinematics_that_do_not_fit_are_not_used(recording: tuple[Episode, dict[
     assert kinematics_of(replace(episode, embodiment="no_such_robot")) is None
     three = np.tile(np.eye(4), (episode.num_frames, 3, 1, 1))
     assert kinematics_of(replace(episode, T_base_ee=three)) is None
+
+
+def test_a_judgement_that_fails_does_not_cost_the_episode(
+    recording: tuple[Episode, dict[str, ViewThumbnails], Signals], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> list[Finding]:
+        raise ValueError("cannot reshape array of size 0")
+
+    fails.__name__ = "find_mistake"
+    judged = inspect(FilterConfig(), recording[2])
+    monkeypatch.setattr(filter_module, "JUDGEMENTS", (*filter_module.JUDGEMENTS[:-1], fails))
+    monkeypatch.setattr(filter_module, "DETECTORS", (*filter_module.DETECTORS[:-1], fails))
+    *others, failed = inspect(FilterConfig(), recording[2])
+    assert [f.detector for f in others] == [f.detector for f in judged[:-1]]
+    assert (failed.stage, failed.verdict.passed, failed.verdict.numbers["verdict"]) == (2, True, "not_judged")
+    assert "cannot reshape" in str(failed.verdict.numbers["message"])

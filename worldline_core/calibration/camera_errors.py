@@ -193,6 +193,12 @@ class StillView:
         length = lengths(step)
         alive = ahead[1:] & ahead[:-1] & (length > STILL_STEP_PX)
         kept = (length * alive).max(axis=0) > MIN_STEP_PX
+        count, (rows, columns) = len(step), self.measured.shape[1:3]
+        value, cover = np.zeros((count, rows, columns, 3), np.float32), np.zeros((count, rows, columns), np.float32)
+        shift = np.zeros((count, rows, columns, 2, len(wanted) + 1), np.float32)
+        growth = np.zeros((count, rows, columns, 2, len(wanted)), np.float32)
+        if not kept.any():  # nothing of the robot moves before such a camera
+            return value, shift, growth, cover
         step, length, alive = step[:, kept].astype(np.float32), length[:, kept].astype(np.float32), alive[:, kept]
         start = ((uv[:-1, kept] - (CELL_PX - 1) / 2) / CELL_PX).astype(np.float32)
         reach = (camera.K[0, 0] * self.radii[kept] / depth[:-1, kept] / CELL_PX).astype(np.float32)
@@ -208,12 +214,8 @@ class StillView:
         thickness, way = (weight * reach).astype(np.float32), step / CELL_PX
         square = (way**2).sum(axis=-1, keepdims=True) + 1e-6
         lines = np.concatenate([way, -(start * way).sum(axis=-1, keepdims=True)], axis=-1) / square
-        count, (rows, columns) = len(step), self.measured.shape[1:3]
         row, column = np.mgrid[:rows, :columns].reshape(2, -1).astype(np.float32)
         cells = np.stack([column, row, np.ones_like(row)])
-        value, cover = np.zeros((count, rows, columns, 3), np.float32), np.zeros((count, rows, columns), np.float32)
-        shift = np.zeros((count, rows, columns, 2, len(wanted) + 1), np.float32)
-        growth = np.zeros((count, rows, columns, 2, len(wanted)), np.float32)
         for i in range(count):
             on = np.flatnonzero(alive[i])
             if not len(on):

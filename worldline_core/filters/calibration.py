@@ -6,8 +6,8 @@ one frame). Projection: tools lie inside the image, and where one moves, the ima
 camera poses are rigid, wrist cameras are fixed to their arm, fixed cameras stay fixed.
 
 The calibration doctor is a detector as well: no usual mistake explains the recording better than its own calibration
-does. An explained mistake also excludes the episode from Stage II: its evidence names the configuration line that repairs
-the source, and nothing is repaired silently.
+does. An explained mistake excludes the episode from Stage II: its evidence names the configuration line that repairs the
+source, and nothing is repaired silently. A camera that is off by an estimate is a warning in the evidence, and bars nothing.
 """
 
 from __future__ import annotations
@@ -338,11 +338,9 @@ def detect_mistake(
     if diagnosis.verdict == "explained":
         lags = all(field.endswith("lag_frames") for field in diagnosis.best.departures)
         reason = "time_alignment" if lags else "calibration"
-    elif diagnosis.verdict == "off":
-        reason = "time_alignment" if all(error.kind == "lag" for error in diagnosis.off) else "calibration"
     return Verdict(
         reason,
-        diagnosis.verdict in ("consistent", "too_little_evidence"),
+        diagnosis.verdict in ("consistent", "off", "too_little_evidence"),  # "off" is an estimate: it warns
         _numbers(diagnosis, step) | {"first_frame": start, "every_frame": step},
     )
 

@@ -40,8 +40,8 @@ from worldline_core.filters.detectors import find_base_motion, find_joint_faults
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import Signals, measure
 from worldline_core.filters.verdict import Finding, Verdict, runs
-from worldline_core.scale.account import InputRow, check_account, write_account
-from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
+from worldline_core.scale.account import InputRow, check_account, crash_evidence, write_account
+from worldline_core.scale.mapping import SerialMapper, ShardMapper, ends_the_run, map_episodes, reading_input
 from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
 
@@ -85,16 +85,20 @@ def find_missing_inputs(signals: Signals, config: FilterConfig, _: Sequence[Find
     return findings
 
 
+JUDGEMENTS: tuple[Detector, ...] = (
+    find_lags,  # image_lag, pose_lag: before calibration, since a lag also disturbs the hand-eye check
+    find_calibration_faults,  # camera, hand_eye, fixed_camera
+    find_projection,
+    find_mistake,  # doctor
+)
+"""For Stage II, by estimates from poses and pictures: one that fails is recorded, and costs the episode nothing."""
 DETECTORS: tuple[Detector, ...] = (
     find_joint_faults,  # reset, joint_jump, joint_speed
     find_picture_faults,  # too_dark, overexposed, blur, corrupted, in each view
     find_static,
     find_base_motion,
     find_missing_inputs,  # required_views
-    find_lags,  # image_lag, pose_lag: before calibration, since a lag also disturbs the hand-eye check
-    find_calibration_faults,  # camera, hand_eye, fixed_camera
-    find_projection,
-    find_mistake,  # doctor
+    *JUDGEMENTS,
 )
 """In this order: Stage I first. Of several findings that drop an episode the first one is its reason."""
 
@@ -103,7 +107,15 @@ def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:
     """All findings about an episode. A mistake that the calibration doctor explains comes before what it explains."""
     findings: list[Finding] = []
     for detect in DETECTORS:
-        findings += detect(signals, config, findings)
+        try:
+            findings += detect(signals, config, findings)
+        except Exception as error:
+            if detect not in JUDGEMENTS or ends_the_run(error):
+                raise
+            evidence = {name: str(value) for name, value in crash_evidence(error).items()}
+            logger.warning("%s: %s failed: %s", signals.episode.episode_id, detect.__name__, evidence["message"])
+            name = detect.__name__.removeprefix("find_")
+            findings.append(Finding(name, None, 2, Verdict("not_judged", True, {"verdict": "not_judged", **evidence})))
     doctor = findings[-1]
     if doctor.detector == "doctor" and doctor.verdict.numbers["verdict"] == "explained":
         explained = (i for i, f in enumerate(findings) if f.stage == 2 and f.detector != "required_views")

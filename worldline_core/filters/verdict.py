@@ -110,6 +110,7 @@ REASONS: dict[str, str] = {
     "missing_actions": "The source has pictures only.",
     "calibration": "K or camera poses cannot be right, or a usual mistake explains the recording better.",
     "calibration_unexplained": "Tools and pictures disagree, and no usual mistake explains it.",
+    "not_judged": "Judging the calibration failed; the evidence says why, and the episode stays.",
     "projection": "Tools do not lie where the picture moves.",
     "time_alignment": "Pictures, camera poses and states show different instants.",
 }
