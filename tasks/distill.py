@@ -5,7 +5,7 @@ from tasks.execution.artifact_task import ArtifactTask
 distill = ArtifactTask(
     name="distill",
     summary="Stage III: teacher forcing, trajectory regression, distribution matching",
-    version=6,
+    version=7,
     function="worldline_core.distillation.distill:distill",
     config="worldline_core.distillation.distill_config:DistillConfig",
     inputs=("tracks", "episodes", "stage2", "tokenizer"),

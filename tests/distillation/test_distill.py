@@ -27,7 +27,7 @@ from worldline_core.distillation.teacher_trajectories import (
     write_trajectories,
 )
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
-from worldline_core.errors import ArtifactError, CheckpointError
+from worldline_core.errors import ArtifactError, CheckpointError, DataError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
 from worldline_core.model.world_model import WorldModel
@@ -168,14 +168,13 @@ def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_
 
 def test_the_head_alone_is_distilled_and_said(inputs: dict[str, Path], tmp_path: Path) -> None:
     model, info = load_checkpoint(inputs["stage2"])
-    head = TrainedClips(views=("head",), strides=(1,))
+    head = TrainedClips(view_sets=(("head",),), strides=(1,))
     save_checkpoint(tmp_path / "head", model, kind="stage2", action_contract=info.contract, trained=head)
     given = inputs | {"stage2": tmp_path / "head"}
-    with pytest.raises(
-        CheckpointError, match=r"(?s)distilled in views that its Stage II model was trained on.*right_wrist"
-    ):
-        distill(config(), given, tmp_path / "refused")
     alone = config().model_copy(update={"views": ["head"]})
+    for settings, model in ((config(), given), (alone, inputs)):
+        with pytest.raises(DataError, match=r"(?s)not trained on these views together.*distill\.views"):
+            distill(settings, model, tmp_path / "refused")
     distill(alone, given, tmp_path / "out")
     assert read_checkpoint_info(tmp_path / "out").trained == head
     assert read_checkpoint_info(tmp_path / "out").views == ("head",)

@@ -51,7 +51,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable) ->
     )  # fmt: skip
     model.initialise(torch.Generator().manual_seed(0))
     contract = make_contract(grid_size=(4, 6), tokenizer=tokenizer.encoder_digest[:16], sigma_px_ref=40.0)
-    save_checkpoint(root / "stage2", model, kind="stage2", action_contract=contract)
+    trained = TrainedClips(view_sets=(VIEWS, RIGHT, HEAD), strides=(1,))
+    save_checkpoint(root / "stage2", model, kind="stage2", action_contract=contract, trained=trained)
     return {**made, "latents": root / "latents", "stage2": root / "stage2"}
 
 
@@ -100,7 +101,7 @@ def test_every_step_sees_every_set_of_views(
             assert batch.clips[0].episode_id[:3] == {3: "thr", 2: "two", 1: "one"}[number]
     for batch in seen["TrajectoryObjective"]:
         assert batch.nodes.shape[2] == batch.mask.shape[1] == len(batch.views)  # type: ignore[attr-defined]
-    assert read_checkpoint_info(tmp_path).trained is None  # it saw every view
+    assert read_checkpoint_info(tmp_path).view_sets == (VIEWS, RIGHT, HEAD)
     assert "validation/rollout_error" in " ".join(counts)
 
 
@@ -114,4 +115,4 @@ def test_nothing_changes_where_no_view_is_missing(inputs: dict[str, Path], tmp_p
 
 def test_a_model_that_saw_no_left_wrist_says_so(inputs: dict[str, Path], tmp_path: Path) -> None:
     distill(config("latents", ["validation"], ["left_wrist"]), inputs, tmp_path)
-    assert read_checkpoint_info(tmp_path).trained == TrainedClips(views=RIGHT, strides=(1,))
+    assert read_checkpoint_info(tmp_path).trained == TrainedClips(view_sets=(RIGHT,), strides=(1,))

@@ -20,6 +20,7 @@ from worldline_core import WorldLine
 from worldline_core.config import read_yaml, validate
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -114,7 +115,7 @@ def test_lerobot_eval_runs_the_same_policy_in_mujoco(
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     recordings = project_root / "artifacts" / "shipped" / "recordings"
-    starts = RecordedStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
+    starts = RecordedStarts(recordings, embodiment="ur5e_silver", splits=["test"], view_sets=[VIEWS], fps=8)
     for number in range(2):
         written: Any = LeRobotDataset("eval", root=next((tmp_path / "out" / "recordings").rglob(f"env_{number}")))
         assert (written.num_episodes, written.num_frames) == (1, 3)
@@ -166,7 +167,7 @@ def check_recorded(project_root: Path, root: Path, views: tuple[str, ...], *, lo
     shipped, driven = project_root / "artifacts" / "shipped", []
     written: Any = LeRobotDataset("local/any", root=root)
     assert (written.num_episodes, written.fps, written.meta.robot_type) == (2, 8, "worldline")
-    starts = RecordedStarts(shipped / "recordings", embodiment="ur5e_silver", splits=["test"], views=views, fps=8)
+    starts = RecordedStarts(shipped / "recordings", embodiment="ur5e_silver", splits=["test"], view_sets=[views], fps=8)
     names = [f"{name.replace('/', '_')}.pos" for name in load_embodiment("ur5e_silver").state_names]
     assert written.features["action"]["names"] == written.features["observation.state"]["names"] == names
     world, threads = WorldLine.from_pretrained(shipped / "models" / "causal"), torch.get_num_threads()
@@ -205,13 +206,13 @@ def test_lerobot_record_writes_what_recorded_commands_lead_to(
     lerobot: Callable[..., str], project_root: Path, tmp_path: Path
 ) -> None:
     said = lerobot(
-        tmp_path, "lerobot_record", "--robot.type=worldline", "--robot.views=[head]", "--teleop.type=worldline_replay",
-        "--teleop.views=[head]", "--dataset.repo_id=local/simulated", "--dataset.video=false", *RECORDED,
+        tmp_path, "lerobot_record", "--robot.type=worldline", "--teleop.type=worldline_replay",
+        "--dataset.repo_id=local/simulated", "--dataset.video=false", *RECORDED,
     )  # fmt: skip
     assert "Commands come at" not in said
     recordings = project_root / "artifacts" / "shipped" / "recordings"
-    starts = RecordedStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
-    for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", ("head",), lossless=True)):
+    starts = RecordedStarts(recordings, embodiment="ur5e_silver", splits=["test"], view_sets=[VIEWS], fps=8)
+    for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", VIEWS, lossless=True)):
         np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
 
 
@@ -221,15 +222,15 @@ def test_lerobot_record_goes_on_with_a_dataset(lerobot: Callable[..., str], proj
     pytest.importorskip("deepdiff", reason="--resume compares features with deepdiff, of LeRobot's core_scripts")
     one = [option.replace("num_episodes=2", "num_episodes=1") for option in RECORDED]
     asked = (
-        "--robot.type=worldline", "--robot.views=[head]", "--robot.dataset_root=out", "--teleop.type=worldline_replay",
-        "--teleop.views=[head]", "--dataset.repo_id=local/simulated", "--dataset.video=false", *one,
+        "--robot.type=worldline", "--robot.dataset_root=out", "--teleop.type=worldline_replay",
+        "--dataset.repo_id=local/simulated", "--dataset.video=false", *one,
     )  # fmt: skip
     lerobot(tmp_path, "lerobot_record", *asked)
     lerobot(tmp_path, "lerobot_record", *asked, "--resume=true")
     starts = RecordedStarts(
-        project_root / "artifacts" / "shipped" / "recordings", embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8
+        project_root / "artifacts" / "shipped" / "recordings", embodiment="ur5e_silver", splits=["test"], view_sets=[VIEWS], fps=8
     )  # fmt: skip
-    for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", ("head",), lossless=True)):
+    for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", VIEWS, lossless=True)):
         np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
     assert len(list((tmp_path / "out" / "meta" / "cameras").iterdir())) == 2
 

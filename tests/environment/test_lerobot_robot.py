@@ -19,6 +19,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 from worldline_core import WorldLine
 from worldline_core.config import read_yaml
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.sources.calibration_file import read_calibration
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
@@ -44,13 +45,13 @@ def world(project_root: Path) -> WorldLine:
 @pytest.fixture(scope="module")
 def starts(project_root: Path) -> RecordedStarts:
     recordings = project_root / "artifacts" / "shipped" / "recordings"
-    return RecordedStarts(recordings, embodiment=ROBOT, splits=("test",), views=("head",), fps=8.0)
+    return RecordedStarts(recordings, embodiment=ROBOT, splits=("test",), view_sets=[VIEWS], fps=8.0)
 
 
 @pytest.fixture
 def robot(plugin: ModuleType, world: WorldLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     monkeypatch.setattr(plugin.robot.WorldLine, "from_pretrained", lambda *_, **__: world)
-    made = plugin.WorldLineRobot(plugin.WorldLineRobotConfig(views=["head"], calibration_dir=tmp_path))
+    made = plugin.WorldLineRobot(plugin.WorldLineRobotConfig(calibration_dir=tmp_path))
     yield made
     if made.is_connected:
         made.disconnect()
@@ -58,7 +59,7 @@ def robot(plugin: ModuleType, world: WorldLine, tmp_path: Path, monkeypatch: pyt
 
 @pytest.fixture
 def replay(plugin: ModuleType, tmp_path: Path) -> Iterator[Any]:
-    made = plugin.WorldLineReplay(plugin.WorldLineReplayConfig(views=["head"], calibration_dir=tmp_path))
+    made = plugin.WorldLineReplay(plugin.WorldLineReplayConfig(calibration_dir=tmp_path))
     made.connect()
     yield made
     made.disconnect()
@@ -72,7 +73,10 @@ def begun(world: WorldLine, starts: RecordedStarts, seed: int) -> Simulation:
 def test_a_robot_is_driven_as_a_simulation(robot: Any, replay: Any, world: WorldLine, starts: RecordedStarts) -> None:
     assert robot.action_features == replay.action_features
     assert list(robot.action_features)[:2] == ["left_shoulder_pan_joint.pos", "left_shoulder_lift_joint.pos"]
-    assert robot.observation_features == {**dict.fromkeys(robot.action_features, float), "head": (64, 96, 3)}
+    assert robot.observation_features == {
+        **dict.fromkeys(robot.action_features, float),
+        **dict.fromkeys(VIEWS, (64, 96, 3)),
+    }
     robot.connect()
     simulation = begun(world, starts, 0)
     before, block = simulation.pictures[0]["head"], starts.commands(0)[:16]
@@ -206,7 +210,10 @@ def test_cameras_of_an_episode_are_written_into_its_dataset(
     np.testing.assert_array_equal(camera.K, starts[1].cameras["head"].K)
     source = read_yaml(tmp_path / "recorded" / "curate.yaml")["curate"]["sources"][0]
     assert source["grippers"]["left_gripper.pos"] == {"closed": 0.0, "open": 1.0}
-    assert (source["angle_unit"], source["views"]) == ("rad", {"observation.images.head": "head"})
+    assert (source["angle_unit"], source["views"]) == (
+        "rad",
+        {f"observation.images.{view}": view for view in VIEWS},
+    )
 
 
 @pytest.mark.parametrize(("interval", "warned"), [(1 / 30, True), (1 / 8, False)])
@@ -241,11 +248,13 @@ def test_units_and_names_are_those_of_leader_arms(plugin: ModuleType) -> None:
 def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: RecordedStarts, tmp_path: Path) -> None:
     start, folder = starts[1], tmp_path / "observed"
     folder.mkdir()
-    Image.fromarray(start.images["head"]).save(folder / "head.png")
-    camera, (height, width) = start.cameras["head"], start.images["head"].shape[:2]
-    entry = {"width": width, "height": height, "K": camera.K.tolist(), "T": camera.T_base_camera.tolist()}
-    entry |= {"maps": "camera_to_base", "axes": "opencv"}
-    (folder / "calibration.yaml").write_text(yaml.safe_dump({"views": {"head": entry}}))
+    entries: dict[str, Any] = {}
+    for view, camera in start.cameras.items():
+        Image.fromarray(start.images[view]).save(folder / f"{view}.png")
+        height, width = start.images[view].shape[:2]
+        entries[view] = {"width": width, "height": height, "K": camera.K.tolist(), "T": camera.T_base_camera.tolist()}
+        entries[view] |= {"maps": "camera_to_base", "axes": "opencv"}
+    (folder / "calibration.yaml").write_text(yaml.safe_dump({"views": entries}))
     names = load_embodiment(ROBOT).state_names
     state = dict(zip(names, start.state.tolist(), strict=True))
     (folder / "state.yaml").write_text(yaml.safe_dump(state))
@@ -257,14 +266,17 @@ def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: 
         robot.send_action(robot._columns.named(command))
     assert np.array_equal(robot.get_observation()["head"], simulation.step(starts.commands(1)[:16])[0]["head"][-1])
 
-    def read(views: tuple[str, ...] = ("head",)) -> None:
-        read_start(folder, load_embodiment(ROBOT), views)
+    def read() -> None:
+        read_start(folder, load_embodiment(ROBOT), VIEWS)
 
+    (folder / "left_wrist.png").rename(folder / "gone.png")
     with pytest.raises(DataError, match=r"(?s)Not a picture to start from.*left_wrist.png"):
-        read(("head", "left_wrist"))
-    Image.fromarray(start.images["head"]).save(folder / "left_wrist.png")
+        read()
+    (folder / "gone.png").rename(folder / "left_wrist.png")
+    (folder / "calibration.yaml").write_text(yaml.safe_dump({"views": {"head": entries["head"]}}))
     with pytest.raises(DataError, match=r"(?s)pinhole camera of each view.*view left_wrist.*got: nothing"):
-        read(("head", "left_wrist"))
+        read()
+    (folder / "calibration.yaml").write_text(yaml.safe_dump({"views": entries}))
     (folder / "state.yaml").write_text(yaml.safe_dump(state | {names[0]: "zero"}))
     with pytest.raises(DataError, match=r"(?s)Not the robot's state.*left/shoulder_pan_joint"):
         read()

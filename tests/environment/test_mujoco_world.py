@@ -121,7 +121,7 @@ def test_it_is_an_environment_with_the_spaces_of_the_simulator(world: MujocoEnv)
 
 @pytest.mark.slow
 def test_attempts_of_one_bank_are_one_start(compared: Path) -> None:
-    starts = RecordedStarts(compared, embodiment=ROBOT, splits=("test",), views=("head",), fps=8)
+    starts = RecordedStarts(compared, embodiment=ROBOT, splits=("test",), view_sets=[("head",)], fps=8)
     assert len(EpisodeSet.open(compared)) == 6
     assert len({row.bank for row in starts.rows}) == len(starts) == 2
 

@@ -29,9 +29,6 @@ class Start:
     cameras: dict[str, Camera]
     controls: np.ndarray
 
-    def head(self) -> Start:
-        return Start({"head": self.images["head"]}, {"head": self.cameras["head"]}, self.controls)
-
     def begin(self, world: WorldLine, **options: object) -> Simulation:
         return world.start(
             self.images, self.cameras, **{"embodiment": ROBOT, "state": self.controls[0], "limits": False, **options}
@@ -76,11 +73,11 @@ def equal(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
 
 
 def test_steps_give_the_bytes_of_a_prediction(causal: WorldLine, starts: list[Start]) -> None:
-    """With mounts that the file knows and ones solved at the start; with all views and with two of them."""
+    """With mounts that the file knows and ones solved at the start."""
     start = starts[0]
     mounts = {**start.cameras, **{view: Camera(start.cameras[view].K) for view in ("left_wrist", "right_wrist")}}
-    for views, cameras in ((causal.views, mounts), (("head", "right_wrist"), start.cameras)):
-        given = replace(start, images={v: start.images[v] for v in views}, cameras={v: cameras[v] for v in views})
+    for cameras in (mounts, start.cameras):
+        given = replace(start, cameras=cameras)
         predicted = causal.predict(given.images, start.controls, given.cameras, embodiment=ROBOT)
         simulation = given.begin(causal)
         assert equal(videos(simulation, start.controls[None])[0], predicted)
@@ -123,7 +120,7 @@ def test_clips_of_a_batch_are_those_of_single_simulations(causal: WorldLine, sta
 
 @pytest.mark.slow
 def test_branches_share_their_history_and_equal_separate_rollouts(causal: WorldLine, starts: list[Start]) -> None:
-    start = starts[0].head()
+    start = starts[0]
     shared, own = start.controls[None, 1:17], start.controls[17:33]
     ways = np.stack([own, own[:1] + 0 * own, own + 0.1 * np.linspace(0, 1, 16)[:, None]])
     simulation = start.begin(causal)
@@ -150,7 +147,7 @@ def test_branches_share_their_history_and_equal_separate_rollouts(causal: WorldL
 
 
 def test_commands_are_held_within_the_robots_limits(causal: WorldLine, starts: list[Start]) -> None:
-    start = starts[0].head()
+    start = starts[0]
     arms = load_embodiment(ROBOT)
     elbow, gripper = arms.joint_columns(arms.arms[0]).start + 2, arms.gripper_column(arms.arms[0])
     wild = np.repeat(start.controls[:1].astype(np.float64), 16, axis=0)

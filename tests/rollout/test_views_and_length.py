@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +19,12 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import CheckpointError, ConfigError, DataError
+from worldline_core.environment.environment import WorldLineEnv
+from worldline_core.errors import CheckpointError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.model.world_model_config import TrainedClips
+from worldline_core.rollout.observation import Camera
 from worldline_core.rollout.predictions import plan_predictions
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import FullClipConfig, RolloutConfig
@@ -27,6 +32,7 @@ from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.rollout.worldline import WorldLine
 
 HEAD, RIGHT = ("head",), ("head", "right_wrist")
+SETS = (HEAD, VIEWS, RIGHT)
 EPISODES = (
     ("three", "test", 33, VIEWS, VIEWS),
     ("two", "test", 33, RIGHT, RIGHT),
@@ -42,8 +48,17 @@ CONFIG = RolloutConfig(method="causal", batch_size=8, bfloat16=False)
 
 @pytest.fixture(scope="module")
 def mixed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Recordings of several sets of views and lengths, some of which cannot be predicted."""
-    return inputs | write_recordings(tmp_path_factory.mktemp("mixed"), EPISODES)
+    """Recordings of several sets of views and lengths, some of which cannot be predicted, and a model of three sets."""
+    root = tmp_path_factory.mktemp("mixed")
+    return inputs | write_recordings(root, EPISODES) | {"checkpoint": trained_on(inputs, root / "sets", SETS)}
+
+
+def trained_on(inputs: dict[str, Path], folder: Path, view_sets: Sequence[tuple[str, ...]]) -> Path:
+    """The causal model as one that saw these sets of views."""
+    model, info = load_checkpoint(inputs["checkpoint"])
+    trained = TrainedClips(view_sets=tuple(view_sets), strides=(1,))
+    save_checkpoint(folder, model, kind="causal", action_contract=info.contract, causal=info.causal, trained=trained)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +101,10 @@ def test_the_views_that_are_asked_for_are_predicted_alone(mixed: dict[str, Path]
         name: set(RIGHT) for name in ("long", "three", "two")
     }
     assert summary["left_out"] == {"missing_view": 3, "missing_calibration": 1, "too_short": 1}
-    for wrong in (("right_wrist",), ("head", "exterior_2"), ()):
-        with pytest.raises(ConfigError, match="A rollout is of views that the model was trained on"):
+    for wrong in (("right_wrist",), ("head", "left_wrist"), ("head", "exterior_2"), ()):
+        with pytest.raises(
+            DataError, match=r"(?s)trained on these views together.*rollout\.views.*or head \+ right_wrist or"
+        ):
             rollout(CONFIG.model_copy(update={"views": wrong}), mixed, tmp_path / "wrong")
     with pytest.raises(DataError, match=r"(?s)No episode can be predicted.*1 left out.*no video of head"):
         rollout(CONFIG, mixed | write_recordings(tmp_path / "none", EPISODES[5:6]), tmp_path / "none" / "out")
@@ -96,23 +113,40 @@ def test_the_views_that_are_asked_for_are_predicted_alone(mixed: dict[str, Path]
 def test_a_model_trained_on_the_head_alone_predicts_the_head_alone(
     inputs: dict[str, Path], mixed: dict[str, Path], tmp_path: Path
 ) -> None:
-    model, info = load_checkpoint(inputs["checkpoint"])
-    trained = TrainedClips(views=HEAD, strides=(1,))
-    save_checkpoint(
-        tmp_path / "head", model, kind="causal", action_contract=info.contract, causal=info.causal, trained=trained
-    )
-    summary = rollout(CONFIG, mixed | {"checkpoint": tmp_path / "head"}, tmp_path / "out")
+    summary = rollout(CONFIG, mixed | {"checkpoint": trained_on(inputs, tmp_path / "head", [HEAD])}, tmp_path / "out")
     assert {row.view for row in RolloutSet.open(tmp_path / "out").rows} == {"head"}
     assert "without_view" not in summary
     world = WorldLine.from_pretrained(tmp_path / "head", tokenizer=inputs["tokenizer"])
     assert (world.views, world.info.strides) == (HEAD, (1,))
-    with pytest.raises(DataError, match=r"(?s)not those of the model's views.*head alone"):
-        world.chosen_views(VIEWS)
-    with pytest.raises(CheckpointError, match=r"trained.views: \['exterior_2'\] are none of the model's views"):
-        save_checkpoint(
-            tmp_path / "other", model, kind="causal", action_contract=info.contract, causal=info.causal,
-            trained=TrainedClips(views=("exterior_2",), strides=(1,)),
-        )  # fmt: skip
+    with pytest.raises(CheckpointError, match=r"trained.view_sets: \['exterior_2'\] are none of the model's views"):
+        trained_on(inputs, tmp_path / "other", [("exterior_2",)])
+
+
+def test_views_that_were_not_trained_together_are_refused_everywhere(
+    inputs: dict[str, Path], mixed: dict[str, Path], tmp_path: Path
+) -> None:
+    """A model of all views, and one that saw the head alone besides: at every door but the rollout step's."""
+    summary = rollout(CONFIG, mixed | {"checkpoint": inputs["checkpoint"]}, tmp_path / "out")
+    assert {row.episode_id for row in RolloutSet.open(tmp_path / "out").rows} == {"three", "long"}
+    assert summary["left_out"] == {"missing_view": 5, "too_short": 1}
+    images = {view: np.zeros((*SIZE, 3), np.uint8) for view in VIEWS}
+    camera = Camera(np.array([[40.0, 0, SIZE[1] / 2], [0, 40, SIZE[0] / 2], [0, 0, 1]]), np.eye(4))
+    for name, sets, wrong in (
+        ("all", [VIEWS], HEAD), ("all", [VIEWS], RIGHT), ("both", [VIEWS, HEAD], RIGHT), ("one", [HEAD], VIEWS),
+    ):  # fmt: skip
+        folder = trained_on(inputs, tmp_path / name, sets)
+        world = WorldLine.from_pretrained(folder, tokenizer=inputs["tokenizer"], bfloat16=False)
+        shown, cameras = {view: images[view] for view in wrong}, dict.fromkeys(wrong, camera)
+        doors: dict[Callable[..., Any], tuple[Any, ...]] = {
+            partial(world.predict, embodiment="ur5e_silver"): (shown, np.zeros((17, 14)), cameras),
+            partial(world.start, embodiment="ur5e_silver", state=np.zeros(14)): (shown, cameras),
+            world.session: (torch.zeros(1, len(wrong), 3, *SIZE), [0], wrong),
+            world.simulator: ([0], wrong),
+            partial(WorldLineEnv, model=world, views=wrong): (),
+        }
+        for door, arguments in doors.items():
+            with pytest.raises(DataError, match=r"(?s)not trained on these views together.*expected:.*head"):
+                door(*arguments)
 
 
 def test_a_view_keeps_its_slot_whichever_others_are_there(inputs: dict[str, Path]) -> None:
@@ -181,7 +215,7 @@ def test_strides_are_those_of_the_training(inputs: dict[str, Path], mixed: dict[
     with pytest.raises(CheckpointError, match=r"(?s)not trained at this stride.*\(1,\).*got: 2"):
         rollout(strided, mixed, tmp_path / "refused")
     model, info = load_checkpoint(inputs["checkpoint"])
-    trained = TrainedClips(views=VIEWS, strides=(1, 2))
+    trained = TrainedClips(view_sets=(VIEWS,), strides=(1, 2))
     save_checkpoint(
         tmp_path / "model", model, kind="causal", action_contract=info.contract, causal=info.causal, trained=trained
     )
@@ -213,6 +247,7 @@ def test_recordings_of_another_rate_are_left_out(mixed: dict[str, Path]) -> None
 
     class Any3:
         views: tuple[str, ...] = VIEWS
+        view_sets = SETS
         frames_per_unit, needs_cameras = 16, True
 
         def unit(self, frames: int) -> int:

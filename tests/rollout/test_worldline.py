@@ -147,7 +147,7 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
             causal.predict(**(given | changes))  # type: ignore[arg-type]
 
     refused(r"(?s)1 \+ k \* 16 rows.*got: 16", controls=observed.controls[:16])
-    refused("images are not those of the model's views", images={"left_wrist": observed.images["left_wrist"]})
+    refused("not trained on these views together", images={"left_wrist": observed.images["left_wrist"]})
     refused("cameras are not those of the images", cameras={})
     refused("RGB and of one size", images=observed.images | {"head": observed.images["head"][:8]})
     refused(r"(?s)camera without a pose.*head", cameras=observed.cameras | {"head": Camera(observed.cameras["head"].K)})

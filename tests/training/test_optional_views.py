@@ -89,10 +89,15 @@ def test_batches_hold_clips_of_one_set_of_views(inputs: dict[str, Path]) -> None
         drawn.update(clip.episode_id for clip in batch.clips)
     # Grouping changes nothing of how often an episode is drawn.
     assert min(drawn.values()) > 0.7 * 1200 / 6
-    assert sampler.trained(VIEWS) is None
+    assert set(sampler.view_sets(VIEWS)) == {VIEWS, RIGHT, HEAD}
     weighted = config.model_copy(update={"source_weights": {"three": 0.0}})
     sampler = ClipSampler(rows(store), weighted, views=VIEWS, splits=["train"], start_step=4, batch_size=2, seed=3)
-    assert sampler.trained(VIEWS) == TrainedClips(views=RIGHT, strides=(1,))
+    assert sampler.trained(VIEWS) == TrainedClips(view_sets=(HEAD, RIGHT), strides=(1,))
+    whole = ClipSampler(
+        [row for row in rows(store) if row.source == "three"], ClipSampling(lengths=(9,)), views=VIEWS, splits=["train"],
+        start_step=4, batch_size=2, seed=3,
+    )  # fmt: skip
+    assert whole.trained(VIEWS) is None
 
 
 def test_single_views_are_drawn_where_they_are(inputs: dict[str, Path]) -> None:
@@ -151,7 +156,7 @@ def test_stage2_trains_on_every_set_of_views(
         assert batch.latents.shape[1] == len(batch.views)
         assert batch.action_maps is not None
         assert batch.action_maps.shape[1] == len(batch.views)
-    assert read_checkpoint_info(tmp_path / "out").trained is None  # it saw every view
+    assert read_checkpoint_info(tmp_path / "out").view_sets == (VIEWS, RIGHT, HEAD)
     again = train_stage2(stage2(input=source), inputs, tmp_path / "again")
     assert again == counts
 
@@ -163,7 +168,7 @@ def test_a_model_of_the_head_alone_trains_on_any_recording_and_rolls_out_the_hea
     frames = {"kind": "frames", "image_size": SIZE}
     train_stage2(stage2(clips=clips, input=frames), inputs, tmp_path / "model")
     info = read_checkpoint_info(tmp_path / "model")
-    assert info.trained == TrainedClips(views=HEAD, strides=(1,))
+    assert info.trained == TrainedClips(view_sets=(HEAD,), strides=(1,))
     config = RolloutConfig(sampler=FullClipConfig(steps=1), splits=("train",), num_frames=17)
     summary = rollout(config, inputs | {"checkpoint": tmp_path / "model"}, tmp_path / "out")
     assert summary["predictions"] == 6

@@ -44,6 +44,7 @@ from worldline_core.model.checkpoint import (
 from worldline_core.model.lpips import load_lpips
 from worldline_core.model.tokenizers import WanTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import match_views
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
@@ -107,13 +108,6 @@ class DistillationRun:
         join_processes(device)
         self.config, self.output, self.stage2 = config, output, Path(inputs["stage2"])
         self.info = info = read_checkpoint_info(self.stage2)
-        if not set(config.views) <= set(info.views):
-            raise CheckpointError(
-                "A causal model is distilled in views that its Stage II model was trained on",
-                where=f"{self.stage2}: distill.views",
-                expected=info.views,
-                got=config.views,
-            )
         self.start = Path(inputs.get("causal", self.stage2))
         if self.start != self.stage2:
             self._check_continued(read_checkpoint_info(self.start))
@@ -126,6 +120,8 @@ class DistillationRun:
         needed = config.clips.needed_views(config.views)
         self.rows = training_rows(self.source, episodes, stage=2, needed=needed, tracks=tracks)
         info.contract.require_tracks((row.episode_id for row in self.rows), tracks)
+        for views in self._sampler(config.teacher_forcing.trainer, config.clips, ALONE).view_sets(info.config.views):
+            match_views(info.view_sets, views, f"distill.views, of the Stage II model {self.stage2}")
         self.loader = ClipLoader(
             self.source, views=tuple(config.views), tracks=tracks,
             action_frames=info.config.action_frames, frame_rates={row.episode_id: row.fps for row in episodes.rows},

@@ -157,7 +157,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         model: a Stage II or causal checkpoint, or a ``WorldLine``; by default the shipped causal one.
         recordings: an EpisodeSet, whose first frames are the starts; by default the shipped one.
         embodiment, splits: of the recordings that are used; ``embodiment`` may be left out where all are of one robot.
-        views: that are simulated, by default all of the model's.
+        views: that are simulated, one of the sets that the model was trained on; by default the largest.
         episode_frames: steps of an episode.
         observe_every: steps between two observations of pictures, a divisor of the block's length; by default the block.
         success: "measured" (`measured_success`), a function, or None: then nothing is a success.
@@ -199,10 +199,10 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             if isinstance(model, WorldLine)
             else WorldLine.from_pretrained(model or shipped / "models" / "causal", **options)
         )
-        self.views = self.world.chosen_views(self.world.views if views is None else views)
+        self.views = self.world.chosen_views(views)
         self.starts = RecordedStarts(
             Path(recordings or shipped / "recordings"),
-            views=self.views, fps=self.world.contract.fps, embodiment=embodiment, splits=splits,
+            view_sets=[self.views], fps=self.world.contract.fps, embodiment=embodiment, splits=splits,
         )  # fmt: skip
         self.kinematics = ArmKinematics(load_embodiment(self.starts.embodiment))
         self.num_envs, self.episode_frames = num_envs, episode_frames

@@ -80,7 +80,7 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             )  # fmt: skip
         prepare_rendering()
         folder = Path(recordings or shipped_folder() / "recordings")
-        self.starts = RecordedStarts(folder, views=views, fps=FRAME_RATE, embodiment=embodiment, splits=splits)
+        self.starts = RecordedStarts(folder, view_sets=[views], fps=FRAME_RATE, embodiment=embodiment, splits=splits)
         self.views, self.image_size, self.render_mode = tuple(views), image_size, render_mode
         self._max_episode_steps, self._observe_every = episode_frames, observe_every
         self.robot = load_embodiment(self.starts.embodiment)

@@ -170,7 +170,7 @@ class CheckpointInfo(StrictModel):
 
     Attributes:
         action_contract: meaning of the action maps in training; None for models that have seen none.
-        trained: views and strides of the clips that it was trained on; None: all views, at stride 1.
+        trained: views and strides of the clips that it was trained on; None: all views together, at stride 1.
         metadata: where it comes from; nothing is computed from it.
     """
 
@@ -189,15 +189,26 @@ class CheckpointInfo(StrictModel):
             raise ValueError(f"action_contract: a checkpoint of kind {self.kind} needs one")
         if (self.kind == "causal") != (self.causal is not None):
             raise ValueError(f"causal: needed by the kind causal and no other, not by {self.kind}")
-        unknown = [view for view in self.views if view not in self.config.views]
-        if unknown:
-            raise ValueError(f"trained.views: {unknown} are none of the model's views {self.config.views}")
+        shown = {view for views in (self.trained.view_sets if self.trained else ()) for view in views}
+        if unknown := sorted(shown - set(self.config.views)):
+            raise ValueError(f"trained.view_sets: {unknown} are none of the model's views {self.config.views}")
         return self
 
     @property
+    def view_sets(self) -> tuple[tuple[str, ...], ...]:
+        """Sets of views that a prediction may show: those that training clips showed together and that hold the model's first
+        trained view; the largest comes first."""
+        slots = tuple(self.config.views)
+        trained = {slots} if self.trained is None else set(self.trained.view_sets)
+        orders = {views: [slots.index(view) for view in views] for views in trained}
+        first = min(order[0] for order in orders.values())
+        fitting = [views for views, order in orders.items() if order[0] == first]
+        return tuple(sorted(fitting, key=lambda views: (-len(views), orders[views])))
+
+    @property
     def views(self) -> tuple[str, ...]:
-        """Views that the model was trained on: a rollout uses no others."""
-        return tuple(self.config.views) if self.trained is None else self.trained.views
+        """Views of the largest trained set."""
+        return self.view_sets[0]
 
     @property
     def strides(self) -> tuple[int, ...]:

@@ -161,7 +161,7 @@ def _model_card(folder: Path, license_name: str | None) -> str:
     )
     contract = {} if info.action_contract is None else info.action_contract.model_dump(mode="json")
     causal = {} if info.causal is None else {"causal": info.causal.model_dump(mode="json")}
-    trained = {"views": list(info.views), "strides": list(info.strides), "weights": info.dtype}
+    trained = {"views together": list(info.view_sets), "strides": list(info.strides), "weights": info.dtype}
     sections = (
         f"---\n{data.to_yaml()}\n---",
         f"# WorldLine {info.kind}",

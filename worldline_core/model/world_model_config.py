@@ -6,14 +6,14 @@ A contract is saved in ``checkpoint.json`` and read from there alone; none of it
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
 from worldline_core.config import StrictModel
-from worldline_core.errors import CheckpointError
+from worldline_core.errors import CheckpointError, DataError
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import ActionTracks
@@ -220,15 +220,34 @@ class ActionContract(StrictModel):
 
 
 class TrainedClips(StrictModel):
-    """Views and strides of the clips of a training, where these were not all views at every frame.
+    """Views and strides of the clips of a training, where these were not all views together at every frame.
 
     Attributes:
-        views: that were trained, in the order of the model's slots; the first one is in every clip.
+        view_sets: views that clips showed together, each set in the order of the model's slots.
         strides: recorded frames from one frame of a clip to the next.
     """
 
-    views: tuple[str, ...] = Field(min_length=1)
+    view_sets: tuple[Annotated[tuple[str, ...], Field(min_length=1)], ...] = Field(min_length=1)
     strides: tuple[int, ...] = Field(min_length=1)
+
+
+def match_views(view_sets: Sequence[tuple[str, ...]], views: Iterable[str], where: object = None) -> tuple[str, ...]:
+    """Return the one of a model's view sets that holds exactly these views, in the model's order.
+
+    Raises:
+        DataError: the model was not trained on these views together.
+    """
+    names = sorted(views)
+    for trained in view_sets:
+        if sorted(trained) == names:
+            return trained
+    raise DataError(
+        "The model was not trained on these views together",
+        where=where,
+        expected=" or ".join(" + ".join(trained) for trained in view_sets),
+        got=" + ".join(names) or "no view",
+        next_step="give the views of one of these sets, or train on yours (clips.view_weights, clips.optional_views)",
+    )
 
 
 class CausalSpec(StrictModel):

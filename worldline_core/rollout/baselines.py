@@ -43,6 +43,7 @@ class FirstFrameCopy:
 
     steps = None
     views: tuple[str, ...] = VIEWS
+    view_sets = None
     frames_per_unit = TEMPORAL_FACTOR
     needs_cameras = False
 
@@ -71,6 +72,7 @@ class TextToVideo:
     """
 
     needs_cameras = False
+    view_sets = None
 
     def __init__(
         self,

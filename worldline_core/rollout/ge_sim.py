@@ -70,6 +70,7 @@ class GeSim:
 
     steps = None
     views: tuple[str, ...] = VIEWS
+    view_sets: tuple[tuple[str, ...], ...] = (VIEWS,)
     frames_per_unit = 4
     needs_cameras = True
 

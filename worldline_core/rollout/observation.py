@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,23 +30,6 @@ class Camera:
 
     K: np.ndarray
     T_base_camera: np.ndarray | None = None
-
-
-def ordered_views(trained: Sequence[str], given: Iterable[str]) -> tuple[str, ...]:
-    """Given views in the order of the model's.
-
-    Raises:
-        DataError: one is none of the model's, or the model's first one is missing.
-    """
-    names = set(given)
-    if not names <= set(trained) or trained[0] not in names:
-        raise DataError(
-            "The images are not those of the model's views",
-            expected=f"{trained[0]}" + (f", and any of {tuple(trained[1:])}" if len(trained) > 1 else " alone"),
-            got=sorted(names),
-            next_step="leave out the views that the model was not trained on",
-        )
-    return tuple(view for view in trained if view in names)
 
 
 FURTHEST_CAMERA_M = 20.0

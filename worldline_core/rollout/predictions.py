@@ -13,13 +13,18 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.world_model_config import match_views
 from worldline_core.rollout.rollout_config import RolloutConfig
 
 
 class Predictor(Protocol):
-    """A model, server or baseline; the first of its views is in every prediction, which has 1 + k ``frames_per_unit`` frames."""
+    """A model, server or baseline; the first of its views is in every prediction, which has 1 + k ``frames_per_unit`` frames.
+
+    ``view_sets``: views that it predicts together, the largest set first; None: any of ``views``, each by itself.
+    """
 
     views: tuple[str, ...]
+    view_sets: tuple[tuple[str, ...], ...] | None
     frames_per_unit: int
     needs_cameras: bool
 
@@ -77,16 +82,19 @@ def plan_predictions(
         fps: rate that recordings must have.
 
     Raises:
-        ConfigError: views are asked for that the predictor does not know, or without its first one.
-        DataError: no episode can be predicted.
+        ConfigError: the predictor knows no such views, or its first one is not among them.
+        DataError: the model was not trained on these views together, or no episode can be predicted.
     """
-    if config.views != "all_present" and not {predictor.views[0]} <= set(config.views) <= set(predictor.views):
-        raise ConfigError(
-            "A rollout is of views that the model was trained on",
-            where="rollout.views",
-            expected=f"{predictor.views[0]}, and any of {predictor.views[1:]}",
-            got=config.views,
-        )
+    if config.views != "all_present":
+        if predictor.view_sets is not None:
+            match_views(predictor.view_sets, config.views, "rollout.views")
+        elif not {predictor.views[0]} <= set(config.views) <= set(predictor.views):
+            raise ConfigError(
+                "A rollout is of views that the predictor knows",
+                where="rollout.views",
+                expected=f"{predictor.views[0]}, and any of {predictor.views[1:]}",
+                got=config.views,
+            )
     fitting: dict[int, tuple[str, ...]] = {}
     left_out: list[QuarantineRow] = []
     for position in chosen:
@@ -102,7 +110,7 @@ def plan_predictions(
         raise DataError(
             "No episode can be predicted",
             where=episodes.root,
-            expected="the model's first view and its camera, action tracks, the model's rate, and one unit of frames",
+            expected="views that the model was trained on together, their cameras and action tracks, its rate, one unit of frames",
             got=f"{len(left_out)} left out {dict(counts)}; the first, {left_out[0].episode_id}: {left_out[0].detail}",
             next_step="see quarantine.parquet of render_actions and filter, or choose other episodes",
         )
@@ -132,15 +140,17 @@ def _views(
     recorded = tuple(view for view in predictor.views if view in row.views)
     known = tracks.calibrated_views(row.episode_id) if predictor.needs_cameras else recorded
     views = tuple(view for view in recorded if view in known)
-    wanted = (predictor.views[0],) if config.views == "all_present" else config.views
-    for reason, present, what in (
-        ("missing_view", recorded, "no video of"),
-        ("missing_calibration", views, "no camera of"),
-    ):
-        absent = [view for view in wanted if view not in present]
-        if absent:
-            return (), (reason, f"{what} {', '.join(absent)}; there are {', '.join(present) or 'none'}")
-    return (views if config.views == "all_present" else tuple(view for view in views if view in wanted)), None
+    sets = predictor.view_sets or (views, predictor.views[:1])
+    if config.views != "all_present":
+        sets = (tuple(view for view in predictor.views if view in config.views),)
+    fitting = [wanted for wanted in sets if predictor.views[0] in wanted and set(wanted) <= set(views)]
+    if fitting:
+        return fitting[0], None
+    reason, present, what = "missing_view", recorded, "no video of"
+    if set(sets[-1]) <= set(recorded):
+        reason, present, what = "missing_calibration", views, "no camera of"
+    absent = [view for view in sets[-1] if view not in present]
+    return (), (reason, f"{what} {', '.join(absent)}; there are {', '.join(present) or 'none'}")
 
 
 def _misfit(config: RolloutConfig, row: EpisodeRow, unit: int, fps: float) -> tuple[str, str] | None:

@@ -42,7 +42,7 @@ class RecordedStarts:
     state) is one start, that of its first recording.
 
     Args:
-        views: of the model; each must be recorded and calibrated, or the first one where ``partial``.
+        view_sets: of the model; a start shows the first one whose views are all recorded and calibrated.
         fps: of the model's controls.
         embodiment, splits: of the recordings; None: all.
     """
@@ -51,14 +51,12 @@ class RecordedStarts:
         self,
         recordings: Path,
         *,
-        views: Sequence[str],
+        view_sets: Sequence[Sequence[str]],
         fps: float,
         embodiment: str | None = None,
         splits: Sequence[str] | None = None,
-        partial: bool = False,
     ) -> None:
-        self._episodes, self._views = EpisodeSet.open(recordings), tuple(views)
-        required = set(views[:1] if partial else views)
+        self._episodes, self._view_sets = EpisodeSet.open(recordings), view_sets
         positions: list[int] = []
         self._left_out: Counter[str] = Counter()
         banks: set[str] = set()
@@ -66,7 +64,7 @@ class RecordedStarts:
             reasons = {
                 "of another robot": embodiment is not None and row.embodiment != embodiment,
                 "of another split": splits is not None and row.split not in splits,
-                "without all views": not required <= set(row.views),
+                "without all views": not any(set(views) <= set(row.views) for views in view_sets),
                 "of another rate": row.fps != fps,
                 "without calibration or commands": row.stage2_reason not in (None, "missing_view"),
                 "from the same start as another": row.bank in banks,
@@ -123,7 +121,14 @@ class RecordedStarts:
     def _read(self, number: int) -> RecordedStart:
         position = self._positions[number]
         episode = self._episodes.episode(position)
-        views = [view for view in self._views if view in episode.cameras]
+        usable = set(episode.cameras) & set(self._episodes.rows[position].views)
+        views = next((views for views in self._view_sets if set(views) <= usable), None)
+        if views is None:
+            raise DataError(
+                "A recording lacks the camera of a view to start from", where=f"episode {episode.episode_id}",
+                expected=" or ".join(" + ".join(views) for views in self._view_sets), got=" + ".join(sorted(usable)),
+                next_step="add its calibration, or start from another recording",
+            )  # fmt: skip
         cameras = {view: Camera(episode.cameras[view].K, episode.cameras[view].T_base_camera[0]) for view in views}
         images = {view: self._episodes.frames(position, view, [0])[0] for view in views}
         return RecordedStart(

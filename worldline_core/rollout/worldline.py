@@ -22,12 +22,12 @@ from worldline_core.model.pretrained import load_model_tokenizer, pretrained_fol
 from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import match_views
 from worldline_core.rollout.observation import (
     Camera,
     check_controls,
     checked_seeds,
     image_size,
-    ordered_views,
     project_controls,
     real_numbers,
 )
@@ -41,7 +41,8 @@ class WorldLine:
     ``WorldLine.from_pretrained(folder).predict(images, controls, cameras, embodiment="ur5e_pair")``
 
     Attributes:
-        views: that it was trained on; a prediction shows these, or some of them with the first one.
+        views: of the largest set that it was trained on together.
+        view_sets: all such sets; a prediction shows the views of one of them.
         contract: what the controls mean: their rate (``fps``), how they are drawn, the grid of the latents.
         causal: blocks, window and nodes of a causal model; None for Stage II, which predicts a clip at once.
         steps: Euler steps per block, or of the whole clip.
@@ -71,7 +72,7 @@ class WorldLine:
         self.tokenizer = tokenizer
         self.device = device
         self.bfloat16 = bfloat16
-        self.views = info.views
+        self.views, self.view_sets = info.views, info.view_sets
         self.contract = info.contract
         self.causal = info.causal
         if self.causal is not None:
@@ -147,8 +148,7 @@ class WorldLine:
         """Videos of every given view under these controls; the same arguments give the same bytes on a CPU.
 
         Args:
-            images: what each view sees now, ``uint8 (H, W, 3)`` RGB, all of one size: of all of ``views``, or of some with
-                the first one among them.
+            images: what each view sees now, ``uint8 (H, W, 3)`` RGB, all of one size: of the views of one of ``view_sets``.
             controls: ``(frames, state size)`` in the embodiment's layout (for each arm joints [rad], then the gripper's
                 opening, 0 closed .. 1 open), at ``contract.fps`` frames per second. Row 0 belongs to the images.
             cameras: of the same views.
@@ -158,8 +158,8 @@ class WorldLine:
             ``uint8 (frames, H, W, 3)`` per view, the observed frame first, at ``image_size``.
 
         Raises:
-            DataError: the views are not the model's, a shape does not fit, the number of frames is not 1 + k whole units,
-                or controls are in another unit.
+            DataError: the model was not trained on these views together, a shape does not fit, the number of frames is not
+                1 + k whole units, or controls are in another unit.
             CalibrationError: a camera cannot be used.
             ConfigError: there is no such embodiment.
         """
@@ -214,9 +214,9 @@ class WorldLine:
             session, starts, self.contract, maps, views=views, image_size=self.image_size, frames=frames, limits=limits
         )
 
-    def chosen_views(self, given: Iterable[str]) -> tuple[str, ...]:
-        """Given views in the model's order; raises as `ordered_views`."""
-        return ordered_views(self.views, given)
+    def chosen_views(self, given: Iterable[str] | None) -> tuple[str, ...]:
+        """One of ``view_sets`` with exactly the given views, by default the largest; raises as `match_views`."""
+        return self.views if given is None else match_views(self.view_sets, given)
 
     def stream(
         self,
@@ -236,7 +236,7 @@ class WorldLine:
             tracks: controls from the observed frame on; where they end early, the last ones stay.
             frames: length of the predictions. The last step predicts a whole unit, which is cut there.
             seeds: of each clip's noise, which does not depend on who shares the batch.
-            views: names of the views in ``images``; by default all of the model's.
+            views: names of the views in ``images``, one of ``view_sets`` in any order; by default the largest.
             stride: predicted frames are those of every ``stride``-th control.
             without_actions: with maps of zeros.
 
@@ -276,6 +276,7 @@ class WorldLine:
     ) -> Session:
         """A running prediction that begins at these images, to be driven unit by unit; arguments as of :meth:`stream`."""
         chosen = self.views if views is None else tuple(views)
+        match_views(self.view_sets, chosen)
         if self.causal is not None:
             sampler = self.simulator(seeds, chosen, stride)
         else:
@@ -324,6 +325,7 @@ class WorldLine:
         if self.causal is None:
             raise CheckpointError("Only a causal model goes block by block", expected="causal", got=self.info.kind)
         chosen = self.views if views is None else tuple(views)
+        match_views(self.view_sets, chosen)
         return BlockCausalSimulator(
             self.model, self.causal, noise=Noise(seeds), views=chosen, fps=self.contract.fps / stride,
             bfloat16=self.bfloat16,

@@ -114,7 +114,7 @@ class SessionHost:
     def __init__(self, world: WorldLine, config: ServeConfig) -> None:
         self.world = world
         self.config = config
-        self.starts = RecordedStarts(config.episodes, views=world.views, fps=world.contract.fps, partial=True)
+        self.starts = RecordedStarts(config.episodes, view_sets=world.view_sets, fps=world.contract.fps)
         self.kinematics = KinematicsByName({})
         self._running: dict[str, _Running] = {}
         self._players: set[object] = set()
@@ -143,6 +143,7 @@ class SessionHost:
         return {
             "protocol": PROTOCOL,
             "views": list(world.views),
+            "view_sets": [list(views) for views in world.view_sets],
             "fps": world.contract.fps,
             "frames_per_step": world.frames_per_unit if world.causal is not None else None,
             "image_size": list(world.image_size),

@@ -184,15 +184,22 @@ class ClipSampler:
         random = np.random.Generator(np.random.Philox(key=[self.seed, index], counter=counter))
         return self._draw(random, kind, 1, part)[0]
 
-    def trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
-        """Strides of the clips and those of the model's ``slots`` that they fill; None: all slots, at stride 1."""
+    def view_sets(self, slots: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
+        """Sets of the model's ``slots`` that clips fill together."""
         drawn = [name for name, weight in self._view_weights.items() if weight > 0]
-        shown = {slot for kind in self._kinds for name in drawn for slot in self._slots(name, kind)}
-        found = TrainedClips(
-            views=tuple(view for view in slots if view in shown),
-            strides=tuple(sorted({kind.stride for kind in self._kinds})),
-        )
-        return None if found == TrainedClips(views=slots, strides=(1,)) else found
+        shown = {
+            tuple(view for view in slots if view in self._slots(name, kind))
+            for kind in self._kinds
+            for name in drawn
+            if name in (JOINT, PRIMARY, *kind.views)
+        }
+        return tuple(sorted(shown))
+
+    def trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
+        """View sets and strides of the clips; None: all ``slots`` together, at stride 1."""
+        strides = tuple(sorted({kind.stride for kind in self._kinds}))
+        found = TrainedClips(view_sets=self.view_sets(slots), strides=strides)
+        return None if found == TrainedClips(view_sets=(slots,), strides=(1,)) else found
 
     def _draw(self, random: np.random.Generator, kind: _Kind, size: int, part: int) -> tuple[Clip, ...]:
         draws = random.random((size * self.plan.together, 2))[part * size : (part + 1) * size]

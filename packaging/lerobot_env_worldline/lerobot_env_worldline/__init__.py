@@ -19,6 +19,7 @@ from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.model.checkpoint import read_checkpoint_info
+from worldline_core.model.world_model_config import match_views
 from worldline_core.shipped import shipped_folder
 
 
@@ -77,7 +78,10 @@ class WorldLineEnvConfig(EnvConfig):
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(count,)),
             OBS_STATE: PolicyFeature(type=FeatureType.STATE, shape=(count,)),
         }
-        for view in self.views or info.views:
+        views = self.views or list(info.views)
+        if self.world == "simulator":
+            match_views(info.view_sets, views, "--env.views")
+        for view in views:
             self.features[f"{OBS_IMAGES}.{view}"] = PolicyFeature(type=FeatureType.VISUAL, shape=(*size, 3))
         self.features_map = {key: key for key in self.features}
 

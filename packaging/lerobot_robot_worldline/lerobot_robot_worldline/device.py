@@ -14,6 +14,7 @@ import numpy as np
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import CheckpointInfo
+from worldline_core.model.world_model_config import match_views
 from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.shipped import shipped_folder
 
@@ -26,7 +27,7 @@ class Recordings:
         model: a Stage II or causal checkpoint; by default the shipped causal one.
         recordings: an EpisodeSet, whose first frames are the starts; by default the shipped one.
         embodiment, splits: of the recordings that are used.
-        views: that are simulated, by default all of the model's.
+        views: that are simulated, a set that the model was trained on; by default the largest.
         seed: of the first episode.
         use_degrees: joints in degrees and grippers from 0 (closed) to 100 (open), as LeRobot's leader arms send them; by default
             radians and the embodiment's gripper (0 closed, 1 open).
@@ -45,11 +46,15 @@ class Recordings:
         """Folder of the model."""
         return Path(self.model or shipped_folder() / "models" / "causal")
 
+    def shown_views(self, info: CheckpointInfo) -> tuple[str, ...]:
+        """Views that are simulated. Raises: DataError: the model was not trained on these together."""
+        return match_views(info.view_sets, self.views or info.views, "views")
+
     def starts(self, info: CheckpointInfo) -> RecordedStarts:
         """First frames of the recordings that the model can go on from."""
         return RecordedStarts(
             Path(self.recordings or shipped_folder() / "recordings"),
-            embodiment=self.embodiment, splits=self.splits, views=self.views or info.views, fps=info.contract.fps,
+            embodiment=self.embodiment, splits=self.splits, view_sets=[self.shown_views(info)], fps=info.contract.fps,
         )  # fmt: skip
 
 

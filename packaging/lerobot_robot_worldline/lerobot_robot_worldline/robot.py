@@ -21,7 +21,6 @@ from worldline_core.errors import ConfigError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import read_checkpoint_info
-from worldline_core.rollout.observation import ordered_views
 from worldline_core.rollout.recorded_starts import RecordedStart, RecordedStarts, read_start
 from worldline_core.rollout.worldline import WorldLine
 
@@ -68,7 +67,7 @@ class WorldLineRobot(Robot):
         self._columns = Columns(self._kinematics, use_degrees=config.use_degrees)
         cells, compression = self._info.contract.grid_size, self._info.config.spatial_compression
         size = (cells[0] * compression, cells[1] * compression, 3)
-        self.cameras = dict.fromkeys(ordered_views(self._info.views, config.views or self._info.views), size)
+        self.cameras = dict.fromkeys(config.shown_views(self._info), size)
         self._announced = Announcements()
         self._running: CommandedSimulation | None = None
         self._executed: list[np.ndarray] = []
