@@ -6,11 +6,12 @@ one commit; elsewhere the list is written last. Credentials come from the enviro
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import batched
 from pathlib import Path, PurePosixPath
@@ -37,8 +38,10 @@ from worldline_core.store.remote import AnyPath, file_system, first_line, list_f
 from worldline_core.store.store import folder_lock
 
 FILE_LIST = "worldline_files.json"
-MAX_LIST_BYTES = 256 << 20
+MAX_LIST_BYTES = 64 << 20
+_FILES_AT_ONCE = 8
 _BATCH_FILES = 32
+_PIECE_BYTES = 1 << 20
 _HUB_LOCATION = re.compile(r"hf://datasets/(?P<id>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?/?")
 
 
@@ -81,10 +84,10 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
     _check_names(files, folder)
     contents = FileList(files=files)
     sending = sources | _card_files(folder, files)
-    place = _place(where, writing=True)
+    hub = _repository(where, writing=True)
     with _client_errors(where, "push"):
-        place.prepare(public=public)
-        present = place.sizes()
+        location = _location(where) if hub is None else hub.prepare(public=public)
+        present = _sizes(location)
         foreign = sorted(present.keys() - sending.keys() - {".gitattributes"})
         if FILE_LIST not in present and foreign:
             raise ArtifactError(
@@ -94,8 +97,13 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
                 got=_shortened(foreign),
                 next_step="push to a location of its own",
             )
-        earlier = place.file_list().files if FILE_LIST in present else {}
-        place.change(sending, sorted((earlier.keys() - files.keys()) & present.keys()), contents)
+        earlier = _read_list(location, present).files if FILE_LIST in present else {}
+        gone = sorted((earlier.keys() - files.keys()) & present.keys())
+        listed = contents.model_dump_json(indent=1).encode()
+        if hub is None:
+            _send(location, sending, gone, listed)
+        else:
+            hub.commit(sending, gone, listed)
     return contents
 
 
@@ -107,25 +115,26 @@ def pull(where: str, folder: Path) -> FileList:
     """
     if folder.exists():
         raise ArtifactError("Folder exists already", where=folder, next_step="pull into a new folder")
-    unfinished, place = folder.with_name(f"{folder.name}.partial"), _place(where, writing=False)
-    with folder_lock(unfinished), _client_errors(where, "pull"):
+    unfinished, hub = folder.with_name(f"{folder.name}.partial"), _repository(where, writing=False)
+    with folder_lock(unfinished):
         if folder.exists():
             raise ArtifactError("Another command has pulled into this folder", where=folder)
-        place.pin()
-        present = place.sizes()
-        if FILE_LIST not in present:
-            raise ArtifactError("No finished EpisodeSet is published here", where=where, expected=FILE_LIST)
-        contents = place.file_list()
-        _check_names({*contents.files, *(present.keys() - {FILE_LIST})}, where)
-        _raise_mismatch([name for name, file in contents.files.items() if present.get(name) != file.size], where)
-        targets = {name: unfinished / name for name in contents.files}
-        missing = {name: targets[name] for name, file in contents.files.items() if not _is_at(file, targets[name])}
-        place.fetch(missing, unfinished)
-        for path in folder_files(unfinished, everything=True):  # the card, or files of an earlier, interrupted pull
-            name = path.relative_to(unfinished)
-            if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
-                path.unlink()
-        _raise_mismatch([name for name in missing if not _is_at(contents.files[name], targets[name])], where)
+        with _client_errors(where, "pull"):
+            location = _location(where) if hub is None else hub.pinned()
+            present = _sizes(location)
+            if FILE_LIST not in present:
+                raise ArtifactError("No finished EpisodeSet is published here", where=where, expected=FILE_LIST)
+            contents = _read_list(location, present)
+            _check_names(contents.files, where)
+            _raise_mismatch([name for name, file in contents.files.items() if present.get(name) != file.size], where)
+            for path in folder_files(unfinished, everything=True):  # of an earlier, interrupted pull
+                name = path.relative_to(unfinished)
+                if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
+                    path.unlink()
+            missing = [name for name, file in contents.files.items() if not _is_at(file, unfinished / name)]
+            with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
+                fetched = pool.map(lambda name: _fetch(location, name, contents.files[name], unfinished), missing)
+                _raise_mismatch([name for name, whole in zip(missing, fetched, strict=True) if not whole], where)
         set_files(unfinished)  # a set that refers to folders beside it would read what others put there
         verify_artifact(unfinished)
         unfinished.rename(folder)
@@ -195,12 +204,18 @@ def _evaluation_only(row: EpisodeRow) -> bool:
     return marked or says_droid(row.source, row.embodiment)
 
 
-def _check_names(names: Iterable[str], where: object) -> None:
-    """Raises: ArtifactError for a name that leads out of the folder, or to a file of this module's."""
+def _check_names(names: Mapping[str, object], where: object) -> None:
+    """Raises: ArtifactError for a name that leads out of the folder, to a file of this module's, or below another file."""
     for name in names:
         pure = PurePosixPath(name)
         plain = name.isprintable() and "\\" not in name and pure.as_posix() == name and not pure.is_absolute()
-        if not plain or ".." in pure.parts or pure.parts[:1] in ((), (VOLATILE_FOLDER,), (".cache",), (FILE_LIST,)):
+        above = any(str(parent) in names for parent in pure.parents)
+        if (
+            not plain
+            or above
+            or ".." in pure.parts
+            or pure.parts[:1] in ((), (VOLATILE_FOLDER,), (".cache",), (FILE_LIST,))
+        ):
             raise ArtifactError(
                 "A file name of the set is unsafe or taken",
                 where=where,
@@ -230,10 +245,13 @@ def _is_at(file: PublishedFile, path: Path) -> bool:
 
 @contextmanager
 def _client_errors(where: str, verb: str) -> Iterator[None]:
-    """Turn errors of a store's client into one that names the next step."""
+    """Turn errors of a store's client into one that names the next step.
+
+    Clients take the types in a server's answers as given: other ones end in errors of values, types and keys.
+    """
     try:
         yield
-    except (OSError, RuntimeError, httpx.HTTPError) as error:
+    except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, httpx.HTTPError) as error:
         raise ArtifactError(
             f"The store did not finish the {verb}",
             where=where,
@@ -242,57 +260,73 @@ def _client_errors(where: str, verb: str) -> Iterator[None]:
         ) from error
 
 
-class _Place:
-    """A folder or an object store that sets are published to."""
-
-    def __init__(self, location: AnyPath) -> None:
-        self.location = location
-
-    def prepare(self, *, public: bool) -> None:
-        """Make the place where it has to be made before files are sent."""
-
-    def pin(self) -> None:
-        """Read one version of the place, where it has several."""
-
-    def sizes(self) -> dict[str, int]:
-        """Size of every file by its relative name."""
-        file_system(self.location).invalidate_cache()
-        return {name: about["size"] for name, about in list_files(self.location).items()}
-
-    def file_list(self) -> FileList:
-        """The list of files at the place."""
-        source = str(self.location / FILE_LIST)
-        content = with_retries(lambda: file_system(self.location).cat_file(source, end=MAX_LIST_BYTES + 1), source)
-        if len(content) > MAX_LIST_BYTES:
-            raise ArtifactError("List of files is too large", where=source, expected=f"at most {MAX_LIST_BYTES} bytes")
-        try:
-            return FileList.model_validate_json(content)
-        except ValidationError as error:
-            got = error.errors(include_url=False)[0]["msg"]
-            raise ArtifactError("List of files is damaged or of another version", where=source, got=got) from error
-
-    def fetch(self, targets: Mapping[str, Path], folder: Path) -> None:
-        """Copy files to this machine, to their targets below the folder."""
-        del folder
-        for target in targets.values():
-            target.parent.mkdir(parents=True, exist_ok=True)
-        self._copy(file_system(self.location).get, {str(self.location / n): str(path) for n, path in targets.items()})
-
-    def change(self, sources: Mapping[str, Path], gone: Iterable[str], contents: FileList) -> None:
-        """Send files, remove those that are gone, and write the list of what is there."""
-        fs = file_system(self.location)
-        self._copy(fs.put, {str(path): str(self.location / name) for name, path in sources.items()})
-        for name in gone:
-            with_retries(lambda name=name: fs.rm_file(str(self.location / name)), str(self.location))
-        content = contents.model_dump_json(indent=1).encode()
-        with_retries(lambda: fs.pipe_file(str(self.location / FILE_LIST), content), str(self.location))
-
-    def _copy(self, copy: Any, pairs: Mapping[str, str]) -> None:
-        for batch in batched(pairs.items(), _BATCH_FILES):
-            with_retries(lambda batch=batch: copy([a for a, _ in batch], [b for _, b in batch]), str(self.location))
+def _location(where: str) -> AnyPath:
+    """A folder or an object store, as fsspec addresses it."""
+    location = parse_location(where)
+    if isinstance(location, Path):
+        return cast("AnyPath", UPath(location.absolute(), protocol="file", auto_mkdir=True))
+    return location
 
 
-class _Hub(_Place):
+def _sizes(location: AnyPath) -> dict[str, int]:
+    """Size of every regular file at a location by its relative name."""
+    file_system(location).invalidate_cache()
+    listed = list_files(location).items()
+    return {name: about["size"] for name, about in listed if about["type"] == "file" and not about.get("islink")}
+
+
+def _read_list(location: AnyPath, present: Mapping[str, int]) -> FileList:
+    """The list of files at a location."""
+    source = location / FILE_LIST
+    if present[FILE_LIST] > MAX_LIST_BYTES:
+        raise ArtifactError("List of files is too large", where=source, expected=f"at most {MAX_LIST_BYTES} bytes")
+    content = with_retries(lambda: b"".join(_pieces(source, present[FILE_LIST])), str(source))
+    try:
+        return FileList.model_validate_json(content)
+    except ValidationError as error:
+        got = error.errors(include_url=False)[0]["msg"]
+        raise ArtifactError("List of files is damaged or of another version", where=source, got=got) from error
+
+
+def _pieces(source: AnyPath, size: int) -> Iterator[bytes]:
+    """The content of a file, until one byte more than it should have: a server may send without end."""
+    # Of the hub's files only block size 0 is read as a stream; others are requested by range, which a server may ignore.
+    options = {"block_size": 0} if str(source).startswith("hf://") else {}
+    left = size + 1
+    with file_system(source).open(str(source), "rb", **options) as stream:
+        while left and (piece := stream.read(min(_PIECE_BYTES, left))):
+            left -= len(piece)
+            yield piece
+
+
+def _fetch(location: AnyPath, name: str, file: PublishedFile, folder: Path) -> bool:
+    """Copy a file below a folder of this machine; returns whether it has its size and digest."""
+    target = folder / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+
+    def copy() -> str:
+        digest = hashlib.sha256()
+        with target.open("wb") as stream:
+            for piece in _pieces(location / name, file.size):
+                digest.update(piece)
+                stream.write(piece)
+        return digest.hexdigest()
+
+    return with_retries(copy, str(location / name)) == file.sha256
+
+
+def _send(location: AnyPath, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
+    """Send files, remove those that are gone, and write the list of what is there."""
+    fs, where = file_system(location), str(location)
+    for batch in batched(sources.items(), _BATCH_FILES):
+        paths, places = [str(path) for _, path in batch], [str(location / name) for name, _ in batch]
+        with_retries(lambda paths=paths, places=places: fs.put(paths, places), where)
+    for name in gone:
+        with_retries(lambda name=name: fs.rm_file(str(location / name)), where)
+    with_retries(lambda: fs.pipe_file(str(location / FILE_LIST), listed), where)
+
+
+class _Repository:
     """A dataset repository of the hub, made when it does not exist, changed by one commit."""
 
     def __init__(self, where: str, repo_id: str, revision: str | None, *, writing: bool) -> None:
@@ -312,8 +346,11 @@ class _Hub(_Place):
         self._revision = revision
         self._where = where
 
-    def prepare(self, *, public: bool) -> None:
-        """Raises: ArtifactError when the repository exists with another visibility: private data must not become public."""
+    def prepare(self, *, public: bool) -> AnyPath:
+        """Make the repository where it does not exist, and return its newest commit.
+
+        Raises: ArtifactError when it exists with another visibility: private data must not become public.
+        """
         self._api.create_repo(**self._repo, private=not public, exist_ok=True)
         private = bool(self._api.repo_info(**self._repo).private)
         if private == public:
@@ -326,22 +363,20 @@ class _Hub(_Place):
             )
         if self._revision is not None:
             self._api.create_branch(self._repo["repo_id"], branch=self._revision, repo_type="dataset", exist_ok=True)
-        self.pin()
+        return self.pinned()
 
-    def pin(self) -> None:
-        self._commit = self._api.repo_info(**self._repo, revision=self._revision).sha
-        name = f"hf://datasets/{self._repo['repo_id']}@{self._commit}"
-        self.location = cast("AnyPath", UPath(name, **self._client, skip_instance_cache=True))
+    def pinned(self) -> AnyPath:
+        """The newest commit of the revision."""
+        commit = self._api.repo_info(**self._repo, revision=self._revision).sha
+        if not re.fullmatch("[0-9a-f]{40}", str(commit)):
+            raise ValueError(f"the repository's commit is {commit!r}")
+        name = f"hf://datasets/{self._repo['repo_id']}@{commit}"
+        return cast("AnyPath", UPath(name, **self._client, skip_instance_cache=True))
 
-    def fetch(self, targets: Mapping[str, Path], folder: Path) -> None:
-        ignored = [".gitattributes", FILE_LIST]
-        self._api.snapshot_download(**self._repo, revision=self._commit, local_dir=folder, ignore_patterns=ignored)
-        shutil.rmtree(folder / ".cache", ignore_errors=True)
-
-    def change(self, sources: Mapping[str, Path], gone: Iterable[str], contents: FileList) -> None:
+    def commit(self, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
+        """Send files, remove those that are gone, and write the list of what is there."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
-        listed = contents.model_dump_json(indent=1).encode()
         self._api.create_commit(
             **self._repo,
             revision=self._revision,
@@ -354,13 +389,11 @@ class _Hub(_Place):
         )
 
 
-def _place(where: str, *, writing: bool) -> _Place:
-    if where.startswith("hf://"):
-        match = _HUB_LOCATION.fullmatch(where)
-        if match is None:
-            raise ConfigError("Not a place on the hub", expected="hf://datasets/ORG/NAME[@REVISION]", got=where)
-        return _Hub(where, match["id"], match["revision"], writing=writing)
-    location = parse_location(where)
-    if isinstance(location, Path):
-        location = cast("AnyPath", UPath(location.absolute(), protocol="file", auto_mkdir=True))
-    return _Place(location)
+def _repository(where: str, *, writing: bool) -> _Repository | None:
+    """The hub's repository that a location names, or None for a location elsewhere."""
+    if not where.startswith("hf://"):
+        return None
+    match = _HUB_LOCATION.fullmatch(where)
+    if match is None:
+        raise ConfigError("Not a place on the hub", expected="hf://datasets/ORG/NAME[@REVISION]", got=where)
+    return _Repository(where, match["id"], match["revision"], writing=writing)

@@ -1,7 +1,7 @@
 """A small hub on the loopback: the HTTP endpoints that huggingface_hub's client uses for dataset repositories, and those it fetches models by.
 
 Repositories live in memory. Large files go through the LFS batch protocol, small ones inside of the commit, as on the real
-hub; the newer chunk storage (xet) is switched off in the client. Faults are put in by `refuse`.
+hub; the newer chunk storage (xet) is switched off in the client. Faults are put in by `refuse` and `instead`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -33,13 +34,19 @@ class Repository:
 
 @dataclass
 class Hub:
-    """State of the server; `refuse(method, path)` returns a status to answer instead, or None."""
+    """State of the server.
+
+    Attributes:
+        refuse: the status to answer instead, or None, by method and path.
+        instead: a body to answer instead, pieces to send as long as they are taken, an address to redirect to, or None.
+    """
 
     repositories: dict[str, Repository] = field(default_factory=dict)
     objects: dict[str, bytes] = field(default_factory=dict)
     requests: list[tuple[str, str]] = field(default_factory=list)
     tokens: set[str] = field(default_factory=set)
     refuse: Callable[[str, str], int | None] = lambda method, path: None
+    instead: Callable[[str, str], bytes | Iterator[bytes] | str | None] = lambda method, path: None
     url: str = ""
 
     def count(self, method: str, part: str) -> int:
@@ -71,6 +78,15 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
             if self.command != "HEAD":
                 self.wfile.write(data)
 
+        def endless(self, pieces: Iterator[bytes]) -> None:
+            self.send_response(200)
+            self.send_header("Transfer-Encoding", "chunked")
+            self.end_headers()
+            self.close_connection = True
+            with suppress(ConnectionError):
+                for piece in pieces:
+                    self.wfile.write(b"%x\r\n%s\r\n" % (len(piece), piece))
+
         def missing(self, code: str) -> None:
             self.answer({"error": code}, 404, {"X-Error-Code": code})
 
@@ -84,6 +100,13 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
             status = hub.refuse(self.command, path)
             if status is not None:
                 return self.answer({"error": "refused by the test"}, status)
+            body_instead = hub.instead(self.command, path)
+            if isinstance(body_instead, str):
+                return self.answer(b"", 302, {"Location": body_instead})
+            if isinstance(body_instead, bytes):
+                return self.answer(body_instead)
+            if body_instead is not None:
+                return self.endless(body_instead)
             if self.command == "PUT" and path.startswith("/lfs/"):
                 return self.put_object(path.removeprefix("/lfs/"), body)
             if path == "/api/repos/create":

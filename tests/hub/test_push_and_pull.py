@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +141,75 @@ def test_a_pull_continues_and_a_changed_file_is_found(hub: Any, folder: Path, tm
     repository.files["stray.txt"] = b"?", False
     pull(PLACE, tmp_path / "changed")
     assert digest_folder(tmp_path / "changed") == digest_folder(folder)
+
+
+ODD = [
+    b"",
+    b"[]",
+    b"null",
+    b"3",
+    b"\xff",
+    b"[" * 100_000,
+    b'{"sha": 3}',
+    b'{"id": "a/b", "sha": "../../x", "siblings": []}',
+]
+LISTED = b'{"type": "file", "path": "worldline_files.json", "oid": "a", "size": '
+
+
+@pytest.mark.parametrize(
+    ("part", "answer"),
+    [
+        *((r"/toy$", body) for body in ODD), *(("/tree/", body) for body in ODD),
+        ("/tree/", b"[1]"), ("/tree/", b'[{"type": "file"}]'), ("/tree/", b'[{"type": "x", "path": "a"}]'),
+        ("/tree/", b'[{"type": "file", "path": 3, "size": 1, "oid": "a"}]'),
+        *(("/tree/", b"[" + LISTED + size + b"}]") for size in (b'"3"', b"null", b"[]", b"1e400", b"-1", b"3000000000")),
+    ],
+)  # fmt: skip
+def test_odd_answers_of_a_hub_end_in_one_message(
+    hub: Any, folder: Path, tmp_path: Path, part: str, answer: bytes
+) -> None:
+    push(folder, PLACE)
+    hub.instead = lambda method, path: answer if re.search(part, path) else None
+    with pytest.raises(ArtifactError, match=r"did not finish the pull|No finished EpisodeSet|List of files is"):
+        pull(PLACE, tmp_path / "back")
+
+
+@pytest.mark.parametrize("end", ["worldline_files.json", ".mp4"])
+def test_no_more_is_read_than_is_listed(hub: Any, folder: Path, tmp_path: Path, end: str) -> None:
+    push(folder, PLACE)
+    sent = 0
+
+    def pieces() -> Iterator[bytes]:
+        nonlocal sent
+        while sent < 1 << 30:
+            sent += 1 << 20
+            yield b"x" * (1 << 20)
+
+    hub.instead = lambda method, path: pieces() if method == "GET" and path.endswith(end) else None
+    with pytest.raises(ArtifactError, match=r"List of files is damaged|not those of the set"):
+        pull(PLACE, tmp_path / "back")
+    assert sent < 64 << 20  # what the connection's buffers hold
+    assert max(path.stat().st_size for path in (tmp_path / "back.partial").rglob("*")) < 1 << 20
+
+
+def test_the_token_is_sent_to_the_hub_alone(hub: Any, folder: Path, tmp_path: Path) -> None:
+    push(folder, PLACE)
+    elsewhere: list[str | None] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            elsewhere.append(self.headers.get("authorization"))
+            self.send_error(404)
+
+    with ThreadingHTTPServer(("localhost", 0), Handler) as other:
+        threading.Thread(target=other.serve_forever, args=(0.01,), daemon=True).start()
+        address = f"http://localhost:{other.server_port}/x"
+        hub.instead = lambda method, path: address if path.endswith(".mp4") else None
+        with pytest.raises(ArtifactError, match="did not finish the pull"):
+            pull(PLACE, tmp_path / "back")
+        other.shutdown()
+    assert elsewhere
+    assert set(elsewhere) == {None}
 
 
 def test_a_damaged_set_is_not_pushed(hub: Any, folder: Path) -> None:
