@@ -101,6 +101,77 @@ def test_files_without_chunks_or_summary_are_read(tmp_path: Path, toy: Any) -> N
         assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(90))
 
 
+def write_split(
+    toy: Any, folder: Path, listed: str = "relative_file_paths: [run_0.mcap, run_1.mcap, run_2.mcap]"
+) -> Path:
+    """The robot's recording as rosbag2 splits it: what is sent once, such as /tf_static, is in the first part only."""
+    sent = toy.robot().sent
+    for number, part in enumerate((sent[:200], sent[200:500], sent[500:])):
+        # Channels and schemas are numbered as they first appear, so differently in each part.
+        toy.Recording(part if number else [*part[::-1]]).write(folder / f"run_{number}.mcap")
+    (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  version: 5\n  {listed}\n")
+    return folder
+
+
+@pytest.mark.parametrize("place", ["bags/run", "."])
+@pytest.mark.parametrize("prefix", ["", "run/"])
+def test_a_split_bag_is_one_recording(tmp_path: Path, toy: Any, place: str, prefix: str) -> None:
+    toy.robot().write(tmp_path / "whole" / "a.mcap")
+    root = tmp_path / "split"
+    write_split(toy, root / place, f"relative_file_paths: [{', '.join(f'{prefix}run_{n}.mcap' for n in range(3))}]")
+    toy.robot(1.0).write(root / place / "other.mcap")  # the list does not name it
+    opened, whole = source(toy.declared(root)), load(toy.declared(tmp_path / "whole"))
+    name = "toy-bags/run" if place != "." else "toy-split"
+    assert name in opened.episode_ids()
+    assert len(opened.episode_ids()) == 2
+    loaded = opened.load(name)
+    assert np.array_equal(loaded.episode.state, whole.episode.state)
+    assert np.array_equal(
+        loaded.episode.cameras["right_wrist"].T_base_camera, whole.episode.cameras["right_wrist"].T_base_camera
+    )
+    assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(90))
+    ranges = toy.declared(root, episodes={"by": "ranges", "ranges": [{"name": "x", "start_s": 1.0, "stop_s": 2.0}]})
+    assert source(ranges).load(f"{name}-x").episode.num_frames == pytest.approx(30, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("listed", "reason", "named"),
+    [
+        ("relative_file_paths: [run_0.mcap, run_1.mcap, run_3.mcap]", "missing_file", "run_3.mcap"),
+        ("relative_file_paths: [run_0.mcap, run_1.db3]", "missing_file", "run_1.db3"),
+        ("relative_file_paths: 7", "unreadable", "relative_file_paths"),
+        ("relative_file_paths: [1, 2]", "unreadable", "relative_file_paths"),
+        ("relative_file_paths: [a, a", "unreadable", "ros2 bag reindex"),
+        ("files: []", "unreadable", "relative_file_paths"),
+    ],
+)
+def test_lists_of_parts_that_cannot_be_used_are_named(
+    tmp_path: Path, toy: Any, listed: str, reason: str, named: str
+) -> None:
+    write_split(toy, tmp_path / "bag", listed)
+    error = rejection(toy.declared(tmp_path), "toy-bag")
+    assert error.reason == reason
+    assert named in str(error)
+
+
+@pytest.mark.parametrize(
+    ("name", "begins", "next_step"),
+    [
+        ("a.mcap.zstd", b"\x28\xb5\x2f\xfd", "zstd -d"),
+        ("a.mcap", b"\x28\xb5\x2f\xfd", "zstd -d"),
+        ("a.mcap", b"\x1f\x8b", "gunzip"),
+        ("a.db3", b"SQLite format 3\0", "mcap convert"),
+        ("a.bag", b"#ROSBAG V2.0\n", "rosbags-convert"),
+    ],
+)
+def test_other_bags_are_named_with_their_next_step(
+    tmp_path: Path, toy: Any, name: str, begins: bytes, next_step: str
+) -> None:
+    (tmp_path / name).write_bytes(begins.ljust(200, b"\0"))
+    error = rejection(toy.declared(tmp_path), f"toy-{name.removesuffix('.mcap')}")
+    assert (error.reason, next_step in str(error.next_step)) == ("unreadable", True)
+
+
 def test_missing_topics_are_named_beside_those_there_are(tmp_path: Path, toy: Any) -> None:
     toy.robot().write(tmp_path / "a.mcap")
     declared = toy.declared(tmp_path)

@@ -11,7 +11,7 @@ import re
 import struct
 import zlib
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -248,6 +248,35 @@ class McapFile:
             yield kind(stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
 
 
+class SplitMcap(McapFile):
+    """The parts of one recording, read one after the other as one file; `path` is their folder.
+
+    Raises: RejectedInputError as `McapFile`, for any part.
+    """
+
+    def __init__(self, folder: AnyPath, parts: Sequence[AnyPath]) -> None:
+        self.parts = [McapFile(part) for part in parts]
+        super().__init__(folder)
+
+    @property
+    def _summary(self) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """None: every part has its own."""
+
+    @cached_property
+    def topics(self) -> dict[str, str]:
+        return {topic: schema for part in self.parts for topic, schema in part.topics.items()}
+
+    @property
+    def first_log_ns(self) -> int:
+        return self.parts[0].first_log_ns
+
+    def _records(
+        self, topics: Collection[str] | None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[Schema | None, Channel, Record]]:
+        for part in self.parts:
+            yield from part._records(topics, start_ns, stop_ns)
+
+
 @contextmanager
 def _damage_as_rejection(where: object) -> Iterator[None]:
     try:
@@ -257,6 +286,25 @@ def _damage_as_rejection(where: object) -> Iterator[None]:
         raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200], next_step=next_step) from error
 
 
+_OTHER_FORMATS = {
+    b"\x28\xb5\x2f\xfd": ("packed as a whole by zstd", "unpack it: zstd -d FILE"),
+    b"\x1f\x8b": ("packed as a whole by gzip", "unpack it: gunzip FILE"),
+    b"SQLite format 3\0": ("a bag of ROS 2 in SQLite", "convert it: mcap convert FILE.db3 FILE.mcap"),
+    b"#ROSBAG V": ("a bag of ROS 1", "convert it: rosbags-convert --src FILE.bag --dst FOLDER --dst-storage mcap"),
+}
+"""First bytes of what is often recorded for MCAP: what it is, and how it becomes MCAP."""
+
+
+def _check_format(stream: BinaryIO, where: object) -> None:
+    begins = stream.read(16)
+    for magic, (got, next_step) in _OTHER_FORMATS.items():
+        if begins.startswith(magic):
+            what = "Recording is in another format"
+            raise RejectedInputError("unreadable", what, where=where, expected="MCAP", got=got, next_step=next_step)
+    if not begins.startswith(_MAGIC):
+        raise ValueError("another beginning than that of an MCAP file")
+
+
 def check_chunks(path: Path, where: object) -> list[int]:
     """Offsets of the chunks of the data section, none of which unpacks to more than MAX_CHUNK_BYTES.
 
@@ -264,8 +312,7 @@ def check_chunks(path: Path, where: object) -> list[int]:
     """
     size, chunks, ended = path.stat().st_size, list[int](), False
     with _damage_as_rejection(where), path.open("rb") as stream:
-        if stream.read(len(_MAGIC)) != _MAGIC:
-            raise ValueError("another beginning than that of an MCAP file")
+        _check_format(stream, where)
         position = len(_MAGIC)
         while position < size - len(_MAGIC):
             stream.seek(position)

@@ -277,14 +277,15 @@ class MessageDecoder:
 
     def __init__(self, where: object) -> None:
         self._where = where
-        self._factories = (Ros2DecoderFactory(), ProtobufDecoderFactory())
-        self._channels: dict[int, tuple[Kind, Callable[[bytes], Any]]] = {}
+        self._channels: dict[tuple[object, ...], tuple[Kind, Callable[[bytes], Any]]] = {}
 
     def decode(self, channel: Channel, schema: Schema | None, data: bytes) -> tuple[Kind, int | None, Any]:
         """Kind of a message, its header time [ns] (None where the schema has none), and its content."""
-        if channel.id not in self._channels:
-            self._channels[channel.id] = self._channel(channel, schema)
-        kind, decode = self._channels[channel.id]
+        # Numbers of channels and schemas mean something within one file of a split recording only.
+        key = channel.topic, channel.message_encoding, *(() if schema is None else (schema.name, schema.data))
+        if key not in self._channels:
+            self._channels[key] = self._channel(channel, schema)
+        kind, decode = self._channels[key]
         if kind not in IMAGE_KINDS and len(data) > _MAX_MESSAGE_BYTES:
             what, where = "Message is too large", f"{self._where}, topic {channel.topic}"
             raise too_large(what, where=where, limit=_MAX_MESSAGE_BYTES, got=len(data), unit="bytes")
@@ -329,7 +330,8 @@ class MessageDecoder:
             raise RejectedInputError("unknown_schema", what, where=where, got=schema.name)
         try:
             with redirect_stderr(StringIO()):  # the ROS 2 parser prints the line at fault as it is
-                found = (factory.decoder_for(channel.message_encoding, schema) for factory in self._factories)
+                factories = Ros2DecoderFactory(), ProtobufDecoderFactory()
+                found = (factory.decoder_for(channel.message_encoding, schema) for factory in factories)
                 return next((decoder for decoder in found if decoder is not None), None)
         except (*_FAULTS, *_SCHEMA_FAULTS) as error:
             what = "Schema definition cannot be read"

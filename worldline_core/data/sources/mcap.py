@@ -7,18 +7,32 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from operator import itemgetter
+from pathlib import PurePosixPath
 from typing import Literal
 
+from worldline_core.config import read_yaml
 from worldline_core.data.episodes.source import LoadedEpisode, SourceConfigBase
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.guards.plain_files import expect_layout
+from worldline_core.data.guards.rejection import RejectedInputError, collect_faults
+from worldline_core.data.guards.source_paths import (
+    AnyPath,
+    find_files,
+    inside,
+    is_file,
+    regular_file,
+    relative_name,
+)
 from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
-from worldline_core.data.mcap.file import McapFile
+from worldline_core.data.mcap.file import McapFile, SplitMcap
 from worldline_core.data.mcap.recording import Segment, read_topics_episode
 from worldline_core.data.mcap.topics_config import Markers, McapTopicsSourceConfig, TimeRanges, WholeFiles
-from worldline_core.errors import DataError
+from worldline_core.errors import ConfigError, DataError
+
+_PATTERNS = ("*.mcap", "*.mcap.zst*", "*.db3", "*.bag")
+"""The last three are bags that `McapFile` refuses with their next step."""
 
 
 class McapSourceConfig(SourceConfigBase):
@@ -28,7 +42,10 @@ class McapSourceConfig(SourceConfigBase):
 
 
 def _files(root: AnyPath) -> dict[str, AnyPath]:
-    return {root.name: root} if is_file(root) else {str(relative_name(p, root)): p for p in find_files(root, "*.mcap")}
+    if is_file(root):
+        return {root.name: root}
+    found = {str(relative_name(path, root)): path for pattern in _PATTERNS for path in find_files(root, pattern)}
+    return dict(sorted(found.items()))
 
 
 def _checked(path: AnyPath, name: str, root: AnyPath) -> AnyPath:
@@ -66,49 +83,113 @@ class McapSource:
         return loaded
 
 
+@dataclass(frozen=True)
+class _Recording:
+    """What one recorder wrote: a file, or the parts of a split bag of rosbag2 in their order.
+
+    Attributes:
+        name: of the file or the bag's folder, below the source's folder.
+        parts: names of the files, below the source's folder.
+        fault: why the bag's list of parts cannot be used.
+    """
+
+    name: str
+    parts: tuple[str, ...]
+    fault: RejectedInputError | None = None
+
+    def open(self, root: AnyPath) -> McapFile:
+        """Raises: RejectedInputError: path_traversal; missing_file for a part that is not there; as `McapFile`."""
+        if self.fault is not None:
+            raise self.fault
+        if is_file(root):
+            return McapFile(root)
+        paths = [inside(root, part) for part in self.parts]
+        return McapFile(paths[0]) if len(paths) == 1 else SplitMcap(root / self.name, paths)
+
+
+def _recordings(root: AnyPath) -> list[_Recording]:
+    """Recordings below a folder; files that a `metadata.yaml` lists together are one."""
+    found = {name: _Recording(name, (name,)) for name in _files(root)}
+    for listing in [] if is_file(root) else find_files(root, "metadata.yaml"):
+        folder = relative_name(listing, root).parent
+        faults: list[RejectedInputError] = []
+        parts: tuple[str, ...] = ()
+        with collect_faults(faults):
+            parts = tuple(str(folder / name) for name in _listed_parts(inside(root, str(folder / "metadata.yaml"))))
+        name = str(folder) if folder.parts else root.name
+        beside = [file for file in found if PurePosixPath(file).parent == folder]
+        if faults and beside:
+            found[name] = _Recording(name, (), faults[0])
+        elif len(parts) > 1:
+            found = {file: each for file, each in found.items() if file not in parts}
+            found[name] = _Recording(name, parts)
+    return sorted(found.values(), key=lambda recording: recording.name)
+
+
+def _listed_parts(path: AnyPath) -> list[str]:
+    """Names of a bag's files in the order in which they were written; older bags list them with their folder."""
+    try:
+        content = read_yaml(regular_file(path))
+    except ConfigError as error:
+        raise RejectedInputError(
+            "unreadable",
+            "List of a bag's files cannot be read",
+            where=path,
+            got=error.got,
+            next_step="write it again: ros2 bag reindex",
+        ) from error
+    with expect_layout(path, "rosbag2_bagfile_information with relative_file_paths"):
+        if "rosbag2_bagfile_information" not in content:
+            return []
+        listed = content["rosbag2_bagfile_information"]["relative_file_paths"]
+        return [PurePosixPath(name).name for name in listed]
+
+
 class McapTopicsSource:
     """Reads every *.mcap below a folder, or one file; ids are label-path[-episode].
 
-    A file in which no episodes can be looked for is listed as one, which then says why.
+    The parts of a split bag are one recording, with the path of their folder. A recording in which no episodes can be
+    looked for is listed as one, which then says why.
     """
 
     looked_for = "*.mcap, and in them what `episodes` declares"
 
     def __init__(self, config: McapTopicsSourceConfig, root: AnyPath) -> None:
         self._config = config
-        self._episodes: dict[str, tuple[AnyPath, str, Segment]] = {}
-        for name, path in _files(root).items():
-            stem = f"{config.label}-{name.removesuffix('.mcap')}"
+        self._root = root
+        self._episodes: dict[str, tuple[_Recording, str, Segment]] = {}
+        for recording in _recordings(root):
+            stem = f"{config.label}-{recording.name.removesuffix('.mcap')}"
             try:
-                checked = _checked(path, name, root)
-                found = list(_segments(config.episodes, checked, name))
+                found = list(_segments(config.episodes, recording, root))
             except RejectedInputError as error:
                 found = [Segment(fault=error)]
             for segment in found:
-                self._episodes[f"{stem}-{segment.name}" if segment.name else stem] = path, stem, segment
+                self._episodes[f"{stem}-{segment.name}" if segment.name else stem] = recording, stem, segment
 
     def episode_ids(self) -> list[str]:
         return list(self._episodes)
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        path, stem, segment = self._episodes[episode_id]
+        recording, stem, segment = self._episodes[episode_id]
         if segment.fault is not None:
             raise segment.fault
-        return read_topics_episode(self._config, McapFile(path), segment, episode_id, self._config.scene or stem)
+        file = recording.open(self._root)
+        return read_topics_episode(self._config, file, segment, episode_id, self._config.scene or stem)
 
 
-def _segments(rule: WholeFiles | TimeRanges | Markers, path: AnyPath, relative_path: str) -> Iterator[Segment]:
-    """Episodes of one file."""
+def _segments(rule: WholeFiles | TimeRanges | Markers, recording: _Recording, root: AnyPath) -> Iterator[Segment]:
+    """Episodes of one recording."""
     if isinstance(rule, WholeFiles):
         yield Segment()
     elif isinstance(rule, TimeRanges):
         for part in rule.ranges:
-            if fnmatchcase(relative_path, part.file):
-                first = McapFile(path).first_log_ns
+            if fnmatchcase(recording.name, part.file):
+                first = recording.open(root).first_log_ns
                 start, stop = (first + round(seconds * 1e9) for seconds in (part.start_s, part.stop_s))
                 yield Segment(part.name, start, stop, part.instruction)
     else:
-        yield from _between_markers(rule, McapFile(path))
+        yield from _between_markers(rule, recording.open(root))
 
 
 def _between_markers(rule: Markers, file: McapFile) -> Iterator[Segment]:
