@@ -132,6 +132,26 @@ def test_images_are_read_one_by_one(tmp_path: Path) -> None:
     assert np.array_equal(loaded.frames("head")[0], first)
 
 
+@pytest.mark.parametrize("channels", ["standard", "as_written"])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_bare_pixels_are_read_by_their_size(tmp_path: Path, channels: str, fixed: bool) -> None:
+    """As the publisher's reader does: frames of 480 x 640 or 720 x 1280, in the order in which it decodes JPEG files."""
+    path = write_franka(tmp_path / "raw")
+    frames = np.zeros((LENGTH, 480, 640, 3), np.uint8)
+    frames[:, :400, 100:] = RGB  # black at the end
+    stored = frames[..., ::-1] if channels == "standard" else frames
+    with h5py.File(path, "r+") as file:
+        key = "observations/rgb_images/camera_top"
+        del file[key]
+        contents = [image.tobytes() for image in stored]
+        if fixed:
+            file[key] = np.array(contents, f"S{480 * 640 * 3}")
+        else:
+            write_images(file, key, [np.frombuffer(content, np.uint8) for content in contents])
+    _, curated = run(tmp_path, settings(tmp_path / "raw", channels=channels))
+    assert np.abs(curated.frames(0, "head")[:, 200, 400].astype(int) - RGB).max() < 8
+
+
 def test_instructions_of_the_table(tmp_path: Path) -> None:
     write_franka(tmp_path / "raw")
     write_franka(tmp_path / "raw", "close_drawer", seed=1)
@@ -190,7 +210,10 @@ FAULTS: dict[str, tuple[Damage, str]] = {
     "joints in another file": (edit(linked), "path_traversal"),
     "joints that were never written": (edit(huge_chunk), "unreadable"),
     "joints as texts": (replaced("puppet/joint_position", lambda v: v.astype("S8")), "unreadable"),
-    "joints in degrees": (replaced("puppet/joint_position", lambda v: np.rad2deg(v) + 10), "joint_out_of_range"),
+    "joints in degrees": (
+        replaced("puppet/joint_position", lambda v: np.rad2deg(v) * [*[1] * 7, 0]),
+        "joint_out_of_range",
+    ),
 }
 
 

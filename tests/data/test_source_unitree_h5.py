@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -17,6 +18,7 @@ from damaged_hdf5 import Damage, cut, kept_beside, replaced, with_nan, without
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.open import open_source
 from worldline_core.data.sources.unitree_h5 import UnitreeH5SourceConfig
 from worldline_core.data.video.encoder import encode_video
@@ -26,9 +28,22 @@ HEADER = "videoid,contentUrl,duration,data_dir,instruction,embodiment\n"
 Write = Callable[..., Path]
 
 
-def motors(columns: int, offset: float = 0.0) -> np.ndarray:
-    """(N, columns): column c is c / 50 + offset and a little motion."""
-    return np.arange(columns)[None] / 50 + offset + 0.01 * np.arange(LENGTH)[:, None]
+ROBOTS = {
+    "g1_dex1": (16, [*range(7), 14, *range(7, 14), 15], [7, 15]),
+    "z1_dual": (14, list(range(14)), [6, 13]),
+    "z1_dual_grippers_last": (14, [*range(6), 12, *range(6, 12), 13], [6, 13]),
+    "z1_single": (7, list(range(7)), [6]),
+    "aloha": (14, list(range(14)), [6, 13]),
+}
+"""Columns, their order in the state, and where its grippers are."""
+
+
+def motors(robot: str = "g1_dex1", offset: float = 0.0) -> np.ndarray:
+    """(N, columns) in the robot's order: joints within a Z1's limits, grippers of 0.2 .. 0.4, and a little motion."""
+    columns, order, grippers = ROBOTS[robot]
+    state = np.tile([0.3, 0.6, -0.9, 0.2, 0.1, -0.2, 0.25], 3)[:columns] + offset + 0.01 * np.arange(LENGTH)[:, None]
+    state[:, grippers] = 0.28 + offset + 0.01 * np.arange(LENGTH)[:, None]
+    return state[:, np.argsort(order)]
 
 
 def pictures(shade: int = 0) -> np.ndarray:
@@ -40,14 +55,14 @@ def pictures(shade: int = 0) -> np.ndarray:
 
 
 def write_transitions(
-    root: Path, number: int = 0, shade: int = 0, dataset: str = "pack_camera", columns: int = 16
+    root: Path, number: int = 0, shade: int = 0, dataset: str = "pack_camera", robot: str = "g1_dex1"
 ) -> Path:
     """One recording of UnifoLM-WMA's layout, and its rows in the table (one a camera); returns the file."""
     path = root / f"transitions/{dataset}/{number}.h5"
     path.parent.mkdir(parents=True, exist_ok=True)
     (path.parent / "meta_data").mkdir(exist_ok=True)
     with h5py.File(path, "w") as file:
-        file["observation.state"], file["action"] = motors(columns), motors(columns, 0.02)
+        file["observation.state"], file["action"] = motors(robot), motors(robot, 0.02)
         file.attrs["state_type"] = file.attrs["action_type"] = "joint position"
         file.attrs["robot_type"] = "Unitree G1 Robot with Gripper"
     table = root / f"{dataset}.csv"
@@ -61,13 +76,13 @@ def write_transitions(
     return path
 
 
-def write_hdf5(root: Path, number: int = 0, shade: int = 0, columns: int = 16) -> Path:
+def write_hdf5(root: Path, number: int = 0, shade: int = 0, robot: str = "g1_dex1") -> Path:
     """One recording as unitree_IL_lerobot converts it: pixels with blue first."""
     root.mkdir(parents=True, exist_ok=True)
     path = root / f"episode_{number}.hdf5"
     with h5py.File(path, "w") as file:
-        file["observations/qpos"], file["action"] = motors(columns), motors(columns, 0.02)
-        file["observations/qvel"] = np.zeros((LENGTH, columns), np.float32)
+        file["observations/qpos"], file["action"] = motors(robot), motors(robot, 0.02)
+        file["observations/qvel"] = np.zeros((LENGTH, 16), np.float32)
         for camera in ("cam_left_high", "cam_right_wrist"):
             file.create_dataset(
                 f"observations/images/{camera}",
@@ -93,22 +108,14 @@ def load(root: Path, **changes: Any) -> Any:
     return source.load(source.episode_ids()[0])
 
 
-ROBOTS = {
-    "g1_dex1": (16, [*range(7), 14, *range(7, 14), 15], [7, 15]),
-    "z1_dual": (14, list(range(14)), [6, 13]),
-    "z1_single": (7, list(range(7)), [6]),
-}
-"""Columns, their order in the state, and where its grippers are."""
-
-
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("write", [write_transitions, write_hdf5])
 def test_columns_are_those_of_the_robots_motors(tmp_path: Path, write: Write, robot: str) -> None:
-    columns, order, grippers = ROBOTS[robot]
-    write(tmp_path, columns=columns)
-    loaded = load(tmp_path, robot=robot)
+    _, order, grippers = ROBOTS[robot]
+    write(tmp_path, robot=robot)
+    loaded = load(tmp_path, robot=robot, embodiment="none", channels="standard")
     for found, offset in ((loaded.episode.state, 0.0), (loaded.episode.action, 0.02)):
-        expected = motors(columns, offset)[:, order]
+        expected = motors(robot, offset)[:, order]
         expected[:, grippers] = np.clip((expected[:, grippers] - 0.2) / 0.2, 0, 1)
         assert np.allclose(found, expected, atol=1e-6)
     assert [loaded.episode.state_names[place].rsplit("/")[-1] for place in grippers] == ["gripper"] * len(grippers)
@@ -117,6 +124,53 @@ def test_columns_are_those_of_the_robots_motors(tmp_path: Path, write: Write, ro
     for view in ("head", "right_wrist"):
         difference = np.abs(loaded.frames(view).astype(int) - pictures())
         assert difference.mean() < (4 if write is write_transitions else 1e-9)  # video, or pixels as they were
+
+
+@pytest.mark.parametrize(
+    ("declared", "recorded"), [("z1_dual", "z1_dual_grippers_last"), ("z1_dual_grippers_last", "z1_dual")]
+)
+def test_another_order_of_columns_is_named(tmp_path: Path, declared: str, recorded: str) -> None:
+    write_hdf5(tmp_path, robot=recorded)
+    with pytest.raises(RejectedInputError, match=f"robot: {recorded}") as caught:
+        load(tmp_path, robot=declared, embodiment="none")
+    assert caught.value.reason == "joint_out_of_range"
+
+
+@pytest.mark.parametrize(
+    "readings", [{"closed": 0.0, "open": 0.2}, {"closed": 0.5, "open": 0.4}, {"closed": 20, "open": 0}]
+)
+def test_a_gripper_outside_of_its_range_in_most_frames_is_refused(tmp_path: Path, readings: dict[str, float]) -> None:
+    write_hdf5(tmp_path)
+    changes = {"gripper_command": readings} if readings["closed"] else {"gripper_state": readings}
+    if readings["closed"] == 20:  # in hundredths
+        edit = replaced("action", lambda values: np.hstack([values[:, :14], 100 * values[:, 14:]]))
+        edit(tmp_path / "episode_0.hdf5")
+    with pytest.raises(RejectedInputError, match="most frames") as caught:
+        load(tmp_path, **changes)
+    assert caught.value.reason == "invalid_gripper"
+
+
+@pytest.mark.parametrize("channels", ["standard", "as_written"])
+@pytest.mark.parametrize("kind", ["padded", "fixed", "pixels"])
+def test_aloha_recordings_are_read(tmp_path: Path, kind: str, channels: str) -> None:
+    """ACT's recorder: PNG or JPEG padded to the longest (N, L), or pixels; red first with `as_written`."""
+    path = write_hdf5(tmp_path, robot="aloha")
+    stored = pictures()[..., ::-1] if channels == "standard" else pictures()
+    with h5py.File(path, "r+") as file:
+        for camera in ("cam_left_high", "cam_right_wrist"):
+            del file[f"observations/images/{camera}"]
+            encoded = [cv2.imencode(".png", image)[1].tobytes() for image in stored]
+            longest = max(map(len, encoded)) + 5
+            padded = np.stack([np.frombuffer(each.ljust(longest, b"\0"), np.uint8) for each in encoded])
+            values = {"padded": padded, "fixed": np.array(encoded, f"S{longest}"), "pixels": stored}[kind]
+            file[f"observations/images/{camera}"] = values
+    loaded = load(tmp_path, robot="aloha", embodiment="aloha_viperx", channels=channels)
+    assert np.array_equal(loaded.frames("head"), pictures())
+    with pytest.raises(ValidationError, match="declare channels"):
+        load(tmp_path, robot="aloha", embodiment="aloha_viperx")
+    if kind == "padded":
+        with pytest.raises(RejectedInputError, match="declare channels"):
+            load(tmp_path, robot="z1_dual", embodiment="none")
 
 
 def test_a_set_comes_through_curation(tmp_path: Path) -> None:
@@ -142,7 +196,7 @@ def link_out(path: Path) -> None:
 
 def external(path: Path) -> None:
     with h5py.File(path.parent / "outside.hdf", "w") as outside:
-        outside["secret"] = motors(16)
+        outside["secret"] = motors()
     with h5py.File(path, "r+") as file:
         del file["action"]
         file["action"] = h5py.ExternalLink("outside.hdf", "secret")

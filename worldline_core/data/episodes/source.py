@@ -29,6 +29,7 @@ EVALUATION_LAYOUTS = ("droid annotation", "robotwin")
 """Layouts, as their readers note them in an episode's conventions, that never train or select a model."""
 EVALUATION_ONLY = "evaluation_only"
 """Noted in the conventions of episodes of other layouts that never do either."""
+_FAR_OUTSIDE = 0.1
 _DROID = re.compile(r"(?<![a-z])droid(?![a-z])", re.IGNORECASE)  # and not "android"
 
 
@@ -241,8 +242,23 @@ class GripperRange(StrictModel):
         return self
 
     def opening(self, raw: np.ndarray) -> tuple[np.ndarray, int]:
-        """Opening in 0 closed .. 1 open, clipped, and how many readings lay outside."""
-        value = (np.asarray(raw, dtype=np.float64) - self.closed) / (self.open - self.closed)
+        """Opening in 0 closed .. 1 open, clipped, and how many readings lay outside.
+
+        Raises: RejectedInputError (invalid_gripper) where a gripper (a column of (N, ...) readings) lies further outside
+            than a tenth of the range in most frames: the range, the unit or the column is not the gripper's.
+        """
+        raw = np.asarray(raw, dtype=np.float64)
+        value = (raw - self.closed) / (self.open - self.closed)
+        far = np.abs(value - 0.5) > 0.5 + _FAR_OUTSIDE
+        if len(raw) and (far.mean(axis=0) > 0.5).any():
+            raise RejectedInputError(
+                "invalid_gripper",
+                "Readings of a gripper are outside of the declared range in most frames",
+                expected=f"{self.closed:g} closed .. {self.open:g} open",
+                got=f"{raw.min():g} .. {raw.max():g}",
+                next_step="declare the readings of this gripper, or the column that holds them",
+                evidence={"min": float(raw.min()), "max": float(raw.max()), "share": float(far.mean(axis=0).max())},
+            )
         return np.clip(value, 0.0, 1.0), int(np.count_nonzero((value < 0.0) | (value > 1.0)))
 
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowErro
 # Images are read a block at a time: a compressed chunk is unpacked once, and little is in memory.
 _BLOCK_IMAGES = 16
 _BLOCK_BYTES = 64 << 20
+_IMAGE_MARKS = b"\xff\xd8", b"\x89PNG"
 
 
 def require_h5py() -> Any:
@@ -200,16 +202,21 @@ class Hdf5File:
         return str(value)
 
     def image_files(self, key: str, length: int) -> Iterator[bytes]:
-        """A dataset (length,) of encoded images, as bytes each, a few in memory at a time."""
+        """Encoded images, as bytes each, a few in memory at a time; ALOHA pads all of them to the longest, (length, L)."""
         dataset = self._dataset(key)
         fixed = dataset.dtype.kind == "S"
         variable = self._h5py.check_vlen_dtype(dataset.dtype) == np.dtype(np.uint8)
-        if dataset.ndim != 1 or not (fixed or variable):
-            raise self._rejected(
-                "unreadable", "Images are not stored as encoded bytes", key, "(N,) byte strings", dataset.dtype
-            )
-        check_shape("Dataset", f"{self._path}, {key}", dataset.shape, (length,))
-        return map(bytes, self._rows(dataset, key))
+        padded = dataset.dtype == np.uint8 and dataset.ndim == 2
+        if not padded and (dataset.ndim != 1 or not (fixed or variable)):
+            expected, got = "(N,) byte strings, or (N, L) of uint8", f"{dataset.shape} of {dataset.dtype}"
+            raise self._rejected("unreadable", "Images are not stored as encoded bytes", key, expected, got)
+        check_shape("Dataset", f"{self._path}, {key}", dataset.shape, (length, None) if padded else (length,))
+        size = dataset.dtype.itemsize if fixed else 0  # h5py takes the zeros off the end
+        return (bytes(row).ljust(size, b"\0") for row in self._rows(dataset, key))
+
+    def holds_pixels(self, key: str) -> bool:
+        """True if images are stored as pixels, not encoded."""
+        return self._dataset(key).ndim > 2
 
     def pixels(self, key: str, length: int) -> Iterator[np.ndarray]:
         """A dataset (length, H, W, 3) of uint8 pixels, as images (H, W, 3) with their channels as stored."""
@@ -282,24 +289,41 @@ def open_hdf5(path: AnyPath) -> Iterator[Hdf5File]:
 
 
 Channels = Literal["as_written", "standard"]
-"""`standard`: usual JPEG and PNG files. `as_written`: a recorder handed OpenCV its RGB arrays, which takes them for BGR, so
-the files show red as blue, and OpenCV's own reading gives RGB back."""
+"""`standard`: usual JPEG and PNG files, or pixels as OpenCV has them, blue first. `as_written`: a recorder handed OpenCV its
+RGB arrays, which takes them for BGR, so files show red as blue, and OpenCV's own reading (or the pixels) gives RGB back."""
 
 
 def hdf5_images(
-    path: AnyPath, key: str, length: int, channels: Channels, *, calibrated: bool = False
+    path: AnyPath,
+    key: str,
+    length: int,
+    channels: Channels,
+    *,
+    calibrated: bool = False,
+    raw_sizes: Mapping[int, tuple[int, int]] = MappingProxyType({}),
 ) -> Iterator[np.ndarray]:
     """uint8 (H, W, 3) RGB, frame by frame; `calibrated` as in `decode_image`.
+
+    Args:
+        raw_sizes: number of bytes -> (H, W) of frames that are pixels without a header.
 
     Raises: RejectedInputError, while it is iterated: missing_file, missing_column, length_mismatch, too_large (by the
         image's own header, before it is decoded), unreadable, path_traversal.
     """
+    standard = channels == "standard"
     first: tuple[int, ...] | None = None
     with open_hdf5(path) as file:
+        if file.holds_pixels(key):
+            for image in file.pixels(key, length):
+                yield np.ascontiguousarray(image[..., ::-1]) if standard else image
+            return
         for number, content in enumerate(file.image_files(key, length)):
             where = f"{path}, {key}, frame {number}"
-            order = "bgr" if channels == "as_written" else "rgb"
-            image = decode_image(content, where, channels=order, calibrated=calibrated)
+            size = None if content.startswith(_IMAGE_MARKS) else raw_sizes.get(len(content))
+            if size is None:
+                image = decode_image(content, where, channels="rgb" if standard else "bgr", calibrated=calibrated)
+            else:
+                image = np.frombuffer(content, np.uint8).reshape(*size, 3)[..., :: -1 if standard else 1]
             first = first or image.shape
             if image.shape != first:
                 raise RejectedInputError(
@@ -309,13 +333,4 @@ def hdf5_images(
                     expected=f"{first[1]}x{first[0]}",
                     got=f"{image.shape[1]}x{image.shape[0]}",
                 )
-            yield image
-
-
-def raw_images(path: AnyPath, key: str, length: int) -> Iterator[np.ndarray]:
-    """`Hdf5File.pixels` of a file that is open while they are iterated.
-
-    Raises: RejectedInputError, as `open_hdf5` and `pixels`.
-    """
-    with open_hdf5(path) as file:
-        yield from file.pixels(key, length)
+            yield np.ascontiguousarray(image)

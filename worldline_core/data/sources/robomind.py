@@ -1,4 +1,4 @@
-"""RoboMIND 1 and 2: one HDF5 file per episode, images as JPEG bytes, joints of the robot (puppet) and of what leads it (master).
+"""RoboMIND 1 and 2: one HDF5 file per episode, images as JPEG bytes or bare pixels, joints of the robot (puppet) and of what leads it (master).
 
     <robot>/<task>/success_episodes/[train|val/]<episode>/data/trajectory.hdf5
     version 1: observations/rgb_images/<camera>, {puppet,master}/joint_position[_left,_right]
@@ -15,11 +15,12 @@ stated differently, is left out here and must be declared.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
@@ -38,6 +39,9 @@ from worldline_core.data.sources.hdf5 import (
 )
 from worldline_core.data.sources.video_folder import caption_table
 from worldline_core.untrusted_text import printable
+
+_RAW_SIZES = {720 * 1280 * 3: (720, 1280), 480 * 640 * 3: (480, 640)}
+"""Some frames are pixels without a header; the publisher's reader knows their size by their number of bytes."""
 
 LayoutName = Literal[
     "h5_franka_1rgb",
@@ -217,9 +221,11 @@ class RobomindSource(EpisodeFiles[RobomindSourceConfig]):
             conventions={} if collector is None else {"collector": collector},
         )
         channels: Channels = config.channels or layout.channels or "standard"
-        return LoadedEpisode(
-            episode, tuple(views), lambda view: hdf5_images(path, f"{layout.images}/{views[view]}", length, channels)
-        )
+
+        def images(view: str) -> Iterator[np.ndarray]:
+            return hdf5_images(path, f"{layout.images}/{views[view]}", length, channels, raw_sizes=_RAW_SIZES)
+
+        return LoadedEpisode(episode, tuple(views), images)
 
     def _text(self, file: Hdf5File, relative: PurePosixPath, path: AnyPath) -> str:
         if self._instructions is None:
