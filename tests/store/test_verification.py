@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,6 +82,36 @@ def test_the_videos_that_a_filtered_set_shares_are_compared_too(run: dict[str, P
     video = next(run["curate"].rglob("*.mp4"))
     with flipped(video, video.stat().st_size // 2, 3), pytest.raises(ArtifactError, match=rf"{video.name}: sha256"):
         next_step(tmp_path, run["filter"])
+
+
+READERS = [
+    "inspect {set}", "inspect {set} --episode x", "card {set}", "push {set} {out}", "export {set} --format lerobot --output {out}",
+    "export {set} --format mcap --episode x --output {out}", "calibrate check --artifact {set} --output {out}", "compare {set} {set}",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", READERS)
+@pytest.mark.parametrize("kind", ["curate", "filter"])
+def test_no_command_reads_a_flipped_byte(
+    run: dict[str, Path], tmp_path: Path, command: str, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video = next(run["curate"].rglob("*.mp4"))
+    artifact_files._digests.clear()
+    with flipped(video, video.stat().st_size // 2, 3), pytest.raises(SystemExit, match=r"[12]"):
+        main(command.format(set=run[kind], out=tmp_path / "out").split())
+    assert f"{video.name}: sha256" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists() or [p.name for p in (tmp_path / "out").rglob("*")] == ["run", ".lock"]
+
+
+@pytest.mark.parametrize("command", ["card {set}", "export {set} --format model --output {out}", "inspect {set}"])
+def test_no_command_reads_a_damaged_model(
+    project_root: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = shutil.copytree(project_root / "artifacts/shipped/models/causal", tmp_path / "model")
+    weights = next(copy.glob("*.safetensors"))
+    with flipped(weights, weights.stat().st_size - 1, 3), pytest.raises(SystemExit, match="1"):
+        main(command.format(set=copy, out=tmp_path / "out").split())
+    assert f"{weights.name}: sha256" in capsys.readouterr().err
 
 
 @pytest.fixture

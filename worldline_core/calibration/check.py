@@ -33,6 +33,7 @@ from worldline_core.pictures import jpeg_bytes
 from worldline_core.progress import Progress
 from worldline_core.scale.account import crash_evidence
 from worldline_core.scale.mapping import ends_the_run
+from worldline_core.store.artifact_files import verify_artifact
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 logger = logging.getLogger(__name__)
@@ -89,7 +90,8 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
 
 
 def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
-    """The episodes of an EpisodeSet."""
+    """The episodes of an EpisodeSet, compared with its manifest."""
+    verify_artifact(folder)
     episodes = EpisodeSet.open(folder)
 
     def load(position: int) -> LoadedEpisode:
@@ -218,6 +220,7 @@ def check_command(
     Raises:
         ConfigError: neither or both of file and folder are given, or the file has a mistake.
         DataError: the source cannot be opened, or has no such episode.
+        ArtifactError: the EpisodeSet is damaged.
     """
     descriptions: dict[str, str] = {}
     if artifact is not None and config is None:

@@ -62,7 +62,7 @@ def export(
 ) -> list[Path]:
     """Write episodes of an EpisodeSet, predictions of a RolloutSet, or a checkpoint with its tokenizer, below a folder.
 
-    The artifact is compared with its manifest first: by every digest, or, for chosen episodes, by sizes and changed files.
+    The artifact, and those that it refers to, are compared with their manifests first.
 
     Args:
         formats: for an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
@@ -91,7 +91,7 @@ def export(
             "Predictions are not chosen by outcome", where=artifact, got=outcome, next_step="name episodes"
         )
     with folder_lock(output):
-        verify_artifact(artifact, "fast" if episode_ids else "full")
+        verify_artifact(artifact)
         if kind == "Checkpoint":
             return [write_pretrained(artifact, output / "model")]
         if kind == "EpisodeSet":
@@ -195,8 +195,10 @@ def _export_rollouts(
         raise ArtifactError(
             "The episodes of these predictions are not known", where=artifact, next_step="name them: --episodes FOLDER"
         )
-    rollouts, recorded = RolloutSet.open(artifact), EpisodeSet.open(folder)
     tracks_folder = linked_folder(artifact, "tracks")
+    for linked in filter(None, (folder, tracks_folder)):
+        verify_artifact(linked)
+    rollouts, recorded = RolloutSet.open(artifact), EpisodeSet.open(folder)
     tracks = None if tracks_folder is None else ActionTracks.open(tracks_folder)
     names, written = list(episode_ids or rollouts.episode_ids), list[Path]()
     if missing := sorted(set(names) - set(rollouts.episode_ids)):

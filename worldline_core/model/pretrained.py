@@ -17,7 +17,7 @@ from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.errors import ArtifactError, CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import CheckpointInfo, read_checkpoint_info
 from worldline_core.model.tokenizers import VideoTokenizer, load_tokenizer, tokenizer_fingerprint
-from worldline_core.store.artifact_files import MANIFEST_NAME, is_stored, linked_folder, read_manifest
+from worldline_core.store.artifact_files import MANIFEST_NAME, is_stored, linked_folder, read_manifest, verify_artifact
 
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 UNKNOWN = "not stated"
@@ -116,7 +116,7 @@ def write_pretrained(folder: Path, output: Path) -> Path:
     """Copy a checkpoint with its tokenizer and its card into a folder that can be published and loaded anywhere.
 
     Raises:
-        ArtifactError: the folder exists.
+        ArtifactError: the folder exists, or the checkpoint or its tokenizer is damaged.
         CheckpointError: it is no Stage II or causal checkpoint, or its tokenizer is not here.
     """
     if output.exists() and any(output.iterdir()):
@@ -124,6 +124,7 @@ def write_pretrained(folder: Path, output: Path) -> Path:
     tokenizer = load_model_tokenizer(read_checkpoint_info(folder), folder)[2]
     root = tokenizer / "vae" if (tokenizer / "vae").is_dir() else tokenizer  # a pipeline's other models do not encode
     for source, target in ((folder, output), (root, output / "tokenizer")):
+        verify_artifact(source)
         target.mkdir(parents=True, exist_ok=True)
         for path in sorted(source.iterdir()):
             if path.suffix in {".json", ".safetensors"} and path.name != MANIFEST_NAME:
@@ -133,7 +134,12 @@ def write_pretrained(folder: Path, output: Path) -> Path:
 
 
 def write_model_card(folder: Path, license_name: str | None = None) -> Path:
-    """Write the card of a finished checkpoint to its ``run/card``, which is no part of its digest."""
+    """Write the card of a finished checkpoint to its ``run/card``, which is no part of its digest.
+
+    Raises:
+        ArtifactError: the checkpoint is damaged.
+    """
+    verify_artifact(folder)
     path = folder / "run" / "card" / "README.md"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(_model_card(folder, license_name), encoding="utf-8")

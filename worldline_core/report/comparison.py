@@ -42,7 +42,7 @@ from worldline_core.pages.page import Table, code, interval, render, words
 from worldline_core.pictures import contact_sheet, jpeg_bytes
 from worldline_core.report.videos import compared_rows
 from worldline_core.rollout.rollout_set import RolloutSet
-from worldline_core.store.artifact_files import MANIFEST_NAME, digest_value, linked_folder, read_json
+from worldline_core.store.artifact_files import MANIFEST_NAME, digest_value, linked_folder, read_json, verify_artifact
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import exclusive_lock
 from worldline_core.untrusted_text import visible
@@ -87,13 +87,14 @@ class Difference:
 def read_run(place: str) -> Series:
     """The series of a run: the folder of an evaluation or of a report, or ``HISTORY:NIGHT``.
 
-    Raises: ArtifactError for a place without scores.
+    Raises: ArtifactError for a place without scores, or one that is damaged.
     """
     folder, _, night = place.rpartition(":")
     if folder and not Path(place).exists():
         _require_night(read_history(Path(folder)), night)
         return read_series(scores_file(Path(folder), night))
     path = Path(place)
+    verify_artifact(path)
     if (path / SCORES_FILE).is_file():
         return read_scores(path, subgroups=True)
     names = [n for n in read_json(path / MANIFEST_NAME).get("inputs") or () if n.partition(".")[0] in EVALUATIONS]
@@ -104,6 +105,8 @@ def read_run(place: str) -> Series:
             got=f"{len(folders)} of the evaluations {names}" if names else "neither scores nor a report's manifest",
             expected="the folder of an evaluation, of a report, or HISTORY:NIGHT (artifacts/nightly:2026-11-21)",
         )  # fmt: skip
+    for folder in folders:
+        verify_artifact(folder)
     return {name: values for folder in folders for name, values in read_scores(folder, subgroups=True).items()}
 
 

@@ -31,7 +31,7 @@ from worldline_core.errors import DataError
 from worldline_core.pages.page import Table, duration, render, words
 from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
 from worldline_core.report.context import ReportContext, Section
-from worldline_core.store.artifact_files import JsonObject, linked_folder, read_json, read_rows
+from worldline_core.store.artifact_files import JsonObject, linked_folder, read_json, read_rows, verify_artifact
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.untrusted_text import cut, visible
 
@@ -318,8 +318,9 @@ def write_card(folder: Path, output: Path, title: str | None = None) -> list[Pat
 
     Returns: the files written.
 
-    Raises: DataError when the folder is no EpisodeSet; ArtifactError when one of its tables is damaged.
+    Raises: DataError when the folder is no EpisodeSet; ArtifactError when it is damaged.
     """
+    verify_artifact(folder)
     facts, episodes = DatasetFacts.read(folder), EpisodeSet.open(folder)
     heading = title or f"EpisodeSet {folder.resolve().name}"
     pictures: list[tuple[str, Path]] = []

@@ -98,7 +98,7 @@ def inspect(
         DataError: there is no such episode.
         ConfigError: an episode was asked for of a kind that has none.
     """
-    verify_artifact(folder, "fast")
+    verify_artifact(folder)
     kind = kind_of(folder)
     lines = describe(kind, folder)
     if kind not in PICTURED:
@@ -146,7 +146,7 @@ class _Subject:
         self.kind, self.folder, self.output = kind, folder, output
         linked = given or linked_folder(folder, "episodes")
         if linked is not None:
-            verify_artifact(linked, "fast")
+            verify_artifact(linked)
         self.episodes_folder = folder if kind == "EpisodeSet" else linked
         self.filtered = None
         self.notes: list[str] = []
