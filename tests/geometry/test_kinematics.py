@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
-from worldline_core.geometry.embodiment_report import random_states
-from worldline_core.geometry.kinematic_tree import read_mjcf
+from worldline_core.geometry.embodiment_report import check_embodiment, random_states
+from worldline_core.geometry.kinematic_tree import _MjcfReader, read_mjcf
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.transforms import rotation_angle
 
@@ -52,6 +52,17 @@ TOY = """
   </worldbody>
 </mujoco>
 """
+SECTIONS_TWICE = TOY.replace(
+    "<worldbody>",
+    """
+  <compiler angle="radian"/>
+  <compiler angle="degree"/>
+  <default><joint pos="0 0.01 0"/><site pos="0 0 0.03" euler="90 0 10"/><default class="b"><site zaxis="1 0 1"/></default></default>
+  <worldbody><body name="apart" pos="0 0 1"><joint name="apart"/><geom size="0.1"/></body></worldbody>
+  <worldbody>""",
+).replace(
+    '<site name="tip"', '<site name="a"/><site name="b" class="b"/><site name="c" quat="1 0 0 0"/><site name="tip"'
+)
 TOY_YAML = {
     "name": "toy",
     "description": {"format": "mjcf", "file": "toy.xml"},
@@ -80,9 +91,9 @@ TOY_YAML = {
 }
 
 
-def toy(tmp_path: Path, **changes: object) -> ArmKinematics:
+def toy(tmp_path: Path, text: str = TOY, **changes: object) -> ArmKinematics:
     (tmp_path / "toy.yaml").write_text(yaml.safe_dump({**TOY_YAML, **changes}))
-    (tmp_path / "toy.xml").write_text(TOY)
+    (tmp_path / "toy.xml").write_text(text)
     return ArmKinematics(load_embodiment(tmp_path / "toy.yaml"))
 
 
@@ -120,10 +131,18 @@ def assert_equals_mujoco(kinematics: ArmKinematics, xml: str, states: np.ndarray
     assert compared == len(states) * model.nbody
 
 
-def test_hand_written_description_equals_mujoco(tmp_path):
+@pytest.mark.parametrize("text", [TOY, SECTIONS_TWICE])
+def test_hand_written_description_equals_mujoco(tmp_path, text):
     states = np.random.default_rng(0).uniform(-1.5, 1.5, (7, 5))
     states[:, 4] = np.linspace(-0.2, 1.2, 7)
-    assert_equals_mujoco(toy(tmp_path), TOY, states)
+    assert_equals_mujoco(toy(tmp_path, text), text, states)
+
+
+def test_the_check_reads_defaults_of_sites_as_the_simulator_does(tmp_path, monkeypatch):
+    kinematics = toy(tmp_path, SECTIONS_TWICE)
+    assert check_embodiment(kinematics.embodiment, samples=5)["passed"]
+    monkeypatch.setattr(_MjcfReader, "_with_defaults", lambda self, element, childclass: element.attrib)
+    assert not check_embodiment(kinematics.embodiment, samples=5)["passed"]
 
 
 @pytest.mark.parametrize("name", ["panda_pair", "yam_station", "fourier_gr1t2", "unitree_g1_29dof", "ur5e"])
@@ -200,6 +219,13 @@ def test_unknown_joint_lists_the_joints(tmp_path):
         ("<body name='b' quat='0 0 0 0'/>", r"direction of length zero[\s\S]*body b"),
         ("<body name='b' pos='0 0'/>", r"body b[\s\S]*3 finite numbers"),
         ("<body><joint name='j' axis='0 0 0'/></body>", r"direction of length zero[\s\S]*joint j"),
+        ("<body name='b' quat='0 1 0 0' euler='1 0 0'/>", r"given twice[\s\S]*body b[\s\S]*quat, euler"),
+        ("<body><joint name='j' class='k'/></body>", r"No such class[\s\S]*joint j[\s\S]*k"),
+        ("<body><site name='s' fromto='0 0 0 1 0 0'/></body>", r"site s[\s\S]*fromto"),
+        ("<body name='b' mocap='true'/>", r"body b[\s\S]*mocap"),
+        ("<body name='b' pos='0 0 ${L}'/>", r"xacro[\s\S]*\$\{L\}"),
+        ("</worldbody><compiler coordinate='global'/><worldbody>", "coordinate"),
+        ("</worldbody><default><default class='k'/><default class='k'/></default><worldbody>", r"there twice[\s\S]*k"),
     ],
 )
 def test_what_the_reader_does_not_know_is_refused(body, message):

@@ -105,6 +105,14 @@ JOINT = "<joint name='{}' type='{}'><parent link='{}'/><child link='{}'/>{}</joi
         ),
         (robot(JOINT.format("j", "revolute", "a", "b", "<origin xyz='0 0 nan'/>")), "3 finite numbers"),
         (robot(JOINT.format("j", "revolute", "a", "b", "<origin rpy='a b c'/>")), "Not numbers"),
+        (
+            robot(JOINT.format("j", "fixed", "a", "b", "<origin quat_xyzw='1 0 0 0'/>")),
+            r"joint j, origin[\s\S]*quat_xyzw",
+        ),
+        (robot(JOINT.format("j", "fixed", "a", "b", "<origin quat='1 0 0 0'/>")), r"joint j, origin[\s\S]*rpy"),
+        (robot(JOINT.format("j", "fixed", "a", "b", "<origin xyz='0 0 ${L}'/>")), r"xacro[\s\S]*\$\{L\}"),
+        (robot(JOINT.format("$(arg n)", "fixed", "a", "b", "")), r"xacro[\s\S]*\$\(arg n\)"),
+        (robot("<xacro:arm prefix='left'/>"), r"xacro[\s\S]*<arm"),
     ],
 )
 def test_what_cannot_be_is_refused(text, message):

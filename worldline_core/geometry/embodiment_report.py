@@ -222,7 +222,7 @@ def bare_mjcf(root: ET.Element) -> ET.Element:
             root.remove(element)
     for parent in list(root.iter()):
         for child in list(parent):
-            in_default = parent.tag == "default" and child.tag not in ("joint", "default")
+            in_default = parent.tag == "default" and child.tag not in ("joint", "site", "default")
             if in_default or (parent.tag in ("body", "worldbody") and child.tag in _NO_POSE_OF_A_BODY):
                 parent.remove(child)
             elif child.tag == "site":

@@ -1,8 +1,8 @@
 """A robot as a tree of bodies and joints, read from MJCF or URDF without MuJoCo, in float64 (`pytorch_kinematics` reads
 URDF in float32, and MJCF with MuJoCo only). Tests compare both readers with MuJoCo itself.
 
-MJCF: nested bodies and sites with pos and quat, euler, axisangle, xyaxes or zaxis, hinge and slide joints, joint defaults by
-class, the compiler's angle and eulerseq. URDF: links, joints, origins and axes; a `mimic` joint is a joint of its own, listed
+MJCF: nested bodies and sites with pos and quat, euler, axisangle, xyaxes or zaxis, hinge and slide joints, defaults of joints
+and sites by class, the compiler's angle and eulerseq; sections that are there twice are merged, as MuJoCo does. URDF: links, joints, origins and axes; a `mimic` joint is a joint of its own, listed
 among the embodiment's finger joints. All else that decides a pose is refused by name.
 """
 
@@ -25,6 +25,10 @@ MAX_BODIES, MAX_DEPTH = 5_000, 200
 """Bodies, links and sites of one description, and how many hang below each other; robots have some hundreds."""
 _URDF_KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": None}
 _MJCF_KINDS = {"hinge": "revolute", "slide": "prismatic"}
+_ORIENTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
+_MOVED_OTHERWISE = {"body": ("mocap",), "site": ("fromto",), "compiler": ("coordinate",)}
+"""Attributes of MJCF that decide a pose in a way that this reader does not know."""
+_XACRO = re.compile(r"\$[{(]")
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,19 @@ def parse_xml(text: str, where: object) -> ET.Element:
     raise DataError("Kinematic description is not XML", where=where, got=str(problem))
 
 
+def _check_expanded(root: ET.Element, where: object) -> None:
+    """Raises: DataError when expressions or elements of xacro are left in a description."""
+    for element in root.iter():
+        found = [f"{name}={value!r}" for name, value in element.attrib.items() if _XACRO.search(value)]
+        if "xacro" in element.tag or (found and element.tag not in ("mesh", "texture", "material")):
+            raise DataError(
+                "Description holds xacro that was not expanded",
+                where=where,
+                got=f"<{element.tag.rpartition('}')[2]} {' '.join(found)}>",
+                next_step="expand it first: xacro FILE > robot.urdf",
+            )
+
+
 def _check_size[T](root: T, children: Callable[[T], Iterable[T]], where: object) -> None:
     """Raises: DataError for more bodies or deeper chains than readers of trees, which call themselves, can take."""
     level, bodies, depth = [root], 1, 1
@@ -144,9 +161,12 @@ def read_mjcf(text: str, where: object) -> TreeBody:
     Raises: DataError when the text is not MJCF, or uses something this reader does not know.
     """
     root = parse_xml(text, where)
-    worldbody = root.find("worldbody")
+    worldbody, *others = root.findall("worldbody") or [None]
     if root.tag != "mujoco" or worldbody is None:
         raise DataError("Not an MJCF file", where=where, expected="<mujoco> with a <worldbody>", got=f"<{root.tag}>")
+    _check_expanded(root, where)
+    for other in others:
+        worldbody.extend(list(other))
     for tag in ("include", "frame", "replicate", "attach"):
         if next(root.iter(tag), None) is not None:
             raise DataError(
@@ -154,6 +174,15 @@ def read_mjcf(text: str, where: object) -> TreeBody:
                 where=where,
                 next_step="write the file out flat (mujoco.mj_saveLastXML)",
             )
+    for tag, names in _MOVED_OTHERWISE.items():
+        for element in root.iter(tag):
+            if unread := [f'{name}="{element.get(name)}"' for name in names if element.get(name, "false") != "false"]:
+                raise DataError(
+                    f"Attribute of a {tag} is not supported here",
+                    where=f"{where}: {tag} {element.get('name', '')}".rstrip(),
+                    got=", ".join(unread),
+                    next_step="give the pose by pos and quat (mujoco.mj_saveLastXML writes it so)",
+                )
     for part, tags in ((worldbody, ("body", "site")), (root, ("default",))):
         _check_size(part, lambda element, tags=tags: (child for child in element if child.tag in tags), where)
     tree = _MjcfReader(root, where).body(worldbody, "world", None)
@@ -161,33 +190,50 @@ def read_mjcf(text: str, where: object) -> TreeBody:
     return tree
 
 
+def _overlaid(inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
+    """Attributes of both, the own ones first; an own orientation, in any form, replaces the inherited one."""
+    replaced = _ORIENTATIONS if any(name in own for name in _ORIENTATIONS) else ()
+    return {**{name: value for name, value in inherited.items() if name not in replaced}, **own}
+
+
 class _MjcfReader:
     """Reader of an MJCF; holds what bodies inherit: the compiler's settings and the joint defaults by class."""
 
     def __init__(self, root: ET.Element, where: object) -> None:
-        compiler = root.find("compiler")
-        settings = {} if compiler is None else compiler.attrib
+        settings = {name: value for part in root.findall("compiler") for name, value in part.attrib.items()}
         self.where = where
         self.to_radians = 1.0 if settings.get("angle", "degree") == "radian" else math.pi / 180
         self.eulerseq = settings.get("eulerseq", "xyz")
         if not re.fullmatch("[xyzXYZ]{3}", self.eulerseq):
             raise DataError("Not a sequence of axes", where=f"{where}: eulerseq", expected="xyz", got=self.eulerseq)
-        self.joint_defaults: dict[str, dict[str, str]] = {}
+        self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {"joint": {}, "site": {}}}
         for default in root.findall("default"):
-            self._read_defaults(default, {}, "main")
+            self._read_defaults(default, "main", "main")
         self.unnamed = 0
         self.body_names = {element.get("name") for element in root.iter("body")}
 
-    def _read_defaults(self, element: ET.Element, inherited: dict[str, str], fallback: str) -> None:
-        joint = element.find("joint")
-        values = {**inherited, **({} if joint is None else joint.attrib)}
-        self.joint_defaults[element.get("class", fallback)] = values
+    def _read_defaults(self, element: ET.Element, name: str, parent: str) -> None:
+        self.defaults[name] = dict(self.defaults[parent])
+        for tag in self.defaults[name]:
+            for part in element.findall(tag):
+                self.defaults[name][tag] = _overlaid(self.defaults[name][tag], part.attrib)
         for child in element.findall("default"):
-            self._read_defaults(child, values, fallback)
+            child_name = child.get("class", "")
+            if not child_name or child_name in self.defaults:
+                raise DataError("A class of defaults has no name, or is there twice", where=self.where, got=child_name)
+            self._read_defaults(child, child_name, name)
+
+    def _with_defaults(self, element: ET.Element, childclass: str | None) -> dict[str, str]:
+        """Attributes of a joint or site, with those of its class."""
+        name = element.get("class", childclass) or "main"
+        if name not in self.defaults:
+            place = f"{self.where}: {element.tag} {element.get('name', '')}"
+            raise DataError("No such class of defaults", where=place, expected=", ".join(self.defaults), got=name)
+        return _overlaid(self.defaults[name][element.tag], element.attrib)
 
     def body(self, element: ET.Element, name: str, childclass: str | None) -> TreeBody:
         childclass = element.get("childclass", childclass)
-        body = TreeBody(name, self._pose(element))
+        body = TreeBody(name, self._pose(element, element.attrib))
         if element.find("freejoint") is not None:
             raise DataError("A free body is no part of a kinematic description", where=f"{self.where}: {name}")
         body.joints = [self._joint(joint, name, childclass) for joint in element.findall("joint")]
@@ -201,12 +247,12 @@ class _MjcfReader:
             else:
                 # A site may have the name of a body; link names are unique.
                 unique = f"site:{child_name}" if child_name in self.body_names else child_name
-                body.children.append(TreeBody(unique, self._pose(child)))
+                pose = self._pose(child, self._with_defaults(child, childclass))
+                body.children.append(TreeBody(unique, pose))
         return body
 
     def _joint(self, element: ET.Element, body: str, childclass: str | None) -> TreeJoint:
-        joint_class = element.get("class", childclass) or "main"
-        values = {**self.joint_defaults.get(joint_class, {}), **element.attrib}
+        values = self._with_defaults(element, childclass)
         kind = _MJCF_KINDS.get(values.get("type", "hinge"))
         reference = _numbers(values.get("ref", "0"), 1, f"{self.where}: ref of a joint of {body}")[0]
         if kind is None or reference != 0.0:
@@ -221,10 +267,11 @@ class _MjcfReader:
         axis = _unit(_numbers(values.get("axis", "0 0 1"), 3, place), place)
         return TreeJoint(name, kind, axis, _numbers(values.get("pos", "0 0 0"), 3, place))
 
-    def _pose(self, element: ET.Element) -> np.ndarray:
-        """T_parent_body from pos and whichever of the five forms of orientation the element has."""
+    def _pose(self, element: ET.Element, given: Mapping[str, str]) -> np.ndarray:
+        """T_parent_body from pos and the one form of orientation among five that is given."""
         place = f"{self.where}: {element.tag} {element.get('name', '')}"
-        given = element.attrib
+        if len(forms := [name for name in _ORIENTATIONS if name in given]) > 1:
+            raise DataError("An orientation is given twice", where=place, expected="one form", got=", ".join(forms))
         T = np.eye(4)
         T[:3, 3] = _numbers(given.get("pos", "0 0 0"), 3, place)
         if "quat" in given:
@@ -262,6 +309,7 @@ def read_urdf(text: str, where: object) -> TreeBody:
     robot = parse_xml(text, where)
     if robot.tag != "robot":
         raise DataError("Not a URDF file", where=where, expected="<robot> with links and joints", got=f"<{robot.tag}>")
+    _check_expanded(robot, where)
     bodies: dict[str, TreeBody] = {}
     for link in robot.findall("link"):
         name = link.get("name", "")
@@ -308,6 +356,14 @@ def _urdf_origin(joint: ET.Element, where: object) -> np.ndarray:
     origin = joint.find("origin")
     if origin is not None:
         place = f"{where}: joint {joint.get('name')}, origin"
+        if unread := sorted(set(origin.attrib) - {"xyz", "rpy"}):
+            raise DataError(
+                "Attribute of an origin is not supported here",
+                where=place,
+                expected="xyz and rpy",
+                got=", ".join(f'{name}="{origin.get(name)}"' for name in unread),
+                next_step="write the rotation as rpy: most simulators read nothing else",
+            )
         T[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3, place)
         T[:3, :3] = rotation_from_euler_fixed_xyz(_numbers(origin.get("rpy", "0 0 0"), 3, place))
     return T
