@@ -117,11 +117,28 @@ def test_dynamics_compare_speeds_and_accelerations():
 
 
 @pytest.mark.parametrize("score", [hausdorff_score, time_warping_score, dynamics_score])
-def test_arms_are_averaged_and_unseen_ones_left_out(score):
+def test_only_arms_that_move_are_scored(score):
+    """A resting arm, one out of view, one that hovers by what cannot be measured: none flatters, an arm that vanishes scores 0."""
+    still, unseen, rest = np.repeat(LINE[:1], 17, axis=0), np.full_like(LINE, np.nan), np.full_like(LINE, 20.0)
+    hovering = rest + np.random.default_rng(0).normal(size=LINE.shape)
+    copied = score(LINE, still)
+    assert copied < 0.7
+    for other in (rest, unseen, hovering):
+        assert score(np.concatenate([LINE, other], axis=1), np.concatenate([still, other], axis=1)) == copied
     both = np.concatenate([LINE, LINE[::-1]], axis=1)
-    other = np.concatenate([LINE, np.full_like(LINE, np.nan)], axis=1)
-    assert score(both, other) == 1.0
-    assert score(LINE, np.full_like(LINE, np.nan)) is None
+    assert score(both, np.concatenate([LINE, unseen], axis=1)) == 0.5
+    assert score(both, both) == 1.0
+    assert score(rest, rest) is None
+    gone = LINE.copy()
+    gone[3:] = np.nan
+    assert score(LINE, gone) == 0.0
+
+
+def test_a_tool_that_vanishes_on_its_way_is_as_far_as_the_rest_of_the_path():
+    half = LINE.copy()
+    half[9:] = np.nan
+    assert hausdorff_score(LINE, half) == pytest.approx(1 / 25)
+    assert time_warping_score(LINE, half) == pytest.approx(17 / (3.125 * np.arange(1, 9).sum()))
 
 
 def test_controls_are_followed_or_not():

@@ -60,7 +60,7 @@ class Metric:
 
 
 _PAPER = "the paper, appendix"
-_EWMBENCH = "EWMBench (arXiv 2505.09694)"
+_EWMBENCH = "after EWMBench (arXiv 2505.09694)"
 _METRICS = (
     Metric(
         "robot_iou_exact", "Robot IoU, exact",
@@ -94,17 +94,18 @@ _METRICS = (
         "this project", perfect=0.0, margin=0.1, digits=2, unit="px", lower_is_better=True,
     ),
     Metric(
-        "hsd", "HSD", "Reciprocal of the symmetric Hausdorff distance of the true and the found path of each tool.",
+        "hsd", "HSD", "Reciprocal of the symmetric Hausdorff distance of the true and the found path of each arm that moves.",
         _EWMBENCH, perfect=1.0, margin=0.01, needs="tool_paths", compute="video.metrics_on_request:hausdorff_score",
     ),
     Metric(
         "ndtw", "nDTW",
-        "Reciprocal of the distance of both paths under dynamic time warping, per step of the true path.",
+        "Reciprocal of the distance of both paths under dynamic time warping, per step of the true path, of each arm that"
+        " moves.",
         _EWMBENCH, perfect=1.0, margin=0.01, needs="tool_paths", compute="video.metrics_on_request:time_warping_score",
     ),
     Metric(
         "dyn", "DYN",
-        "Agreement of the distributions of the tools' speeds and accelerations, by their Wasserstein distances.",
+        "Agreement of the distributions of speeds and accelerations of each arm that moves, by their Wasserstein distances.",
         f"{_EWMBENCH}, distances relative to the true path's own motion", perfect=1.0, margin=0.01, needs="tool_paths",
         compute="video.metrics_on_request:dynamics_score",
     ),

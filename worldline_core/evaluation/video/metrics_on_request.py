@@ -1,9 +1,8 @@
 """Metrics that are measured where ``evaluate_video.metrics`` names them: paths of the tools, and still scenes.
 
-HSD, nDTW and DYN follow EWMBench (arXiv 2505.09694): reciprocals of distances, in hundredths of the frame's height. Tools cannot be
-found more precisely than about one hundredth, so places are no nearer than that, and a perfect path scores 1 instead of infinity. The
-two terms of DYN are relative to the true path's own motion instead of weighted by constants of a data set. Each is the mean over the
-arms that are seen.
+HSD, nDTW and DYN follow EWMBench (arXiv 2505.09694): reciprocals of distances, in hundredths of the frame's height, of the arms that
+move. Tools cannot be found more precisely than about one hundredth, so places are no nearer than that, and a perfect path scores 1
+instead of infinity. docs/evaluation.md states the formulas and the differences.
 """
 
 from __future__ import annotations
@@ -23,6 +22,8 @@ from worldline_core.evaluation.metrics import SSIM_WINDOW, frames_to_unit, ssim_
 OUTLINE_FRACTION = 0.1  # half side of the outline, of the frame's height
 STEP_FRACTION = 0.1  # farthest way of a tool from one frame to the next, of the frame's height
 RESOLUTION = 1.0  # smallest distance that can be measured, hundredths of the height
+LEAST_PATH = 5.0  # diagonal of the box around the path of an arm that moves, hundredths of the height
+LEAST_FOUND = 0.2  # share of the true path's frames in which a tool must be found (EWMBench's)
 LEAST_MOTION = 0.1  # mean speed and acceleration of a tool that rests, hundredths of the height a frame
 MIN_DIFFERENCE = 3.0  # difference of two controls that the videos can show, hundredths of the height
 _NEARER = 1e-3  # of equal places the nearer one: a hundredth of a pixel's difference at ten pixels' distance
@@ -129,12 +130,19 @@ def time_warping_distance(first: np.ndarray, second: np.ndarray) -> float:
 def _over_arms(
     true: np.ndarray, found: np.ndarray, distance: Callable[[np.ndarray, np.ndarray], float], least: int = 1
 ) -> float | None:
-    """Mean over arms of 1 / distance of their paths; None where no arm is found in ``least`` frames."""
+    """Mean over the arms that move of 1 / distance of the true and the found path; None where no arm moves.
+
+    An arm that is hardly found, or in fewer than ``least`` frames, scores 0.
+    """
     scores = []
     for arm in range(true.shape[1]):
-        seen = np.isfinite(true[:, arm]).all(axis=-1) & np.isfinite(found[:, arm]).all(axis=-1)
-        if seen.sum() >= least:
-            scores.append(1.0 / max(distance(true[seen, arm], found[seen, arm]), RESOLUTION))
+        known = np.isfinite(true[:, arm]).all(axis=-1)
+        path = true[known, arm]
+        if len(path) < least or np.linalg.norm(np.ptp(path, axis=0)) < LEAST_PATH:
+            continue
+        seen = known & np.isfinite(found[:, arm]).all(axis=-1)
+        hardly = seen.sum() < max(least, LEAST_FOUND * len(path))
+        scores.append(0.0 if hardly else 1.0 / max(distance(path, found[seen, arm]), RESOLUTION))
     return sum(scores) / len(scores) if scores else None
 
 
