@@ -15,17 +15,13 @@ def add_plan_command(commands: argparse._SubParsersAction[argparse.ArgumentParse
     """Add the command to the parser of the whole command line."""
     plan = commands.add_parser(
         "plan",
-        help="what every stage of a preset takes: memory, time, and the setting that would fit",
-        description="Memory a device, seconds a step and hours of every stage, from the configuration alone; nothing is"
-        " loaded. Exit status: 0 everything fits, 1 something does not.",
+        help="memory that every stage of a preset takes, and the setting that would fit",
+        description="Memory a device of every stage, from the configuration alone; nothing is loaded."
+        " Exit status: 0 everything fits, 1 something does not.",
     )
     add_config_arguments(plan)
     plan.add_argument("--gpus", type=int, default=8, help="devices that share the trainings (default: 8)")
     plan.add_argument("--memory", default="80GB", metavar="SIZE", help="memory of each (default: 80GB)")
-    plan.add_argument("--card", default="H100", help="whose peak rates: A100, H100, H200, B200 (default: H100)")
-    plan.add_argument(
-        "--utilisation", type=float, default=0.4, help="share of the card's peak that is reached (default: 0.4)"
-    )
     plan.set_defaults(run=_plan)
 
 
@@ -35,14 +31,14 @@ def _plan(arguments: argparse.Namespace) -> None:
     preset = arguments.preset or (None if arguments.config else "demo")
     if preset is not None:
         preset_path(preset)  # answers before torch is imported
+    from worldline_core.pipeline.memory_estimate import SizeSheet
     from worldline_core.pipeline.pipeline_config import PipelineConfig
-    from worldline_core.pipeline.size_sheet import Machine, SizeSheet, as_text
 
-    asked = {"devices": arguments.gpus, **{name: vars(arguments)[name] for name in ("memory", "card", "utilisation")}}
-    machine = validate(Machine, asked, where="worldline plan")
     config = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=arguments.overrides)
-    rows = list(SizeSheet(config, Path.cwd(), machine).rows())
-    print(as_text(machine, rows))
+    machine = {"devices": arguments.gpus, "memory": arguments.memory}
+    sheet = validate(SizeSheet, {"config": config, "project": Path.cwd(), **machine}, where="worldline plan")
+    rows = list(sheet.rows())
+    print(sheet.as_text(rows))
     raise SystemExit(0 if not any(setting for _, setting in rows) else 1)
 
 

@@ -186,16 +186,6 @@ class SmallDecoder(nn.Module):
         fill(decoder, read_weights(weights, str(content.get("weights_sha256"))), where=weights, dtype=torch.float32)
         return decoder.to(device).eval().requires_grad_(False)
 
-    @classmethod
-    def outline(cls, folder: Path, tokenizer: VideoTokenizer) -> SmallDecoder:
-        """Without trained weights, to count with: of the size that the folder describes, where it is there."""
-        size, path = dict[str, int](), folder / DESCRIPTION
-        if path.is_file():
-            content = read_description(path, FORMAT, "decoder", VERSION)
-            config = described(SmallDecoderConfig, content.get("config"), path)
-            size = {"width": config.width, "depth": config.depth}
-        return cls(SmallDecoderConfig.of(tokenizer, "", **size), tokenizer).eval().requires_grad_(False)
-
 
 def windows(
     latents: Float[Tensor, "b c t_l h_l w_l"], first: Tensor | None = None, before: Tensor | None = None

@@ -1,25 +1,26 @@
-"""Memory and operations of a training, counted by running its own objective on tensors that have shapes and no values.
+"""Memory of every stage of a preset on so many devices: the table of `worldline plan`, and the refusal of a training that cannot fit.
 
-torch's own MemTracker gives the same figures within 0.4 % for a single pass, but refuses modules that are called several times
-before a backward pass, as the tokenizers and Stage III do; operations are counted by the formulas of its FlopCounterMode.
+Activations are counted by running a stage's own objective on tensors that have shapes and no values. torch's MemTracker gives the
+same figures within 0.4 % for a single pass, but refuses modules that are called several times before a backward pass, as the
+tokenizers and Stage III do.
 """
 
 from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, reduce
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from pydantic import ByteSize, Field
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
-from torch.utils.flop_counter import flop_registry, sdpa_backward_flop_count, sdpa_flop_count
 
 from worldline_core.config import StrictModel
 from worldline_core.distillation.auxiliary_losses import PerceptualLoss
@@ -30,11 +31,13 @@ from worldline_core.distillation.distribution_matching import DistributionMatchi
 from worldline_core.distillation.teacher_trajectories import TrajectoryBatch, teacher_trajectories
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.errors import ConfigError
-from worldline_core.model.checkpoint import SINGLE_PRECISION, read_checkpoint_info
+from worldline_core.model.checkpoint import DESCRIPTION, SINGLE_PRECISION, read_checkpoint_info
 from worldline_core.model.lpips import LPIPS
 from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import WorldModelConfig, cosmos3_nano_config
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.shipped import project_path
 from worldline_core.training.clip_config import JOINT, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_sampler import Clip, latent_frame_count
@@ -47,135 +50,79 @@ from worldline_core.training.trainer import autocast
 from worldline_core.training.training_config import RelationalConfig, Stage1Config, Stage2Config, TrainerConfig
 from worldline_core.training.video_teacher import teacher_outline
 
-_SMALL = 8
-"""Largest size (layers, latent frames) that is traced whole."""
+WHOLE = 8
+"""Most layers of a model that is traced as it is."""
 USABLE = 0.92
 """Share of a device's memory that a stage may fill; the rest is for the driver, communication and fragmentation."""
 
-_aten = torch.ops.aten
-_ATTENTION = {
-    _aten._scaled_dot_product_flash_attention_for_cpu: lambda args: sdpa_flop_count(*(t.shape for t in args[:3])),
-    _aten._scaled_dot_product_flash_attention_for_cpu_backward: lambda args: sdpa_backward_flop_count(
-        *(t.shape for t in args[:4])
-    ),
-}
+AnyStage = Stage1Config | Stage2Config | DistillConfig
 
 
-class Cost(NamedTuple):
-    """Bytes held at once and operations of one computation.
+class Held(NamedTuple):
+    """Most bytes held at once until the loss is there, and from then on, without gradients of parameters."""
 
-    Attributes:
-        forward, backward: most bytes until the loss is there, and from then on, without gradients of parameters.
-        held: bytes when the loss is there.
-        peak: most bytes at once, gradients of parameters included; not linear in the size of a model.
-        flops: floating-point operations, two for a multiplication and addition, except attention's.
-        attention_flops: those of attention, which grow with the square of the tokens.
-    """
-
-    forward: float = 0.0
-    backward: float = 0.0
-    held: float = 0.0
-    peak: float = 0.0
-    flops: float = 0.0
-    attention_flops: float = 0.0
-
-    @property
-    def activations(self) -> float:
-        return max(self.forward, self.backward)
-
-    @property
-    def all_flops(self) -> float:
-        return self.flops + self.attention_flops
-
-    def then(self, other: Cost) -> Cost:
-        """Both, one after the other."""
-        flops, attention = self.flops + other.flops, self.attention_flops + other.attention_flops
-        return Cost(*map(max, self, other))._replace(flops=flops, attention_flops=attention)
-
-    def repeated(self, count: float) -> Cost:
-        """The same computation several times, one after the other."""
-        return self._replace(flops=count * self.flops, attention_flops=count * self.attention_flops)
+    forward: float
+    backward: float
 
 
 class _Tracker(TorchDispatchMode):
-    """Follows the storages that a computation allocates and frees, and counts its operations.
+    """Follows the storages that a computation allocates and frees.
 
     Decisions that depend on values (a loss is finite, a text is padded) see 0.5, 1 or True.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.live = self.gradients = self.most = self.peak = 0
-        self.flops = self.attention_flops = 0.0
-        self._storages: dict[int, weakref.ref[Any]] = {}
+        self.live = self.most = 0
+        self._followed: set[int] = set()
 
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        kwargs = kwargs or {}
         if func is torch.ops.prim.device.default:
             return args[0].device
-        if func is _aten._local_scalar_dense.default:
+        if func is torch.ops.aten._local_scalar_dense.default:
             return True if args[0].dtype == torch.bool else 0.5 if args[0].is_floating_point() else 1
-        result = func(*args, **kwargs)
-        packet = func._overloadpacket
-        if packet in _ATTENTION:
-            self.attention_flops += _ATTENTION[packet](args)
-        elif packet in flop_registry:
-            self.flops += flop_registry[packet](*args, **kwargs, out_val=result)
+        result = func(*args, **(kwargs or {}))
         given = {storage._cdata for storage in _storages((args, kwargs))}
         for storage in _storages(result):
-            if storage._cdata not in given and storage._cdata not in self._storages:  # else it is no new memory
-                self._follow(storage)
+            if storage._cdata not in given and storage._cdata not in self._followed:  # else it is no new memory
+                self._followed.add(storage._cdata)
+                self.live += storage.nbytes()
+                self.most = max(self.most, self.live)
+                weakref.finalize(storage, self._freed, storage._cdata, storage.nbytes())
         return result
 
-    def _follow(self, storage: torch.UntypedStorage) -> None:
-        key, size = storage._cdata, storage.nbytes()
-
-        def freed(_: object) -> None:
-            if self._storages.pop(key, None) is not None:
-                self.live -= size
-
-        self._storages[key] = weakref.ref(storage, freed)
-        self.live += size
-        self.most = max(self.most, self.live)
-        self.peak = max(self.peak, self.live + self.gradients)
-
-    def count_gradient(self, parameter: Tensor) -> None:
-        """Move a parameter's new gradient from the activations to the gradients."""
-        if parameter.grad is not None and self._storages.pop(parameter.grad.untyped_storage()._cdata, None) is not None:
-            self.live -= parameter.grad.untyped_storage().nbytes()
-            self.gradients += parameter.grad.untyped_storage().nbytes()
+    def _freed(self, key: int, size: int) -> None:
+        self._followed.remove(key)
+        self.live -= size
 
 
 def _storages(values: Any) -> list[torch.UntypedStorage]:
     return [value.untyped_storage() for value in tree_leaves(values) if isinstance(value, Tensor)]
 
 
-def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> Cost:
-    """Cost of ``work`` and, with `parameters`, of the backward pass of the loss that it returns.
+def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> Held:
+    """Bytes that ``work`` holds and, with `parameters` that are trained, the backward pass of the loss that it returns.
 
     Call it within a FakeTensorMode; what exists before (the weights) is not counted.
     """
-    tracker = _Tracker()
-    hooks = [one.register_post_accumulate_grad_hook(tracker.count_gradient) for one in parameters if one.requires_grad]
-    with tracker:
+    trained = [parameter for parameter in parameters if parameter.requires_grad]
+    for parameter in trained:
+        parameter.register_post_accumulate_grad_hook(lambda one: setattr(one, "grad", None))
+    with _Tracker() as tracker:
         loss = work()
-        held, forward, tracker.most = tracker.live, tracker.most, tracker.live
-        if hooks:
+        forward, tracker.most = tracker.most, tracker.live
+        if trained:
             loss.backward()
-    for hook in hooks:
-        hook.remove()
-    return Cost(forward, tracker.most, held, tracker.peak, tracker.flops, tracker.attention_flops)
+    return Held(forward, tracker.most)
 
 
-def extrapolated(trace: Callable[[int], Cost], size: int, traced_at: tuple[int, int]) -> Cost:
-    """``trace(size)`` by a straight line through two smaller sizes (layers of a model, frames of a clip)."""
-    if size <= _SMALL:
-        return trace(size)
-    small, large = traced_at
-    share = (size - small) / (large - small)
-    return Cost(*(a + (b - a) * share for a, b in zip(trace(small), trace(large), strict=True)))
+def extrapolated(trace: Callable[[int], Held], layers: int) -> Held:
+    """``trace(layers)``; of deep models by a straight line through two shallow ones, for layers are equal."""
+    if layers <= WHOLE:
+        return trace(layers)
+    return Held(*(a + (b - a) * (layers - 3) for a, b in zip(trace(3), trace(4), strict=True)))
 
 
 def to_bfloat16(model: nn.Module) -> None:
@@ -184,11 +131,6 @@ def to_bfloat16(model: nn.Module) -> None:
         for key, value in list(module.named_parameters(recurse=False)):
             if not f"{name}.".startswith(SINGLE_PRECISION):
                 module.register_parameter(key, nn.Parameter(value.detach().bfloat16(), value.requires_grad))
-
-
-def weight_bytes(model: nn.Module) -> int:
-    """Bytes of a model's weights and buffers."""
-    return sum(value.nbytes for value in model.state_dict().values())
 
 
 def parameter_counts(model: WorldModelConfig, trained: Callable[[str], bool] = lambda _: True) -> tuple[int, int]:
@@ -206,43 +148,59 @@ def gigabytes(size: float) -> str:
 
 
 @dataclass(frozen=True)
-class ClipShape:
-    """Number of clips, their views, recorded frames, and rows and columns of a latent of one device's micro-batch."""
+class Sources:
+    """Folders of outside models (published shapes stand for a missing one), and (H, W) of pictures and of latents."""
 
-    clips: int
-    views: tuple[str, ...]
-    frames: int
+    tokenizer: Path | None
+    teacher: Path | None
+    image_size: tuple[int, int]
     grid: tuple[int, int]
 
-    def batch(self, model: WorldModelConfig, *, maps: bool = True, text: int = 0) -> Batch:
-        """An uninitialised batch of this shape, with ``text`` tokens for each clip (0: without text)."""
-        size, count = (self.clips, len(self.views)), latent_frame_count(self.frames)
+    @classmethod
+    def of(cls, tokenizer: Path | None, teacher: Path | None, image_size: tuple[int, int]) -> Sources:
+        """With the latents that a tokenizer makes of pictures of a size."""
+        with FakeTensorMode():
+            space = tokenizer_outline(tokenizer).spatial_compression
+        return cls(tokenizer, teacher, image_size, (image_size[0] // space, image_size[1] // space))
+
+    def batch(self, model: WorldModelConfig, clips: int, views: Sequence[str], frames: int, text: int = 0) -> Batch:
+        """An uninitialised batch of clips of so many recorded frames, with maps, or with ``text`` tokens for each clip."""
+        size, count = (clips, len(views)), latent_frame_count(frames)
         drawn = self.grid if model.native_size is None else (1, 1)
         return Batch(
-            (Clip("", 0, self.frames, 1),) * self.clips,
-            self.views,
+            (Clip("", 0, frames, 1),) * clips,
+            tuple(views),
             torch.empty(*size, model.latent_channels, count, *self.grid),
-            torch.empty(*size, model.map_channels, count, *drawn) if maps else None,
-            torch.zeros(self.clips, text, dtype=torch.long) if text else None,
-            torch.ones(self.clips, text, dtype=torch.bool) if text else None,
+            None if text else torch.empty(*size, model.map_channels, count, *drawn),
+            torch.zeros(clips, text, dtype=torch.long) if text else None,
+            torch.ones(clips, text, dtype=torch.bool) if text else None,
         )
+
+    def largest(
+        self, model: WorldModelConfig, trainer: TrainerConfig, clips: ClipSampling, views: Sequence[str], text: int = 0
+    ) -> Batch:
+        """The largest micro-batch: the longest clips, in all views where steps are joint, else in one."""
+        joint = clips.view_weights is None or JOINT in clips.view_weights
+        count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
+        return self.batch(model, count * trainer.batch_size, views, max(clips.lengths), text)
+
+    def video(self, batch: Batch, views: int = 1) -> Tensor:
+        """Pictures of a clip; clips are encoded one by one, and so are their views."""
+        return torch.empty(views, 3, batch.clips[0].num_frames, *self.image_size)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Memory and time of one stage on one device.
+    """Memory of one stage on one device.
 
     Attributes:
         parameters: trained ones, or those of a model that only predicts.
-        parts: bytes at the worst moment, by name; their sum is ``total``.
-        flops: of one optimiser step, prediction or clip; steps: how many of these, where known.
+        parts: bytes at the worst moment, by name.
     """
 
     title: str
     parameters: int
     parts: Mapping[str, float]
-    flops: float = 0.0
-    steps: int | None = None
 
     @property
     def total(self) -> float:
@@ -256,8 +214,23 @@ class Estimate:
         return ", ".join(f"{name} {gigabytes(size)}" for name, size in self.parts.items())
 
 
-Frozen = dict[str, tuple[int, Cost]]
-"""Bytes of models that are not trained, whole on every device, and the cost of what they compute for a micro-batch."""
+class Work(NamedTuple):
+    """What a device computes again and again: ``run``, by the step's number, returns the loss where something is trained.
+
+    Attributes:
+        models, scores: world models that are trained, the first alone averaged, and those that are not.
+        whole: other models that are not trained, whole on every device.
+    """
+
+    run: Callable[[int], Any]
+    models: Sequence[WorldModel] = ()
+    scores: Sequence[WorldModel] = ()
+    whole: Mapping[str, nn.Module] = {}
+
+
+def whole_bytes(models: Mapping[str, nn.Module]) -> dict[str, float]:
+    """Bytes of weights and buffers."""
+    return {name: sum(value.nbytes for value in one.state_dict().values()) for name, one in models.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,314 +238,217 @@ class Training:
     """One training, by its configuration alone.
 
     Attributes:
-        shape: the largest micro-batch (`largest_batch`).
-        objective, batch: what is minimised, and a micro-batch for it; both are made without values.
+        work: a step with a model of some depth, made without values.
         trained: whether a parameter gets gradients, by its name.
-        turns: steps of each kind that the training takes, and their share (distribution matching alternates).
-        models, scores: world models that are trained, the first alone averaged, and those that are not.
-        before: what encodes clips and asks the teacher, over when the model's own step begins.
-        compared: what compares pictures at the end of the forward pass, in the last turn.
+        turns: numbers of steps, one of each kind that the training takes (distribution matching alternates).
     """
 
     title: str
     trainer: TrainerConfig
-    clips: ClipSampling
     model: WorldModelConfig
-    shape: ClipShape
-    objective: Callable[[WorldModel], Any]
-    batch: Callable[[], Batch]
+    work: Callable[[WorldModel], Work]
     trained: Callable[[str], bool] = lambda _: True
-    turns: Sequence[tuple[int, float]] = ((0, 1.0),)
-    models: int = 1
-    scores: int = 0
-    before: Callable[[], Frozen] = dict
-    compared: Callable[[], Frozen] = dict
+    turns: Sequence[int] = (0,)
 
-    def turn(self, step: int, *, sharded: bool) -> Cost:
-        """Cost of the loss and the backward pass of a micro-step."""
+    def outline(self, layers: int) -> Work:
+        """The step of a model of so many layers; call it within a FakeTensorMode."""
+        network = WorldModel(self.model.model_copy(update={"num_layers": layers}))
+        for name, parameter in network.named_parameters():
+            parameter.requires_grad_(self.trained(name))
+        return self.work(network)
+
+    @cache  # noqa: B019 - a few trainings a process
+    def activations(self, *, sharded: bool) -> float:
+        """Most bytes of activations of a micro-step."""
         trainer = self.trainer.model_copy(update={"device": "cpu"})  # tensors without values follow a CPU's paths
 
-        def trace(layers: int) -> Cost:
+        def trace(step: int, layers: int) -> Held:
             with FakeTensorMode():
-                network = WorldModel(self.model.model_copy(update={"num_layers": layers}))
-                for name, parameter in network.named_parameters():
-                    parameter.requires_grad_(self.trained(name))
-                objective: Any = self.objective(network)
-                models = [value for value in vars(objective).values() if isinstance(value, nn.Module)]
-                for one in models:
-                    if isinstance(one, WorldModel):
-                        one.checkpointing = trainer.sharding.checkpointing
+                work = self.outline(layers)
+                for one in (*work.models, *work.scores):
+                    one.checkpointing = trainer.sharding.checkpointing
                     if sharded and trainer.precision == "bf16":
                         to_bfloat16(one)
-                batch = self.batch()
 
                 def loss() -> Tensor:
                     with autocast(trainer):
-                        return objective.loss(batch, torch.Generator(), step)[0]
+                        return work.run(step)
 
-                return traced(loss, [parameter for one in models for parameter in one.parameters()])
+                return traced(loss, [value for one in work.models for value in one.parameters()])
 
-        return extrapolated(trace, self.model.num_layers, (3, 4))
-
-    @cache  # noqa: B019 - a few trainings a process
-    def micro_step(self, *, sharded: bool) -> Cost:
-        """Memory of the largest micro-step, and the operations of a mean one."""
-        turns = [self.turn(step, sharded=sharded) for step, _ in self.turns]
-        for _, cost in self.compared().values():
-            # It comes last in the forward pass, and is over when the backward pass begins.
-            last, held = turns[-1], turns[-1].held + cost.activations
-            forward, peak = max(last.forward, held), max(last.peak, held)
-            turns[-1] = last._replace(forward=forward, peak=peak, flops=last.flops + cost.flops)
-        shares = [turn.repeated(share) for turn, (_, share) in zip(turns, self.turns, strict=True)]
-        cost = reduce(Cost.then, [*(cost for _, cost in self.before().values()), *shares])
-        lengths = [latent_frame_count(n) / latent_frame_count(self.shape.frames) for n in self.clips.lengths]
-        linear, square = (sum(n**power for n in lengths) / len(lengths) for power in (1, 2))
-        return cost._replace(flops=linear * cost.flops, attention_flops=square * cost.attention_flops)
+        return max(max(extrapolated(partial(trace, step), self.model.num_layers)) for step in self.turns)
 
     def estimate(self, devices: int) -> Estimate:
-        """Memory and operations on each of so many devices that share the training."""
+        """Memory on each of so many devices that share the training."""
         trainer, shards = self.trainer, min(self.trainer.sharding.shards or devices, devices)
         micro_steps = trainer.accumulation
         if trainer.global_batch is not None:
             micro_steps = -(-trainer.global_batch // (trainer.batch_size * devices))
-        step = self.micro_step(sharded=shards > 1)
+        with FakeTensorMode():
+            work = self.outline(1)
         trained, block = parameter_counts(self.model, self.trained)
-        own, part = 4 * self.models * trained / shards, 4 * trained / shards
+        own, part = 4 * len(work.models) * trained / shards, 4 * trained / shards
         summed = micro_steps == 1 or trainer.sharding.reduce_every_micro_step
-        gradients = part if summed else 4 * trained
-        alone = shards == micro_steps == 1 and self.model.num_layers <= _SMALL
         parts = {
             "weights": own,
             "moments": 2 * own,
             "average": part,
-            **{name: size for name, (size, _) in (self.before() | self.compared()).items()},
-            "frozen scores": self.scores * part,
+            **whole_bytes(work.whole),
+            "frozen scores": len(work.scores) * part,
             # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
             "gathered": 0 if shards == 1 else block * (2 * 2 + 2 + 4),
-            "gradients": gradients,
-            # With one micro-step on one device, gradients come as activations go.
-            "activations": step.peak - gradients if alone else step.activations,
+            "gradients": part if summed else 4 * trained,
+            "activations": self.activations(sharded=shards > 1),
         }
-        parts = {name: size for name, size in parts.items() if size}
-        return Estimate(self.title, self.models * trained, parts, micro_steps * step.all_flops, trainer.steps)
+        return Estimate(self.title, len(work.models) * trained, {name: size for name, size in parts.items() if size})
 
     def fitting_setting(self, devices: int, memory: float) -> str:
-        """The nearest setting with which this training would fit devices of ``memory`` bytes, in words."""
+        """The nearest setting with which this training would fit devices of ``memory`` bytes; empty where it does."""
+        if self.estimate(devices).fits(memory):
+            return ""
         changes = {"checkpointing": "block", "reduce_every_micro_step": True, "shards": None}
         sharding = self.trainer.sharding.model_copy(update=changes)
         block = replace(self, trainer=self.trainer.model_copy(update={"sharding": sharding}))
         for count in (devices * 2**power for power in range(11)):
-            need = block.estimate(count)
-            if need.fits(memory):
-                wider = "" if count == devices else f" over {count} devices"
-                summed = "" if count == 1 else ", reduce_every_micro_step: true"
-                return f"trainer.sharding.checkpointing: block{summed}{wider} ({gigabytes(need.total)} GB a device)"
+            if (need := block.estimate(count)).fits(memory):
+                several = "" if count == 1 else f", reduce_every_micro_step: true, on {count} devices"
+                return f"trainer.sharding.checkpointing: block{several} ({gigabytes(need.total)} GB a device)"
         return "shorter clips, devices of more memory, or a smaller model"
 
 
-@dataclass(frozen=True)
-class ClipFrames:
-    """The pictures behind the latents of clips, and the models that read or write them.
+class _Similarities(ClipSimilarities):
+    """Similarity matrices of a relational teacher that looks at ``video``."""
 
-    Attributes:
-        tokenizer, teacher: their folders; published shapes stand for a missing one.
-        grid, image_size: rows and columns of latents and of pictures.
-    """
-
-    tokenizer: Path | None
-    teacher: Path | None
-    grid: tuple[int, int]
-    image_size: tuple[int, int]
-
-    @classmethod
-    def of(cls, tokenizer: Path | None, teacher: Path | None, image_size: tuple[int, int]) -> ClipFrames:
-        """The latents that a tokenizer makes of pictures of a size."""
-        with FakeTensorMode():
-            space = tokenizer_outline(tokenizer).spatial_compression
-        return cls(tokenizer, teacher, (image_size[0] // space, image_size[1] // space), image_size)
-
-
-@cache
-def encoding(source: ClipFrames, shape: ClipShape) -> tuple[int, Cost]:
-    """Bytes of the tokenizer, and the cost of encoding clips and views one by one, as `FrameSource` does."""
-    with FakeTensorMode(), torch.no_grad():
-        codec = tokenizer_outline(source.tokenizer)
-
-        def trace(latent_frames: int) -> Cost:
-            video = torch.empty(1, 3, 4 * latent_frames - 3, *source.image_size)
-            return traced(lambda: codec.encode(video))
-
-        cost = extrapolated(trace, latent_frame_count(shape.frames), (3, 5))
-        return weight_bytes(codec), cost.repeated(shape.clips * len(shape.views))
-
-
-@cache
-def _teaching(source: ClipFrames, shape: ClipShape) -> tuple[int, Cost]:
-    """Bytes of the relational teacher, and its cost for the clips of a micro-batch, one by one."""
-    with FakeTensorMode():
-        network, features = teacher_outline(source.teacher)
-        video = torch.empty(len(shape.views), 3, shape.frames, *source.image_size)
-        return weight_bytes(network), traced(lambda: features(video)).repeated(shape.clips)
-
-
-@cache
-def _comparing(source: ClipFrames, shape: ClipShape, latent_frames: int, bfloat16: bool) -> tuple[int, Cost]:
-    """Bytes of the tokenizer and LPIPS, and the cost of the perceptual term, its gradients too, view by view."""
-    with FakeTensorMode():
-        codec, network = tokenizer_outline(source.tokenizer), LPIPS().requires_grad_(False)
-        if bfloat16:
-            to_bfloat16(codec)
-        distance = PerceptualLoss(codec, network, latent_frames)
-
-        def trace(frames: int) -> Cost:
-            size = (1, 1, codec.latent_channels, frames, *shape.grid)
-            predicted, target = nn.Parameter(torch.empty(size)), torch.empty(size)
-            return traced(lambda: distance(predicted, target), [predicted])
-
-        cost = extrapolated(trace, latent_frame_count(shape.frames), (latent_frames + 1, latent_frames + 3))
-        return weight_bytes(codec) + weight_bytes(network), cost.repeated(shape.clips * len(shape.views))
-
-
-class _OutlinedSimilarities(ClipSimilarities):
-    """A teacher that has answered already."""
-
-    def __init__(self, config: RelationalConfig) -> None:
-        self.config = config
+    def __init__(self, config: RelationalConfig, features: Callable[[Tensor], Tensor], video: Tensor) -> None:
+        self.config, self.features, self.video = config, features, video
 
     def similarities(
         self, clips: Sequence[Clip], views: Sequence[str], grid: tuple[int, int, int], frames: Tensor | None = None
     ) -> SimilarityMatrices:
+        self.features(self.video)
         shape = bins, rows, columns = common_shape(self.config, grid)
-        clip_views, cells = (len(clips), len(views)), rows * columns
-        intra = torch.empty(*clip_views, bins - 1, cells, cells)
-        return SimilarityMatrices(shape, intra, torch.empty(len(clips), len(views) - 1, bins, cells, cells))
+        count, cells = len(clips), rows * columns
+        cross = torch.empty(count, len(views) - 1, bins, cells, cells)
+        return SimilarityMatrices(shape, torch.empty(count, len(views), bins - 1, cells, cells), cross)
 
 
-def largest_batch(
-    trainer: TrainerConfig, clips: ClipSampling, views: Sequence[str], grid: tuple[int, int]
-) -> ClipShape:
-    """The longest clips, in all views where steps are joint, else in one."""
-    joint = clips.view_weights is None or JOINT in clips.view_weights
-    count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
-    return ClipShape(count * trainer.batch_size, tuple(views), max(clips.lengths), grid)
-
-
-def trainings(
-    config: Stage1Config | Stage2Config | DistillConfig, model: WorldModelConfig, source: ClipFrames
-) -> list[Training]:
+def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> list[Training]:
     """The trainings of one step, in their order."""
     if isinstance(config, DistillConfig):
-        return _distillation(config, model.model_copy(update={"towers": "generation"}), source)
+        model = model.model_copy(update={"towers": "generation"})
+        return [
+            Training(
+                f"distill: {part.replace('_', ' ')}", getattr(config, part).trainer, model,
+                partial(_distillation, part, config, source),
+                turns=(0, CYCLE - 1) if part == "distribution_matching" else (0,),
+            )
+            for part in ("teacher_forcing", "trajectory_regression", "distribution_matching")
+        ]  # fmt: skip
     relational = config.relational if isinstance(config, Stage2Config) else None
     text = config.text.max_length if isinstance(config, Stage1Config) else 0
-    shape = largest_batch(config.trainer, config.clips, model.views, source.grid)
 
-    def objective(network: WorldModel) -> FlowMatchingObjective:
-        term = None
+    def work(network: WorldModel) -> Work:
+        batch, term = source.largest(model, config.trainer, config.clips, model.views, text), None
+        tokenizer, whole = tokenizer_outline(source.tokenizer), dict[str, nn.Module]()
+        if isinstance(config.input, FrameInput):
+            whole["tokenizer"] = tokenizer
         if relational is not None:
-            term = RelationalTerm(relational, _OutlinedSimilarities(relational), network.config.num_layers)
+            whole["teacher"], features = teacher_outline(source.teacher)
+            seen = _Similarities(relational, features, source.video(batch, len(batch.views)))
+            term = RelationalTerm(relational, seen, network.config.num_layers)
             term.layer = max(1, network.config.num_layers // 2)  # it makes no difference which: all are held
-        return FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
+        objective = FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
 
-    def before() -> Frozen:
-        frozen = {"tokenizer": encoding(source, shape)} if isinstance(config.input, FrameInput) else {}
-        return frozen | ({"teacher": _teaching(source, shape)} if relational is not None else {})
+        def run(step: int) -> Tensor:
+            if "tokenizer" in whole:
+                tokenizer.encode(source.video(batch))
+            return objective.loss(batch, torch.Generator(), step)[0]
+
+        return Work(run, (network,), whole=whole)
 
     title = {"base": "base", "stage1": "stage I"}[config.kind] if isinstance(config, Stage1Config) else "stage II"
-    return [
-        Training(
-            title, config.trainer, config.clips, model, shape, objective,
-            lambda: shape.batch(model, maps=not text, text=text),
-            trained=is_trained if text else lambda _: True, before=before,
-        )
-    ]  # fmt: skip
+    return [Training(title, config.trainer, model, work, is_trained if text else lambda _: True)]
 
 
-def _distillation(config: DistillConfig, model: WorldModelConfig, source: ClipFrames) -> list[Training]:
-    first, regression, matching = config.teacher_forcing, config.trajectory_regression, config.distribution_matching
-    mixed = config.clips.model_copy(
-        update={"view_weights": first.view_weights, "single_view_factor": first.single_view_factor}
-    )
-    shapes = [
-        largest_batch(one.trainer, clips, config.views, source.grid)
-        for one, clips in ((first, mixed), (regression, config.clips), (matching, config.clips))
-    ]
+def _distillation(part: str, config: DistillConfig, source: Sources, network: WorldModel) -> Work:
+    """A step of one of the three trainings of Stage III."""
+    first, model = config.teacher_forcing, network.config
+    mixed = {"view_weights": first.view_weights, "single_view_factor": first.single_view_factor}
+    clips = config.clips.model_copy(update=mixed if part == "teacher_forcing" else {})
+    batch = source.largest(model, getattr(config, part).trainer, clips, config.views)
+    tokenizer, whole = tokenizer_outline(source.tokenizer), dict[str, nn.Module]()
+    if isinstance(config.input, FrameInput):
+        whole["encoder"] = tokenizer  # it stays there, though the later steps use the latents of the trajectories
+    models, scores, distance = [network], list[WorldModel](), None
+    if part == "teacher_forcing":
+        scores = [WorldModel(model)] if first.teacher_share else []
+        objective: Any = TeacherForcingObjective(network, config, *scores)
+    else:
+        shown, views, channels, frames, *grid = batch.latents.shape
+        nodes = torch.empty(shown, config.spec.steps + 1, views, channels, frames - 1, *grid)
+        mask = torch.ones(shown, views, frames, *grid)
+        batch = TrajectoryBatch(**vars(batch), nodes=nodes, history=batch.latents, mask=mask)
+        if config.lpips_weights is not None:
+            decoder, lpips = tokenizer_outline(source.tokenizer), LPIPS().requires_grad_(False)
+            if config.perceptual.bfloat16:
+                to_bfloat16(decoder)
+            whole |= {"tokenizer": decoder, "lpips": lpips}
+            compared = 1 + config.perceptual.latent_frames
+            perceptual = PerceptualLoss(decoder, lpips, config.perceptual.latent_frames)
+            # One view after the other, and what comes before the compared frames without gradients: neither adds up.
+            distance = lambda a, b: perceptual(a[:1, :1, :, -compared:], b[:1, :1, :, -compared:])  # noqa: E731
+        if part == "trajectory_regression":
+            objective = TrajectoryObjective(network, config, distance)
+        else:
+            fake, real = WorldModel(model), WorldModel(model)
+            models, scores = [network, fake], [real]
+            objective = DistributionMatchingObjective(network, real, fake, config, distance)
 
-    def trajectory_batch(shape: ClipShape) -> TrajectoryBatch:
-        plain = shape.batch(model)
-        clips, views, channels, frames, *grid = plain.latents.shape
-        nodes = torch.empty(clips, config.spec.steps + 1, views, channels, frames - 1, *grid)
-        mask = torch.ones(clips, views, frames, *grid)
-        return TrajectoryBatch(**vars(plain), nodes=nodes, history=plain.latents, mask=mask)
+    def run(step: int) -> Tensor:
+        if "encoder" in whole and part == "teacher_forcing":
+            tokenizer.encode(source.video(batch))
+        return objective.loss(batch, torch.Generator(), step)[0]
 
-    def encoder(shape: ClipShape, used: bool) -> Frozen:
-        if not isinstance(config.input, FrameInput):
-            return {}
-        size, cost = encoding(source, shape)
-        return {"encoder": (size, cost if used else Cost())}  # trajectories keep the latents of their clips
-
-    def compared(shape: ClipShape) -> Frozen:
-        if config.lpips_weights is None:
-            return {}
-        return {"tokenizer": _comparing(source, shape, config.perceptual.latent_frames, config.perceptual.bfloat16)}
-
-    asked = first.teacher_share > 0
-    return [
-        Training(
-            "distill: teacher forcing", first.trainer, mixed, model, shapes[0],
-            lambda network: TeacherForcingObjective(network, config, WorldModel(network.config) if asked else None),
-            lambda: shapes[0].batch(model), scores=int(asked), before=lambda: encoder(shapes[0], used=True),
-        ),
-        Training(
-            "distill: trajectory regression", regression.trainer, config.clips, model, shapes[1],
-            lambda network: TrajectoryObjective(network, config, None), lambda: trajectory_batch(shapes[1]),
-            before=lambda: encoder(shapes[1], used=False), compared=lambda: compared(shapes[1]),
-        ),
-        Training(
-            "distill: distribution matching", matching.trainer, config.clips, model, shapes[2],
-            lambda network: DistributionMatchingObjective(
-                network, WorldModel(network.config), WorldModel(network.config), config, None
-            ),
-            lambda: trajectory_batch(shapes[2]), turns=((0, 1 - 1 / CYCLE), (CYCLE - 1, 1 / CYCLE)), models=2, scores=1,
-            before=lambda: encoder(shapes[2], used=False), compared=lambda: compared(shapes[2]),
-        ),
-    ]  # fmt: skip
+    return Work(run, models, scores, whole)
 
 
-def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: ClipFrames) -> Estimate:
+def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sources) -> Estimate:
     """A shard of the teacher's trajectories, whose clips are made together; the teacher is whole on every device."""
-    model, settings = model.model_copy(update={"towers": "generation"}), config.trajectory_regression
-    clips = min(settings.trajectories.clips, settings.trajectories.clips_per_shard)
-    shape = ClipShape(clips, tuple(config.views), max(config.clips.lengths), source.grid)
-    trainer = settings.trainer.model_copy(update={"device": "cpu"})
+    model, regression = model.model_copy(update={"towers": "generation"}), config.trajectory_regression
+    clips = min(regression.trajectories.clips, regression.trajectories.clips_per_shard)
+    trainer = regression.trainer.model_copy(update={"device": "cpu"})
+    with FakeTensorMode() as fake:
+        batch = source.batch(model, clips, config.views, max(config.clips.lengths))
+        encoder = {"encoder": tokenizer_outline(source.tokenizer)} if isinstance(config.input, FrameInput) else {}
 
-    def trace(layers: int) -> Cost:
-        with FakeTensorMode(), autocast(trainer):
+    def trace(layers: int) -> Held:
+        with fake, torch.no_grad(), autocast(trainer):
             teacher = WorldModel(model.model_copy(update={"num_layers": layers})).requires_grad_(False)
-            batch = shape.batch(model)
-            return traced(
-                lambda: teacher_trajectories(
+
+            def run() -> None:
+                for tokenizer in encoder.values():
+                    tokenizer.encode(source.video(batch))
+                teacher_trajectories(
                     teacher, batch.latents, maps_of(batch), torch.empty_like(batch.latents), views=batch.views,
                     spec=config.spec, substeps=(1,) * config.spec.steps,
-                )
-            )  # fmt: skip
+                )  # fmt: skip
 
-    cost = extrapolated(trace, model.num_layers, (2, 3))
-    # Each block takes all sub-steps, and one pass more that writes it into the cache.
-    cost = cost.repeated((1 + sum(settings.trajectories.substeps)) / (1 + config.spec.steps))
-    parameters, encoder = parameter_counts(model)[0], 0
-    if isinstance(config.input, FrameInput):
-        encoder, before = encoding(source, shape)
-        cost = before.then(cost)
-    parts = {"weights": 4 * parameters + encoder, "activations": cost.activations}
-    steps = -(-settings.trajectories.clips // clips)
-    return Estimate(f"distill: trajectories (a shard of {clips} clips)", parameters, parts, cost.all_flops, steps)
+            return traced(run)
+
+    held, count = extrapolated(trace, model.num_layers), parameter_counts(model)[0]
+    parts = {"weights": 4 * count, **whole_bytes(encoder), "activations": held.forward}
+    return Estimate(f"distill: trajectories (a shard of {clips} clips)", count, parts)
 
 
-def device_memory(device: str) -> float | None:
-    """Bytes of a card; None for a processor, whose memory the system shares out."""
-    on_gpu = torch.device(device).type == "cuda"
-    return float(torch.cuda.get_device_properties(device).total_memory) if on_gpu else None
+def stage_rows(
+    config: AnyStage, model: WorldModelConfig, source: Sources, devices: int, memory: float
+) -> Iterator[tuple[Estimate, str]]:
+    """What the trainings of one step take, and the setting with which each would fit; empty where it does."""
+    for one in trainings(config, model, source):
+        if isinstance(config, DistillConfig) and one.title.endswith("regression"):
+            shard = trajectory_shard(config, model, source)
+            yield shard, "" if shard.fits(memory) else "fewer clips_per_shard"
+        yield one.estimate(devices), one.fitting_setting(devices, memory)
 
 
 def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
@@ -581,10 +457,10 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
     Raises:
         ConfigError: its parts in GB, and the setting that would fit.
     """
-    if not isinstance(config, (Stage1Config, Stage2Config, DistillConfig)):
+    if not isinstance(config, AnyStage):
         return
     device = (config.teacher_forcing if isinstance(config, DistillConfig) else config).trainer.device
-    memory, source = device_memory(device), _source(config, inputs)
+    memory, source = device_memory(device), _sources(config, inputs)
     start = inputs.get({Stage1Config: "base", Stage2Config: "stage1", DistillConfig: "stage2"}[type(config)])
     if memory is None or source is None or (start is None and not isinstance(config, Stage1Config)):
         return  # the training itself names the input that is missing
@@ -593,13 +469,7 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
         model = read_checkpoint_info(Path(start)).config
     if isinstance(config, Stage2Config):
         model = stage2_model_config(config, model)
-    devices = int(os.environ.get("WORLD_SIZE", "1"))
-    needs = [(one.estimate(devices), one) for one in trainings(config, model, source)]
-    rows = [(need, "" if need.fits(memory) else one.fitting_setting(devices, memory)) for need, one in needs]
-    if isinstance(config, DistillConfig):
-        shard = trajectory_shard(config, model, source)
-        rows.append((shard, "" if shard.fits(memory) else "fewer clips_per_shard"))
-    for need, setting in rows:
+    for need, setting in stage_rows(config, model, source, int(os.environ.get("WORLD_SIZE", "1")), memory):
         if setting:
             raise ConfigError(
                 "This training does not fit the device's memory.",
@@ -610,11 +480,78 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
             )
 
 
-def _source(config: Stage1Config | Stage2Config | DistillConfig, inputs: Mapping[str, Path]) -> ClipFrames | None:
+def device_memory(device: str) -> float | None:
+    """Bytes of a card; None for a processor, whose memory the system shares out."""
+    on_gpu = torch.device(device).type == "cuda"
+    return float(torch.cuda.get_device_properties(device).total_memory) if on_gpu else None
+
+
+def _sources(config: AnyStage, inputs: Mapping[str, Path]) -> Sources | None:
     tokenizer, teacher = (Path(inputs[name]) if name in inputs else None for name in ("tokenizer", "teacher"))
     if isinstance(config.input, FrameInput):
-        return None if tokenizer is None else ClipFrames.of(tokenizer, teacher, config.input.image_size)
+        return None if tokenizer is None else Sources.of(tokenizer, teacher, config.input.image_size)
     if "latents" not in inputs:
         return None
     latents = LatentStore.open(Path(inputs["latents"]))
-    return ClipFrames(tokenizer, teacher, latents.latent_shape[1:], latents.image_size)
+    return Sources(tokenizer, teacher, latents.image_size, latents.latent_shape[1:])
+
+
+class SizeSheet(StrictModel):
+    """The trainings of one preset on so many devices of one kind; ``project``: folder that the preset's paths begin in."""
+
+    config: PipelineConfig
+    project: Path
+    devices: int = Field(default=8, ge=1)
+    memory: ByteSize
+
+    @property
+    def model(self) -> WorldModelConfig:
+        """Shape of Stage I's model: that of the base checkpoint, of the backbone to import, or the configured one."""
+        base = self.folder("base")
+        if base is not None and (base / DESCRIPTION).is_file():
+            return read_checkpoint_info(base).config
+        if self.config.import_backbone is not None:
+            return cosmos3_nano_config(fps=self.config.import_backbone.fps, **self.config.import_backbone.changes)
+        if self.config.train_stage1 is None:
+            raise ConfigError(
+                "The size of the model is not known.",
+                where="models.base",
+                expected="a base checkpoint, import_backbone, or train_stage1.model",
+            )
+        return self.config.train_stage1.model
+
+    def folder(self, name: str) -> Path | None:
+        """Folder of outside weights, if it is here."""
+        path = getattr(self.config.models, name)
+        folder = None if path is None else project_path(self.project, path)
+        return folder if folder is not None and folder.is_dir() else None
+
+    def source(self, stage: AnyStage) -> Sources:
+        """The pictures and latents that a stage reads: its own frames, or those of the cache."""
+        reading = stage.input if isinstance(stage.input, FrameInput) else self.config.encode_latents
+        return Sources.of(self.folder("tokenizer"), self.folder("teacher"), reading.image_size)
+
+    def rows(self) -> Iterator[tuple[Estimate, str]]:
+        """What every training takes, in the order of a run, and the setting with which it would fit."""
+        generation = self.model.model_copy(update={"towers": "generation"})
+        stages = (
+            (self.config.train_stage1, self.model),
+            (self.config.train_stage2, generation),
+            (self.config.distill, generation),
+        )
+        for stage, model in stages:
+            if stage is not None:
+                yield from stage_rows(stage, model, self.source(stage), self.devices, self.memory)
+
+    def as_text(self, rows: Iterable[tuple[Estimate, str]]) -> str:
+        """The sheet as a Markdown table; the last column names the setting with which a stage would fit."""
+        lines = [
+            f"{self.devices} devices of {gigabytes(self.memory)} GB ({USABLE:.0%} of it usable)\n",
+            "| stage | parameters | GB a device | of that | fits |",
+            "|---|---|---|---|---|",
+        ]
+        for row, setting in rows:
+            count = f"{row.parameters / 1e9:.2f} G" if row.parameters >= 1e9 else f"{row.parameters / 1e6:.1f} M"
+            fits = f"no: set {setting}" if setting else "yes"
+            lines.append(f"| {row.title} | {count} | {gigabytes(row.total)} | {row.describe_parts()} | {fits} |")
+        return "\n".join(lines)
