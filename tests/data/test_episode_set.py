@@ -14,6 +14,7 @@ import pytest
 from worldline_core.data.episodes.episode import ARRAYS, EpisodeDescription
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.episode_set_writer import part_name
 from worldline_core.data.episodes.sidecar import Sidecar
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.frames import packed_images, unpacked_images
@@ -86,6 +87,14 @@ def test_a_killed_writer_continues_to_the_same_bytes(tmp_path: Path, sample: Mak
     assert files_of(tmp_path / "killed") == files_of(tmp_path / "undisturbed")
     with pytest.raises(DataError, match="already holds a finished EpisodeSet"):
         EpisodeSetWriter(tmp_path / "killed")
+
+
+def test_the_work_of_a_container_with_the_same_process_ids_is_left_alone(tmp_path: Path, sample: Make) -> None:
+    writer = EpisodeSetWriter(tmp_path / "set", video_crf=10)
+    others = tmp_path / "set/run/episodes/parts" / f".{part_name('episode-000')}.{os.getpid()}"
+    others.mkdir()
+    writer.add(*sample(0))
+    assert others.is_dir()
 
 
 def test_segments_cut_every_array(tmp_path: Path, sample: Make) -> None:

@@ -19,8 +19,10 @@ msgpack = pytest.importorskip("msgpack")
 from websockets.sync.server import ServerConnection, serve
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
+from worldline_core.http_exchange import IncompleteResponseError, exchange
 from worldline_core.policies.array_messages import pack, unpack
 from worldline_core.policies.openpi import OpenpiPolicy
+from worldline_core.serving.client import SimulatorClient
 
 
 def encode(value: Any) -> Any:
@@ -157,6 +159,19 @@ def test_a_deadline_is_for_the_whole_exchange() -> None:
         OpenpiPolicy(url)
 
 
+@pytest.mark.parametrize("client", ["policy", "simulator", "judge"])
+def test_a_deadline_begins_before_names_are_resolved(client: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: stop.wait(10))
+    stop, begin = threading.Event(), time.monotonic()
+    with pytest.raises((UnavailableError, IncompleteResponseError), match=r"within 0\.3 s"):
+        if client == "judge":
+            exchange("http://judge.example/v1", None, headers={}, timeout_s=0.3, max_bytes=100)
+        else:
+            (OpenpiPolicy if client == "policy" else SimulatorClient)("ws://far.example:1", deadline_s=0.3)
+    assert time.monotonic() - begin < 2
+    stop.set()
+
+
 @pytest.mark.parametrize(
     ("key", "sent"), [("abc\r", "abc"), ("abc\r\nX-Evil: 1", None), ("\0", None), ("schl\u00fcssel", None)]
 )
@@ -216,7 +231,8 @@ def _described(dtype: object = "<f4", shape: object = (2,), data: object = b"\0"
         msgpack.packb({b"__npgeneric__": True, b"dtype": "<f8", b"data": None}),
         _described("(1f4,f4"), _described("(,)f4"), _described("01f4,f4"), _described("(99999999,)f4"), _described("g"),
         b"", b"\xc1", b"\xdf\xff\xff\xff\xff", b"\x91" * 3000, b"\x93\x01", b"\x01\x02", msgpack.packb(msgpack.ExtType(4, b"x")),
-        msgpack.packb([[]] * 40_000 + [{}] * 30_000), b"\xdc\xff\xff" + b"\xdc\xff\xff" * 9, b"\x81\xa1a\xa2\xff\xfe",
+        msgpack.packb([[]] * 65_537), msgpack.packb([[[]] * 60_000] * 18), msgpack.packb([["text"] * 60_000] * 18),
+        msgpack.packb([{str(n): 1 for n in range(60_000)}] * 18), b"\xdc\xff\xff" + b"\xdc\xff\xff" * 9, b"\x81\xa1a\xa2\xff\xfe",
         struct.pack(">BI", 0xC6, 1 << 31),
     ],
 )  # fmt: skip

@@ -20,7 +20,7 @@ from tasks.execution.artifact_task import find_task
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.store import store as store_module
-from worldline_core.store.artifact_files import digest_folder, digest_value
+from worldline_core.store.artifact_files import digest_file, digest_folder, digest_value
 from worldline_core.store.atomic import atomic_path, write_arrays_atomic, write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import ArtifactStore, folder_lock
 
@@ -328,6 +328,24 @@ def test_missing_rights_of_a_store_end_in_one_message_but_those_of_a_source_do_n
         store.run("count", 1, lambda _config, _inputs, output: refuse(output / "0.txt"), CountConfig(), {})
     with pytest.raises(PermissionError):
         store.run("count", 1, lambda *_: refuse(tmp_path / "recording.mp4"), CountConfig(), {})
+
+
+def test_digests_of_weights_that_another_process_notes_meanwhile_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    configs = {name: JudgedConfig(weights=tmp_path / name) for name in ("one", "two")}
+    for name in configs:
+        (tmp_path / name).write_text(name)
+    store = ArtifactStore(tmp_path / "store")
+
+    def digest(path: Path) -> str:
+        if path.name == "one":
+            store.key("count", 1, configs["two"], {})
+        return digest_file(path)
+
+    monkeypatch.setattr(store_module, "digest_file", digest)
+    store.key("count", 1, configs["one"], {})
+    assert len(json.loads((tmp_path / "store/.weights.json").read_text())) == 2
 
 
 def test_a_read_only_store_serves_finished_artifacts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,8 +26,10 @@ _SCALARS = {"b": bool, "i": int, "u": int, "f": int | float, "S": bytes, "U": st
 """Types that a NumPy scalar is packed as; a number in the place of a text would be taken for its length."""
 MAX_MESSAGE_BYTES = 64 << 20
 MAX_AXES = 16
-MAX_ITEMS = 65_536
-"""Entries of one map or list, and maps and lists of one message: large numbers of values belong into arrays."""
+MAX_ENTRIES = 65_536
+"""Entries of one map or list."""
+MAX_VALUES = 1 << 20
+"""Entries of all maps and lists of a message: large numbers of values belong into arrays."""
 
 
 def _msgpack() -> ModuleType:
@@ -75,13 +77,13 @@ def unpack(content: bytes, where: object) -> Any:
     Raises:
         DataError: it is no message, or holds an array that does not fit its own description.
     """
-    containers = 0
+    values = 0
 
     def counted(found: Any) -> Any:
-        nonlocal containers
-        containers += 1
-        if containers > MAX_ITEMS:
-            raise ValueError(f"more than {MAX_ITEMS} maps and lists")
+        nonlocal values
+        values += 1 + len(found)
+        if values > MAX_VALUES:
+            raise ValueError(f"more than {MAX_VALUES:,} values in maps and lists")
         return _array(found) if isinstance(found, dict) else found
 
     try:
@@ -89,8 +91,8 @@ def unpack(content: bytes, where: object) -> Any:
             content,
             object_hook=counted,
             list_hook=counted,
-            max_array_len=MAX_ITEMS,
-            max_map_len=MAX_ITEMS,
+            max_array_len=MAX_ENTRIES,
+            max_map_len=MAX_ENTRIES,
             max_ext_len=0,
         )
     # msgpack's own errors are ValueErrors; a text that is no UTF-8 and an unknown dtype are ValueError and TypeError.

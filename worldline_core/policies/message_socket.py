@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import logging
+import socket
+import time
 from collections.abc import Mapping
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
+from worldline_core.http_exchange import within
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES, pack, unpack
 from worldline_core.untrusted_text import without_secret
+
+CLOSE_S = 1.5
+_silent = logging.getLogger(f"{__name__}.protocol")
+_silent.setLevel(logging.CRITICAL + 1)  # websockets logs a traceback of what it raises as well
 
 
 class MessageSocket:
@@ -19,7 +28,8 @@ class MessageSocket:
     Args:
         url: ``ws://host:port/path`` or ``wss://...``; reached directly, without a proxy.
         headers: sent with the connection request; the last word of each is a secret, hidden where the server repeats it.
-        deadline_s: for connecting, and for each reply where :meth:`request` names no other.
+        deadline_s: for connecting, name resolution included, and for each request with its reply where :meth:`request`
+            names no other.
         max_bytes: of one reply.
 
     Raises:
@@ -35,7 +45,7 @@ class MessageSocket:
         deadline_s: float = 30.0,
         max_bytes: int = MAX_MESSAGE_BYTES,
     ) -> None:
-        from websockets.exceptions import InvalidHandshake, InvalidStatus, InvalidURI
+        from websockets.exceptions import InvalidStatus, WebSocketException
         from websockets.sync.client import connect
 
         self.url, self.deadline_s, self.max_bytes = url, deadline_s, max_bytes
@@ -47,9 +57,14 @@ class MessageSocket:
             )  # fmt: skip
         self._secrets = [value.split()[-1] for value in given.values() if value]
         try:
-            self._connection = connect(
-                url, additional_headers=given, compression=None, max_size=max_bytes, open_timeout=deadline_s,
-                close_timeout=1.0, proxy=None,
+            # The library's own deadline begins when the name is resolved.
+            self._connection = within(
+                deadline_s,
+                lambda: connect(
+                    url, additional_headers=given, compression=None, max_size=max_bytes, open_timeout=deadline_s,
+                    close_timeout=1.0, proxy=None, logger=_silent,
+                ),
+                discard=lambda late: late.close(),
             )  # fmt: skip
         except InvalidStatus as error:
             status = error.response.status_code
@@ -57,15 +72,11 @@ class MessageSocket:
                 "The server refuses the connection", where=url, expected="status 101", got=status,
                 next_step="give its API key or token" if status in (401, 403) else None,
             ) from error  # fmt: skip
-        except (
-            OSError,
-            InvalidHandshake,
-            InvalidURI,
-            EOFError,
-            ValueError,
-        ) as error:  # ValueError: a malformed address
+        # ValueError: a malformed address; AssertionError: websockets', where a server speaks first and hangs up.
+        except (OSError, WebSocketException, EOFError, ValueError, AssertionError) as error:
             raise UnavailableError(
-                "No server answers", where=url, got=f"{type(error).__name__}: {error}",
+                "No server answers", where=url,
+                got=f"{type(error).__name__}: {str(error) or f'no connection within {deadline_s:g} s'}",
                 next_step="start it, or correct the address (ws://HOST:PORT)",
             ) from error  # fmt: skip
 
@@ -78,26 +89,27 @@ class MessageSocket:
         """
         from websockets.exceptions import ConnectionClosed
 
-        content = pack(message)
-        try:
-            self._connection.send(content)
-        except ConnectionClosed as error:
-            raise self._closed(error) from error
-        return self.receive(deadline_s=deadline_s)
-
-    def receive(self, *, deadline_s: float | None = None) -> dict[str, Any]:
-        """The next message of the server; raises as :meth:`request`."""
-        from websockets.exceptions import ConnectionClosed
-
+        content, begin = pack(message), time.monotonic()
         deadline = self.deadline_s if deadline_s is None else deadline_s
         try:
-            reply = self._connection.recv(timeout=deadline)
+            within(deadline, lambda: self._connection.send(content))
         except TimeoutError as error:
-            self.close()
-            raise UnavailableError(
-                "The server did not answer in time", where=self.url, expected=f"a reply within {deadline:g} s",
-                next_step="connect again; allow more time where the server needs it",
-            ) from error  # fmt: skip
+            raise self._late(deadline) from error
+        except ConnectionClosed as error:
+            raise self._closed(error) from error
+        return self._receive(deadline, begin)
+
+    def receive(self) -> dict[str, Any]:
+        """The next message of the server; raises as :meth:`request`."""
+        return self._receive(self.deadline_s, time.monotonic())
+
+    def _receive(self, deadline: float, begin: float) -> dict[str, Any]:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            reply = self._connection.recv(timeout=max(0.0, begin + deadline - time.monotonic()))
+        except TimeoutError as error:
+            raise self._late(deadline) from error
         except ConnectionClosed as error:
             if error.sent is not None and error.sent.code == 1009 and not error.rcvd_then_sent:
                 raise DataError(
@@ -118,14 +130,24 @@ class MessageSocket:
             raise
         return found
 
+    def _late(self, deadline: float) -> UnavailableError:
+        self.close()
+        return UnavailableError(
+            "The server did not answer in time", where=self.url, expected=f"a reply within {deadline:g} s",
+            next_step="connect again; allow more time where the server needs it",
+        )  # fmt: skip
+
     def _closed(self, error: Exception) -> UnavailableError:
         return UnavailableError(
             "The server closed the connection", where=self.url, got=str(error), next_step="connect again"
         )
 
     def close(self) -> None:
-        """End the connection."""
-        self._connection.close()
+        """End the connection; that of a server which takes nothing any more is cut."""
+        with suppress(TimeoutError):
+            within(CLOSE_S, self._connection.close)
+        with suppress(OSError):
+            self._connection.socket.shutdown(socket.SHUT_RDWR)
 
     def __enter__(self) -> Self:
         return self

@@ -3,14 +3,65 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
 from worldline_core.policies.message_socket import MessageSocket
 from worldline_core.serving.serve_config import PROTOCOL
+
+
+def _finite(kind: str, axes: int, values: np.ndarray) -> np.ndarray:
+    if values.dtype.kind != kind or values.ndim != axes or not values.size or not np.isfinite(values).all():
+        raise ValueError(f"{axes} axes of finite numbers wanted, got {values.dtype} {values.shape}")
+    return values
+
+
+_Rows = Annotated[np.ndarray, AfterValidator(partial(_finite, "f", 3))]
+_Poses = Annotated[np.ndarray, AfterValidator(partial(_finite, "f", 4))]
+_Pictures = Annotated[np.ndarray, AfterValidator(partial(_finite, "u", 4))]
+_Videos = Annotated[np.ndarray, AfterValidator(partial(_finite, "u", 5))]
+
+
+class _Reply(BaseModel):
+    """State of a session, with what else a reply may have: pictures, frames, and the session that begins."""
+
+    model_config = ConfigDict(frozen=True, strict=True, arbitrary_types_allowed=True)
+
+    num_frames: int = Field(ge=1)
+    states: _Rows
+    commands: _Rows
+    tool_poses: _Poses
+    pictures: dict[str, _Pictures] = Field({}, min_length=1)
+    frames: dict[str, _Videos] = Field({}, min_length=1)
+    seconds: float = 0.0
+
+    def check(self, clips: int, frames: int) -> None:
+        """Raises: ValueError for another number of clips, or of frames of a step."""
+        parts = self.states, self.commands, self.tool_poses, *self.pictures.values(), *self.frames.values()
+        got = {len(part) for part in parts}, {video.shape[1] for video in self.frames.values()} or {frames}
+        if got != ({clips}, {frames}):
+            raise ValueError(f"{clips} clips and steps of {frames} frames wanted, got {got[0]} and {got[1]}")
+
+
+class _Opened(_Reply):
+    session: str
+    frames_per_step: int = Field(ge=1)
+    embodiment: str
+    state_names: list[str]
+    pictures: dict[str, _Pictures] = Field(min_length=1)
+
+
+class _Pictured(_Reply):
+    pictures: dict[str, _Pictures] = Field(min_length=1)
+
+
+class _Stepped(_Reply):
+    frames: dict[str, _Videos] = Field(min_length=1)
 
 
 class SimulatorClient(MessageSocket):
@@ -79,9 +130,9 @@ class SimulatorClient(MessageSocket):
         reply = self.request(request)
         error = reply.get("error")
         if error is not None:
-            if not isinstance(error, dict) or not {"kind", "what"} <= error.keys():
+            if not isinstance(error, dict) or not isinstance(error.get("what"), str):
                 raise DataError("The server's error is not understood", where=self.url, got=error)
-            kind = UnavailableError if error["kind"] == "UnavailableError" else DataError
+            kind = UnavailableError if error.get("kind") == "UnavailableError" else DataError
             details = {name: error.get(name) for name in ("expected", "got", "next_step")}
             raise kind(error["what"], where=error.get("where", self.url), **details)
         return reply
@@ -100,18 +151,29 @@ class RemoteSimulation:
 
     def __init__(self, client: SimulatorClient, opened: Mapping[str, Any]) -> None:
         self._client = client
-        self.session: str = opened["session"]
-        self.frames_per_step: int = opened["frames_per_step"]
-        self.embodiment: str = opened["embodiment"]
-        self.state_names: list[str] = opened["state_names"]
+        reply = self._checked(_Opened, opened)
+        self.session, self.frames_per_step = reply.session, reply.frames_per_step
+        self.embodiment, self.state_names = reply.embodiment, reply.state_names
         self.seconds = 0.0
-        self._take(opened)
+        self._take(reply, len(reply.states))
 
-    def _take(self, reply: Mapping[str, Any]) -> None:
-        self.num_frames: int = reply["num_frames"]
-        self.states, self.commands, self.tool_poses = (reply[name] for name in ("states", "commands", "tool_poses"))
-        if "pictures" in reply:
-            self.pictures = _by_clip(reply["pictures"])
+    def _checked[R: _Reply](self, kind: type[R], reply: Mapping[str, Any]) -> R:
+        try:
+            return kind.model_validate(reply)
+        except ValidationError as error:
+            found = error.errors()[0]
+            where = f"{self._client.url}: {'.'.join(map(str, found['loc']))}"
+            raise DataError("A reply of the server is not understood", where=where, got=found["msg"]) from error
+
+    def _take(self, reply: _Reply, clips: int) -> None:
+        try:
+            reply.check(clips, self.frames_per_step)
+        except ValueError as error:
+            raise DataError("A reply of the server does not fit", where=self._client.url, got=error) from error
+        self.num_frames = reply.num_frames
+        self.states, self.commands, self.tool_poses = reply.states, reply.commands, reply.tool_poses
+        if reply.pictures:
+            self.pictures = _by_clip(reply.pictures)
 
     @property
     def state(self) -> np.ndarray:
@@ -120,10 +182,11 @@ class RemoteSimulation:
 
     def step(self, controls: np.ndarray) -> list[dict[str, np.ndarray]]:
         """Predict the next frames under controls ``(b, frames_per_step, j)``; of every clip ``uint8 (n, H, W, 3)`` by view."""
-        reply = self._client.call({"op": "step", "session": self.session, "controls": np.asarray(controls, np.float64)})
-        self._take(reply)
-        self.seconds = reply["seconds"]
-        frames = _by_clip(reply["frames"])
+        request = {"op": "step", "session": self.session, "controls": np.asarray(controls, np.float64)}
+        reply = self._checked(_Stepped, self._client.call(request))
+        self._take(reply, len(self.states))
+        self.seconds = reply.seconds
+        frames = _by_clip(reply.frames)
         self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in frames]
         return frames
 
@@ -139,7 +202,8 @@ class RemoteSimulation:
 
     def reset(self) -> None:
         """Go back to the start."""
-        self._take(self._client.call({"op": "reset", "session": self.session}))
+        reply = self._client.call({"op": "reset", "session": self.session})
+        self._take(self._checked(_Pictured, reply), len(self.states))
 
     def close(self) -> None:
         """End the session."""

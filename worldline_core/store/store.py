@@ -374,7 +374,8 @@ def _weights_digests(places: Mapping[str, Path | None], cache: Path) -> dict[str
             key = f"{path.resolve()} {facts.st_size} {facts.st_mtime_ns}"
             if key not in known:
                 known[key] = digest_file(path)
-                with suppress(OSError):  # a read-only store
+                with suppress(OSError, ArtifactError), exclusive_lock(cache.with_suffix(".lock")):  # a read-only store
+                    known |= read_json(cache)  # of other processes meanwhile
                     write_json_atomic(cache, known)
             files[relative.as_posix()] = {"sha256": known[key]}
         digests[name] = digest_listed(files)

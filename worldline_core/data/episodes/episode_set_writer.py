@@ -8,8 +8,8 @@ episodes alone.
 from __future__ import annotations
 
 import json
-import os
 import shutil
+import uuid
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -205,8 +205,8 @@ class EpisodeSetWriter:
             views[view] = RecordedView.of(images) if isinstance(images, np.ndarray) else images
         robot_masks, thing_labels = robot_masks or {}, thing_labels or {}
         final = self._parts / part_name(episode.episode_id)
-        working = self._parts / f".{final.name}.{os.getpid()}"
-        shutil.rmtree(working, ignore_errors=True)
+        # Not by the process id, which the containers that share a store have in common.
+        working = self._parts / f".{final.name}.{uuid.uuid4().hex}"
         working.mkdir(parents=True)
         try:
             stored: dict[str, EpisodeVideo] = {}
