@@ -90,7 +90,7 @@ class Denoiser:
         kinematics = ArmKinematics(load_embodiment(str(episode.embodiment)))
         tracks, _ = compute_tracks(episode, kinematics)
         video = torch.stack([frames_to_video(frames[view], world.image_size) for view in world.views])
-        maps = world.action_maps([tracks], latent_frame_indices(video.shape[2]), start=0, views=world.views)
+        maps = world.action_maps([tracks], latent_frame_indices(video.shape[2]), views=world.views)
         clean = world.tokenizer.encode(video)[None]
         noise = Noise([42]).draw(clean.shape[1:])
         first, level = clean[:, :, :, :1], self.sigmas[0]

@@ -245,7 +245,7 @@ def make_spec() -> Callable[..., CausalSpec]:
     def make(**changes: object) -> CausalSpec:
         from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
 
-        values = {"block_size": 2, "sink_blocks": 1, "recent_blocks": 3, "sigmas": CAUSAL_SIGMAS}
+        values = {"block_size": 2, "sink_blocks": 1, "recent_blocks": 3, "anchor_blocks": None, "sigmas": CAUSAL_SIGMAS}
         return CausalSpec.model_validate(values | changes)
 
     return make

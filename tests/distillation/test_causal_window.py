@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from pydantic import ValidationError
 
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
@@ -76,3 +77,10 @@ def test_an_objective_trains_on_what_a_rollout_sees(objective: Any, make_model: 
     objective(model, config).loss(batch_of(config.spec.steps), torch.Generator().manual_seed(0), 5)
     (given,) = seen
     torch.testing.assert_close(given[-1], blockwise(model, config, given), rtol=1e-5, atol=1e-5)
+
+
+def test_a_rollout_begins_anew_no_later_than_the_longest_trained_clip_ends() -> None:
+    settings = {"clips": {"lengths": [33, 65]}, "window": {"anchor_blocks": 4}}
+    assert DistillConfig.model_validate(settings).spec.anchor_blocks == 4
+    with pytest.raises(ValidationError, match=r"anchor_blocks 4: the longest clip has 2 blocks"):
+        DistillConfig.model_validate(settings | {"clips": {"lengths": [33]}})

@@ -20,7 +20,7 @@ from worldline_core.model.world_model_config import CausalSpec
 
 BLOCK = 2
 FRAMES = 7
-SPEC = CausalSpec(block_size=BLOCK, sink_blocks=1, recent_blocks=3, sigmas=(1.0, 0.0))
+SPEC = CausalSpec(block_size=BLOCK, sink_blocks=1, recent_blocks=3, anchor_blocks=None, sigmas=(1.0, 0.0))
 
 
 @pytest.fixture(scope="module", params=["velocity", "first_frame_residual"])

@@ -20,7 +20,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec, WorldModelConfig
 
 SIZE = (32, 48)
-SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=1, sigmas=CAUSAL_SIGMAS)
+SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=1, anchor_blocks=None, sigmas=CAUSAL_SIGMAS)
 N = 33
 NAMES = {"a-0": "ur5e_pair", "a-1": "ur5e_pair", "b/0 x": "aloha_viperx", "b-1": "aloha_viperx", "b-2": "aloha_viperx"}
 

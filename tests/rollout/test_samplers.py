@@ -32,7 +32,7 @@ def observation(batch: int = 2, frames: int = 9) -> tuple[torch.Tensor, torch.Te
     return first, torch.randn(batch, 3, 9, frames, 4, 4, generator=generator)
 
 
-SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, sigmas=CAUSAL_SIGMAS)
+SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, anchor_blocks=None, sigmas=CAUSAL_SIGMAS)
 
 
 def test_nodes_of_the_samplers() -> None:
@@ -44,7 +44,7 @@ def test_nodes_of_the_samplers() -> None:
     with pytest.raises(ConfigError, match="at least one step"):
         shifted_sigmas(0)
     with pytest.raises(ValidationError, match="must fall from at most 1 to 0"):
-        CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, sigmas=(1.0, 0.5, 0.5, 0.0))
+        CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, anchor_blocks=None, sigmas=(1.0, 0.5, 0.5, 0.0))
 
 
 class Oracle(torch.nn.Module):

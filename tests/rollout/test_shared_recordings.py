@@ -48,7 +48,13 @@ def inputs_of(
         tokenizer=tokenizer.encoder_digest[:16],
     )  # fmt: skip
     model = make_model(latent_channels=8, prediction="first_frame_residual")
-    spec = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, sigmas=(CAUSAL_SIGMAS[0], CAUSAL_SIGMAS[3], 0.0))
+    spec = CausalSpec(
+        block_size=4,
+        sink_blocks=1,
+        recent_blocks=3,
+        anchor_blocks=None,
+        sigmas=(CAUSAL_SIGMAS[0], CAUSAL_SIGMAS[3], 0.0),
+    )
     save_checkpoint(root / "causal", model, kind="causal", action_contract=contract, causal=spec)
     save_checkpoint(root / "stage2", model, kind="stage2", action_contract=contract)
     return {name: str(root / name) for name in ("episodes", "tracks", "tokenizer", "causal", "stage2")}

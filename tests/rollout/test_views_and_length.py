@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -201,13 +201,43 @@ def test_stage2_goes_on_where_its_last_clip_ended(mixed: dict[str, Path], inputs
     first = pieces(WorldLine.from_pretrained(checkpoint, **options), 17)
     assert np.array_equal(np.concatenate(chained)[:17], np.concatenate(first))
     session = world.session(images, [42])
-    last = session.step(world.action_maps([tracks], range(0, 17, 4), start=0, views=VIEWS))[0]
+    last = session.step(world.action_maps([tracks], range(0, 17, 4), views=VIEWS))[0]
     again = world.session(torch.stack([frames_to_video(last[view][-1:])[:, 0] for view in VIEWS])[None], [42])
     again._sampler._noise = session._sampler._noise  # type: ignore[attr-defined]
-    maps = world.action_maps([tracks], range(16, 33, 4), start=16, views=VIEWS)
+    maps = world.action_maps([tracks], range(16, 33, 4), views=VIEWS)
     assert np.array_equal(again.step(maps)[0]["head"], chained[2])
     with pytest.raises(ValidationError, match=r"clip_frames\n.*1 \+ a multiple of 4"):
         FullClipConfig(clip_frames=16)
+
+
+def test_a_causal_rollout_begins_anew_at_its_own_picture_every_few_blocks(
+    mixed: dict[str, Path], inputs: dict[str, Path]
+) -> None:
+    """With anchors every two blocks, the third block is the first one of a rollout from the last picture of the second."""
+    world = WorldLine.from_pretrained(inputs["checkpoint"], tokenizer=inputs["tokenizer"], bfloat16=False)
+    assert world.causal is not None
+    free = list(_causal_pieces(world, mixed, 65))
+    world.causal = world.causal.model_copy(update={"anchor_blocks": 2})
+    pieces = list(_causal_pieces(world, mixed, 65))
+    assert [len(piece["head"]) for piece in pieces] == [1, 16, 16, 16, 16]
+    for view in VIEWS:
+        assert all(np.array_equal(pieces[block][view], free[block][view]) for block in range(3))
+        assert not np.array_equal(pieces[3][view], free[3][view])
+    tracks = ActionTracks.open(mixed["tracks"]).tracks("long")
+    last = torch.stack([frames_to_video(pieces[2][view][-1:])[:, 0] for view in VIEWS])[None]
+    session = world.session(last, [42])
+    for _ in range(2):  # the noise goes on
+        session._sampler.noise.draw((3, world.model.config.latent_channels, 4, *world.contract.grid_size))  # type: ignore[union-attr]
+    for block in (3, 4):
+        maps = world.action_maps([tracks], range(16 * (block - 1), 16 * block + 1, 4), views=VIEWS)
+        assert np.array_equal(session.step(maps)[0]["head"], pieces[block]["head"])
+
+
+def _causal_pieces(world: WorldLine, mixed: dict[str, Path], frames: int) -> Iterator[dict[str, np.ndarray]]:
+    episodes, tracks = EpisodeSet.open(mixed["episodes"]), ActionTracks.open(mixed["tracks"]).tracks("long")
+    position = episodes.position("long")
+    images = torch.stack([frames_to_video(episodes.frames(position, view, [0]))[:, 0] for view in VIEWS])[None]
+    return (clips[0] for clips in world.stream(images, [tracks], frames, [42]))
 
 
 def test_strides_are_those_of_the_training(inputs: dict[str, Path], mixed: dict[str, Path], tmp_path: Path) -> None:

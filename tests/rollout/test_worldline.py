@@ -20,6 +20,8 @@ from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
+from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
+from worldline_core.rollout.simulation import Session
 
 FRAMES = 17
 
@@ -120,15 +122,20 @@ def test_weights_in_bfloat16_predict_nearly_the_same(observed: Observation, caus
         assert np.abs(found[view].astype(int) - frames).mean() < 1
 
 
-def test_decoding_one_block_while_the_next_is_sampled_changes_nothing(observed: Observation, causal: WorldLine) -> None:
+@pytest.mark.parametrize("anchor_blocks", [None, 1, 2])
+def test_decoding_one_block_while_the_next_is_sampled_changes_nothing(
+    observed: Observation, causal: WorldLine, anchor_blocks: int | None
+) -> None:
     images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
     assert causal.causal is not None
     size = (1, len(causal.views), causal.info.config.map_channels, 1 + causal.causal.block_size)
     generator = torch.Generator().manual_seed(0)
-    maps = [torch.randn(*size, *causal.contract.grid_size, generator=generator) for _ in range(2)]
+    maps = [torch.randn(*size, *causal.contract.grid_size, generator=generator) for _ in range(4)]
+    spec = causal.causal.model_copy(update={"anchor_blocks": anchor_blocks})
 
     def blocks(*, overlapped: bool) -> list[dict[str, np.ndarray]]:
-        session = causal.session(torch.stack(images)[None], [42])
+        sampler = BlockCausalSimulator(causal.model, spec, noise=Noise([42]), views=causal.views)
+        session = Session(sampler, causal.tokenizer, torch.stack(images)[None], device="cpu", bfloat16=False)
         return [clips[0] for clips in session.steps(maps, overlapped=overlapped)]
 
     for one, other in zip(blocks(overlapped=True), blocks(overlapped=False), strict=True):

@@ -34,7 +34,7 @@ def small_world(shipped: Path, make_model: Callable[..., WorldModel]) -> WorldLi
     given = WorldLine.from_pretrained(shipped / "models" / "causal")
     _, info = load_checkpoint(shipped / "models" / "causal", towers="generation")
     model = make_model(latent_channels=32, num_layers=1)
-    spec = CausalSpec(block_size=1, sink_blocks=1, recent_blocks=2, sigmas=(1.0, 0.0))
+    spec = CausalSpec(block_size=1, sink_blocks=1, recent_blocks=2, anchor_blocks=None, sigmas=(1.0, 0.0))
     return WorldLine(model, info.model_copy(update={"config": model.config, "causal": spec}), given.tokenizer)
 
 

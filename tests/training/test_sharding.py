@@ -18,7 +18,7 @@ from worldline_core.training.training_config import ShardingConfig
 from worldline_core.training.training_state import ExponentialAverage
 
 VIEWS = ("head", "left_wrist", "right_wrist")
-SPEC = CausalSpec(block_size=2, sink_blocks=1, recent_blocks=1, sigmas=(1.0, 0.5, 0.0))
+SPEC = CausalSpec(block_size=2, sink_blocks=1, recent_blocks=1, anchor_blocks=None, sigmas=(1.0, 0.5, 0.0))
 
 Make = Callable[..., WorldModel]
 

@@ -40,10 +40,15 @@ class AuxiliaryWeights(StrictModel):
 
 
 class WindowConfig(StrictModel):
-    """Finished blocks that stay visible: the first ones and the most recent ones (one and three in the paper)."""
+    """Finished blocks that stay visible: the first ones and the most recent ones (one and three in the paper).
+
+    ``anchor_blocks``: after so many predicted blocks a rollout begins anew at its own last picture (None, the paper: never).
+    No more than the longest clip has: then a rollout is never in a state that training does not have.
+    """
 
     sink_blocks: int = Field(default=1, ge=1)
     recent_blocks: int = Field(default=3, ge=0)
+    anchor_blocks: int | None = Field(default=None, ge=1)
 
 
 class TeacherForcingConfig(StrictModel):
@@ -160,6 +165,11 @@ class DistillConfig(StrictModel):
             raise ValueError(
                 f"clips.lengths {odd}: clips are one observed frame and whole blocks, 1 + k * {span} frames"
             )
+        blocks = (max(self.clips.lengths) - 1) // span
+        if (self.window.anchor_blocks or 0) > blocks:
+            raise ValueError(
+                f"window.anchor_blocks {self.window.anchor_blocks}: the longest clip has {blocks} blocks; train on longer clips"
+            )
         steps, substeps = self.spec.steps, self.trajectory_regression.trajectories.substeps
         if len(substeps) != steps:
             raise ValueError(f"trajectories.substeps {substeps}: one number per interval of sigmas is needed, {steps}")
@@ -179,5 +189,6 @@ class DistillConfig(StrictModel):
             block_size=self.block_size,
             sink_blocks=self.window.sink_blocks,
             recent_blocks=min(self.window.recent_blocks, earlier_blocks),
+            anchor_blocks=self.window.anchor_blocks,
             sigmas=self.sigmas,
         )

@@ -260,12 +260,15 @@ class CausalSpec(StrictModel):
         block_size: latent frames per block.
         sink_blocks: finished blocks that stay visible from the start (the observed latent frame is block 0).
         recent_blocks: most recent finished blocks that stay visible besides.
+        anchor_blocks: after so many predicted blocks a rollout begins anew at its own last picture, with an empty cache; None:
+            never. What happened then lasts: a model whose window slides off it falls back to the first picture.
         sigmas: noise levels at which a block's Euler steps start, 0 at the end.
     """
 
     block_size: int = Field(ge=1)
     sink_blocks: int = Field(ge=1)
     recent_blocks: int = Field(ge=0)
+    anchor_blocks: int | None = Field(ge=1)
     sigmas: tuple[float, ...] = Field(min_length=2)
 
     @field_validator("sigmas")

@@ -223,7 +223,7 @@ def _timed_blocks(
         return None
     first = encode_images(world.tokenizer, _observed(world, episodes, [item]).to(config.device))
     index = range(0, world.frames_per_unit + 1, TEMPORAL_FACTOR)
-    maps = world.action_maps([tracks.tracks(item.controls_of)], index, start=0, views=item.views)
+    maps = world.action_maps([tracks.tracks(item.controls_of)], index, views=item.views)
     return long_rollout(partial(world.simulator, [item.seed], item.views), first, maps, sampler.timed_blocks)
 
 

@@ -131,7 +131,8 @@ def _rates(fps: float | None, first: Tensor) -> Tensor | None:
 class FullClipSampler:
     """Samples one whole clip per step with a Stage II model."""
 
-    chained = True
+    units_per_clip: int | None = 1
+    """Steps until the prediction begins anew at its last picture; None: it never does."""
 
     def __init__(
         self,
@@ -180,8 +181,6 @@ class BlockCausalSimulator:
         fps: frames per second of the clips; None: as the model's config says.
     """
 
-    chained = False
-
     def __init__(
         self,
         model: WorldModel,
@@ -194,6 +193,7 @@ class BlockCausalSimulator:
     ) -> None:
         self.model = model
         self.spec = spec
+        self.units_per_clip = spec.anchor_blocks
         self.views = tuple(views)
         self.fps = fps
         self.bfloat16 = bfloat16

@@ -1,8 +1,9 @@
 """Running predictions: `Session` is driven by action maps, `Simulation` (of ``WorldLine.start``) by the commands of a policy.
 
 A session begins with the current images and predicts one unit (a block or a clip) at a time. A causal model's KV cache is a
-window of constant size with positions counted from its start. A Stage II model chains clips: the last predicted picture of every
-view is the observed one of the next clip. Pictures are decoded unit by unit, so memory does not grow with the length.
+window of constant size with positions counted from its start. Every clip of a Stage II model, and every few blocks of a causal
+one that has anchors, begin anew: the last predicted picture of every view is the observed one of what follows. Pictures are
+decoded unit by unit, so memory does not grow with the length.
 
 Equal seeds and controls give equal bytes on a CPU, and the noise of a clip does not depend on who shares its batch. In bfloat16
 neither do the bytes; in float32 sums of another batch size are rounded otherwise, by one grey level at most.
@@ -72,7 +73,8 @@ class Session:
         self._bfloat16 = bfloat16
         self._decoders: list[VideoDecoder]
         self._first: Tensor | None  # observed latents of a clip that no step has begun
-        self._ended: Frames | None = None
+        self._units = 0  # predicted since the observed picture
+        self._last: Frames = []  # of the last unit, where a clip may begin
         self.observed = self._observe(images)
 
     @torch.no_grad()
@@ -82,28 +84,31 @@ class Session:
         Raises:
             DataError: the controls given to a causal model are not those of one block.
         """
-        if self._ended is not None:
-            last = [[frames_to_video(clip[v][-1:])[:, 0] for v in self._sampler.views] for clip in self._ended]
-            self._observe(torch.stack([torch.stack(pictures) for pictures in last]))
-        frames = self._decode(self._sample(maps))
-        self._ended = frames if self._sampler.chained else None
-        return frames
+        if self._clip_ended:
+            self._begin_anew()
+        self._last = self._decode(self._sample(maps))
+        return self._last
 
     def steps(
         self, maps: Iterable[Float[Tensor, "b v a t h w"]], *, overlapped: bool | None = None
     ) -> Iterator[Frames]:
         """Like `step`, for controls that are known in advance: one block is decoded while the next is sampled.
 
-        By default so on a GPU alone, where decoding gets a stream of its own; chained clips never overlap.
+        By default so on a GPU alone, where decoding gets a stream of its own. A clip waits for the picture that it begins at.
         """
         on_gpu = torch.device(self._device).type == "cuda"
-        if self._sampler.chained or not (on_gpu if overlapped is None else overlapped):
+        if not (on_gpu if overlapped is None else overlapped):
             yield from map(self.step, maps)
             return
         beside = torch.cuda.Stream(self._device) if on_gpu else None
         waiting: Future[Frames] | None = None
         with ThreadPoolExecutor(1) as decoding:
             for given in maps:
+                if self._clip_ended:
+                    if waiting is not None:
+                        self._last, waiting = waiting.result(), None
+                        yield self._last
+                    self._begin_anew()
                 latents = self._sample(given)
                 if beside is not None:
                     beside.wait_stream(torch.cuda.current_stream(self._device))
@@ -112,12 +117,23 @@ class Session:
                     yield waiting.result()
                 waiting = following
             if waiting is not None:
-                yield waiting.result()
+                self._last = waiting.result()
+                yield self._last
 
+    @property
+    def _clip_ended(self) -> bool:
+        return self._sampler.units_per_clip is not None and self._units >= self._sampler.units_per_clip
+
+    def _begin_anew(self) -> None:
+        last = [[frames_to_video(clip[v][-1:])[:, 0] for v in self._sampler.views] for clip in self._last]
+        self._observe(torch.stack([torch.stack(pictures) for pictures in last]))
+
+    @torch.no_grad()
     def _sample(self, maps: Tensor) -> Tensor:
         if self._first is not None:
             self._sampler.start(self._first, maps[:, :, :, :1])
             self._first = None
+        self._units += 1
         return self._sampler.step(maps[:, :, :, 1:])
 
     def select(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> Session:
@@ -129,14 +145,14 @@ class Session:
         other._sampler = self._sampler.fork(clips, seeds)
         other._first = None if self._first is None else self._first[list(clips)]
         other._decoders = [self._decoders[clip].copy() for clip in clips]
-        other._ended = None if self._ended is None else [self._ended[clip] for clip in clips]
+        other._last = [self._last[clip] for clip in clips] if self._last else []
         other.observed = [self.observed[clip] for clip in clips]
         return other
 
     @torch.no_grad()
     def _observe(self, images: Tensor) -> Frames:
         """Begin a clip at these images."""
-        images = images.to(self._device)
+        images, self._units = images.to(self._device), 0
         self._first = encode_images(self._tokenizer, images)
         self._decoders = [self._tokenizer.decoder(clip) for clip in images]
         return self._decode(rearrange(self._first, "b v c h w -> b v c 1 h w"))

@@ -208,7 +208,7 @@ class WorldLine:
         frames = self.unit(USUAL_CLIP_FRAMES)
         # Rows of the tracks of a step: the start, the last known frame, the new ones.
         index = range(1, frames + 2, self.tokenizer.temporal_compression)
-        maps = partial(self.action_maps, frames=index, start=int(self.causal is None), views=views)
+        maps = partial(self.action_maps, frames=index, views=views)
         session = self.session(starts.pictures(views, self.image_size), starts.seeds, views)
         return Simulation(
             session, starts, self.contract, maps, views=views, image_size=self.image_size, frames=frames, limits=limits
@@ -259,9 +259,7 @@ class WorldLine:
 
         def controls(begin: int) -> Tensor:
             index = [stride * frame for frame in range(begin, begin + unit + 1, self.tokenizer.temporal_compression)]
-            # A Stage II model begins a clip at every step; a causal one goes on with the first.
-            start = 0 if self.causal is not None else index[0]
-            maps = self.action_maps(tracks, index, start=start, views=chosen, stride=stride)
+            maps = self.action_maps(tracks, index, views=chosen, stride=stride)
             return torch.zeros_like(maps) if without_actions else maps
 
         for begin, clips in zip(begins, session.steps(map(controls, begins)), strict=True):
@@ -298,18 +296,17 @@ class WorldLine:
         tracks: Sequence[EpisodeTracks],
         frames: Sequence[int],
         *,
-        start: int,
         views: Sequence[str],
         stride: int = 1,
     ) -> Float[Tensor, "b v a t h w"]:
-        """Maps (or vectors, of a model with FiLM) of the latent frames at these recorded frames of a clip that begins at ``start``; past
-        the end of a track its last controls stay.
+        """Maps (or vectors, of a model with FiLM) of the latent frames at these recorded frames, drawn as of a clip that begins at the
+        first of them; past the end of a track its last controls stay.
         """
         cut = []
         count, native = self.info.config.action_frames, self.info.config.native_size
         for track in tracks:
             # Of every latent frame, and of those between it and the one before: `control_frames`.
-            drawn = [max(start, frame - stride * back) for frame in frames for back in range(count)]
+            drawn = [max(frames[0], frame - stride * back) for frame in frames for back in range(count)]
             cut.append(track.clip([min(frame, track.num_frames - 1) for frame in drawn]))
         if native is not None:
             maps = native_vectors(cut, views, native)
