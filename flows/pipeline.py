@@ -49,16 +49,19 @@ def chain(c: PipelineConfig) -> None:
     trained["distill"] = distill.submit(c.distill, **clips, stage2=trained["train_stage2"])
     predicted = predict(c, data, banks, models, trained)
     scores = evaluate(c, data, banks, models, predicted)
-    made = {"curate": curated, "filter": data["episodes"], "render_actions": data["tracks"], **trained, **scores}
+    made = {"curate": curated, "filter": data["episodes"], "render_actions": data.get("tracks"), **trained, **scores}
     report.submit(c.report, **made, rollout=predicted, models=models)
 
 
 def prepare(c: PipelineConfig) -> tuple[TaskCall, Inputs, Inputs]:
-    """Recordings → curated → filtered episodes → action tracks. Candidate banks are not filtered; a run may have none."""
+    """Recordings → curated → filtered episodes → action tracks, where there are cameras. Banks are not filtered."""
     recorded: Inputs = {name: record.submit(config, f"record.{name}") for name, config in c.recordings()}
     curated = curate.submit(c.curate, source=c.sources_of(c.curate, recorded))
     episodes = filter_episodes.submit(c.filter, episodes=curated)
-    data: Inputs = {"episodes": episodes, "tracks": render_actions.submit(c.render_actions, episodes=episodes)}
+    data: Inputs = {"episodes": episodes}
+    if c.render_actions is None:
+        return curated, data, {}
+    data["tracks"] = render_actions.submit(c.render_actions, episodes=episodes)
     if c.curate_banks is None:
         return curated, data, {}
     source = c.sources_of(c.curate_banks, recorded)
@@ -94,7 +97,7 @@ def predict(c: PipelineConfig, data: Inputs, banks: Inputs, models: Inputs, trai
     """Videos of every rollout whose checkpoint exists: this run's own, a shipped one, or none (baselines, imports)."""
     checkpoints, predicted = c.checkpoints(trained), {}
     for name, run in c.rollouts_in_order():
-        episodes, tracks = ((banks if run.episodes == "banks" else data)[key] for key in ("episodes", "tracks"))
+        episodes, tracks = ((banks if run.episodes == "banks" else data).get(key) for key in ("episodes", "tracks"))
         if run.imported is not None:
             videos = c.videos_folder(run)
             predicted[name] = import_rollouts.submit(run.imported, f"rollout.{name}", episodes=episodes, videos=videos)

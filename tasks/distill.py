@@ -8,8 +8,8 @@ distill = ArtifactTask(
     version=7,
     function="worldline_core.distillation.distill:distill",
     config="worldline_core.distillation.distill_config:DistillConfig",
-    inputs=("tracks", "episodes", "stage2", "tokenizer"),
-    optional_inputs=("latents", "causal"),
+    inputs=("episodes", "stage2", "tokenizer"),
+    optional_inputs=("tracks", "latents", "causal"),
     distributed=True,
 )
 

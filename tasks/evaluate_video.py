@@ -8,8 +8,8 @@ evaluate_video = ArtifactTask(
     version=6,
     function="worldline_core.evaluation.video.evaluate_video:evaluate_video",
     config="worldline_core.evaluation.evaluation_config:VideoEvaluationConfig",
-    inputs=("episodes", "tracks", "rollouts.*"),
-    optional_inputs=("segmenter",),
+    inputs=("episodes", "rollouts.*"),
+    optional_inputs=("tracks", "segmenter"),
 )
 
 if __name__ == "__main__":

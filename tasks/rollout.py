@@ -8,8 +8,8 @@ rollout = ArtifactTask(
     version=6,
     function="worldline_core.rollout.rollout:rollout",
     config="worldline_core.rollout.rollout_config:RolloutConfig",
-    inputs=("episodes", "tracks", "tokenizer"),
-    optional_inputs=("checkpoint",),
+    inputs=("episodes",),
+    optional_inputs=("tracks", "tokenizer", "checkpoint"),
 )
 
 if __name__ == "__main__":

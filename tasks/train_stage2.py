@@ -5,11 +5,11 @@ from tasks.execution.artifact_task import ArtifactTask
 train_stage2 = ArtifactTask(
     name="train_stage2",
     summary="Stage II: action-driven three-view prediction on successes and failures",
-    version=8,
+    version=9,
     function="worldline_core.training.stage2:train_stage2",
     config="worldline_core.training.training_config:Stage2Config",
-    inputs=("tracks", "episodes", "stage1"),
-    optional_inputs=("latents", "tokenizer", "teacher"),
+    inputs=("episodes", "stage1"),
+    optional_inputs=("tracks", "latents", "tokenizer", "teacher"),
     distributed=True,
 )
 

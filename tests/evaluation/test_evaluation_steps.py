@@ -69,6 +69,18 @@ def test_video_metrics_prefer_the_right_videos(evaluated):
     assert min(first) > 30  # the conditioning frame counts
 
 
+def test_videos_are_compared_with_videos_without_action_tracks(recordings, evaluated, tmp_path):
+    """Plain mp4s beside plain mp4s: full-frame metrics need no states, cameras or segmenter."""
+    inputs = {name: path for name, path in recordings.inputs.items() if name not in ("tracks", "segmenter")}
+    evaluate_video(VideoEvaluationConfig(resamples=100, metrics=("hsd", "scene_consistency")), inputs, tmp_path)
+    found, full = (json.loads((folder / "summary.json").read_text()) for folder in (tmp_path, evaluated))
+    means, whole = (summary["metrics"]["test"]["good"] for summary in (found, full))
+    assert {name.partition("@")[0] for name in means} == {"psnr", "ssim"}
+    assert means["psnr"] == whole["psnr"]
+    for name in ("robot_iou", "end_effector_error_px", "hsd", "scene_consistency"):
+        assert "have no action tracks" in found["unavailable"][name]
+
+
 def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, evaluated, tmp_path):
     shutil.copytree(evaluated, tmp_path / "again")
     parts = sorted((tmp_path / "again/run/parts").rglob("*.json"))

@@ -110,6 +110,21 @@ def test_views_of_distillation_are_checked_before_any_training(override: str, me
     load_config(PipelineConfig, preset="smoke", overrides=[override, "distill.views=[head]"])
 
 
+def test_a_run_of_recordings_without_cameras_draws_nothing() -> None:
+    with pytest.raises(ConfigError, match=r"render_actions: without it nothing is drawn"):
+        load_config(PipelineConfig, preset="smoke", overrides=["render_actions=null"])
+    changes = ["render_actions=null", "curate_banks=null", "evaluate_planning=null", "train_stage2.native_size=14"]
+    config = PipelineConfig.load("smoke", overrides=changes + [f"rollouts.{name}=null" for name in _of_banks("smoke")])
+    made = outline(chain, config)
+    assert "render_actions" not in made
+    assert not any("tracks" in call.inputs for call in made.values())
+
+
+def _of_banks(preset: str) -> list[str]:
+    runs = PipelineConfig.load(preset).rollouts.items()
+    return [name for name, run in runs if run.episodes == "banks" or str(run.checkpoint).startswith("shipped_")]
+
+
 def test_inputs_are_checked_where_a_task_is_called() -> None:
     config = PipelineConfig.load("smoke")
     with pytest.raises(ConfigError, match=r"missing \['episodes'\], unknown \['recordings'\]"):

@@ -111,7 +111,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable, ma
     film = config.model_copy(update={"action_conditioning": "native_film", "action_channels": 14})
     model.config, model.action_encoder = film, new_action_branch(film)
     torch.nn.init.normal_(model.action_encoder.proj[0].weight, generator=generator)
-    save_checkpoint(root / "film", model, kind="stage2", action_contract=contract)
+    save_checkpoint(
+        root / "film", model, kind="stage2", action_contract=contract.model_copy(update={"sigma_px_ref": None})
+    )
     return {
         "episodes": root / "episodes",
         "tracks": root / "tracks",

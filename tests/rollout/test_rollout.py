@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +15,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from tests.rollout.conftest import NAMES, SIZE, SPEC, N, digests, recorded
+from tests.rollout.conftest import NAMES, SIZE, SPEC, N, digests, recorded, write_recordings
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.block_causal_attention import KVCache
@@ -169,6 +170,36 @@ def test_a_model_with_film_is_driven_by_the_control_vectors_of_the_recording(
         rollout(config.model_copy(update={"actions": actions}), film, tmp_path / actions)
         seen.append(RolloutSet.open(tmp_path / actions).frames("b-1", "head").tobytes())
     assert len(set(seen)) == 3
+
+
+@pytest.mark.parametrize("kind", ["copy_first_frame", "text_to_video", "stage1", "film"])
+def test_what_no_camera_is_needed_for_is_predicted_without_tracks(
+    inputs: dict[str, Path], tmp_path: Path, kind: str
+) -> None:
+    """Recordings without cameras have no action tracks."""
+    models = inputs["checkpoint"].parent
+    made = write_recordings(tmp_path, [("a", "test", N, VIEWS, ()), ("b", "test", N, VIEWS, ())])
+    given = {"episodes": made["episodes"], "tokenizer": inputs["tokenizer"]}
+    sampler: Any = {"kind": "full_clip", "steps": 1} if kind == "film" else {"kind": "text_to_video", "steps": 1}
+    if kind == "copy_first_frame":
+        sampler, given = {"kind": kind}, {"episodes": made["episodes"]}
+    elif kind == "stage1":
+        model, info = load_checkpoint(models / "base")
+        given["checkpoint"] = tmp_path / "stage1"
+        save_checkpoint(given["checkpoint"], model, kind="stage1", action_contract=None, metadata=info.metadata)
+    else:
+        given["checkpoint"] = models / {"text_to_video": "base"}.get(kind, kind)
+    config = RolloutConfig.model_validate({"sampler": sampler, "num_frames": 9, "bfloat16": False})
+    assert rollout(config, given, tmp_path / "out")["predictions"] == 2
+    if kind == "film":
+        for actions in ("shuffled", "delayed"):
+            changed = config.model_copy(update={"actions": actions})
+            rollout(changed, given, tmp_path / actions)
+            pair = [RolloutSet.open(tmp_path / name).frames("b", "head") for name in ("out", actions)]
+            assert not np.array_equal(*pair)
+        maps = given | {"checkpoint": models / "stage2"}
+        with pytest.raises(ConfigError, match=r"(?s)drawn from action tracks.*run render_actions"):
+            rollout(config, maps, tmp_path / "maps")
 
 
 def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text(

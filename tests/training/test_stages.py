@@ -173,6 +173,11 @@ def test_native_control_vectors_take_the_place_of_maps(
     assert all(layer.weight.abs().max() > 0 for layer in model.action_encoder.proj)  # type: ignore[union-attr]
     assert result["validation/loss"] != result["validation/loss_shuffled_actions"]
     train_stage2(stage2(2, native_size=3), inputs | {"stage1": tmp_path / "film"}, tmp_path / "on")
+    without = {name: folder for name, folder in inputs.items() if name != "tracks"}
+    bare = train_stage2(stage2(30, native_size=3, action_dropout=0.0), without, tmp_path / "bare")
+    assert bare["validation/loss"] == result["validation/loss"]  # vectors are the same, with cameras or without
+    with pytest.raises(ConfigError, match=r"(?s)drawn from action tracks.*run render_actions"):
+        train_stage2(stage2(2), without, tmp_path / "maps")
     with pytest.raises(DataError, match=r"(?s)driven by control vectors.*up to 1 numbers.*got: 2"):
         train_stage2(stage2(2, native_size=1), inputs, tmp_path / "small")
     with pytest.raises(CheckpointError, match=r"(?s)native_size.*expected: 3"):

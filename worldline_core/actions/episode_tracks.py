@@ -10,10 +10,10 @@ episode. Bytes depend on the tracks alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -24,8 +24,9 @@ from jaxtyping import Bool, Float
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ArtifactError, DataError
+from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.store.artifact_files import how_to_rebuild
 from worldline_core.store.atomic import write_arrays_atomic, write_table_atomic
 
@@ -264,6 +265,69 @@ class ActionTracks:
             native = np.asarray(episode.action if row["controls"] == "action" else episode.state, np.float32)
         labels = {name: tuple(row[name]) if isinstance(row[name], list) else row[name] for name in _LABELS}
         return EpisodeTracks(**labels, **arrays, native=native)
+
+
+class ControlVectors(ActionTracks):
+    """Control vectors of recordings without cameras, for models that take no maps: tracks of no arm in no view.
+
+    Args:
+        controls: ``action`` (the commands; an episode without them is left out) or ``state``.
+    """
+
+    def __init__(self, episodes: EpisodeSet, controls: str) -> None:
+        def known(position: int) -> bool:
+            episode = episodes.episode(position)
+            return episode.commanded if controls == "action" else episode.state_kind != "none"
+
+        self.root, self.episodes, self.sigma_px_ref = episodes.root, episodes, float("nan")
+        self._rows = {
+            row.episode_id: {"controls": controls, "views": VIEWS, "camera_motion": ["absent"] * len(VIEWS)}
+            for position, row in enumerate(episodes.rows)
+            if known(position)
+        }
+        if not self._rows:
+            raise DataError(
+                "No recording has the controls that the model is driven by", where=episodes.root, expected=controls,
+                got=f"none in {len(episodes)} recordings", next_step="declare actions or states in the source",
+            )  # fmt: skip
+
+    def tracks(self, episode_id: str) -> EpisodeTracks:
+        """The vectors of one episode. Raises: DataError: there are none."""
+        if episode_id not in self:
+            raise DataError("No control vectors of this episode", where=self.root, got=episode_id)
+        episodes = cast("EpisodeSet", self.episodes)
+        episode, controls = episodes.episode(episodes.position(episode_id)), self.controls(episode_id)
+        n, v, identity = episode.num_frames, len(VIEWS), np.eye(4, dtype=np.float32)
+        return EpisodeTracks(
+            episode_id=episode_id, embodiment=episode.embodiment, views=VIEWS, arms=(), image_size=(1, 1), controls=controls,
+            camera_motion=("absent",) * v, uv=np.zeros((n, v, 0, 2)), depth=np.zeros((n, v, 0), np.float32),
+            rot6d=np.zeros((n, v, 0, 6), np.float32), gripper=np.zeros((n, v, 0), np.float32),
+            valid=np.zeros((n, v, 0), np.bool_), T_base_tool=np.zeros((n, 0, 4, 4), np.float32),
+            T_base_camera=np.tile(identity, (n, v, 1, 1)), K=np.full((v, 3, 3), np.nan, np.float32),
+            capsules=np.zeros((n, 0, 2, 3), np.float32), capsule_radii=np.zeros(0, np.float32),
+            native=np.asarray(episode.action if controls == "action" else episode.state, np.float32),
+        )  # fmt: skip
+
+
+def open_controls(
+    inputs: Mapping[str, Path], episodes: EpisodeSet, *, vectors: bool, controls: str = "action"
+) -> ActionTracks:
+    """The input ``tracks``; for a model of control vectors, which no camera is needed for, also those of the recordings themselves.
+
+    Args:
+        vectors: the model takes control vectors.
+        controls: kind of the vectors that are read without ``tracks``.
+
+    Raises: ConfigError: a model of action maps is given no tracks.
+    """
+    if "tracks" in inputs:
+        return ActionTracks.open(Path(inputs["tracks"]), episodes if vectors else None)
+    if not vectors:
+        raise ConfigError(
+            "Action maps are drawn from action tracks", expected="an input named tracks", got=", ".join(sorted(inputs)),
+            next_step="run render_actions and give its folder as --input tracks=FOLDER",
+        )  # fmt: skip
+    return ControlVectors(episodes, controls)
 
 
 def native_vectors(

@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.actions.episode_tracks import open_controls
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance, PerceptualLoss
 from worldline_core.distillation.causal_objective import CausalObjective
@@ -113,7 +113,7 @@ class DistillationRun:
             self._check_continued(read_checkpoint_info(self.start))
         native = info.config.native_size
         self.episodes = episodes = EpisodeSet.open(Path(inputs["episodes"]))
-        tracks = ActionTracks.open(Path(inputs["tracks"]), None if native is None else episodes)
+        tracks = open_controls(inputs, episodes, vectors=native is not None, controls=info.contract.controls)
         self.source = open_source(config.input, inputs, episodes, device)
         found = {"tokenizer": self.source.description["tokenizer"], "grid_size": self.source.latent_shape[1:]}
         info.contract.require(where=self.source.root, **found)

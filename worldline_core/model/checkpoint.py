@@ -187,6 +187,9 @@ class CheckpointInfo(StrictModel):
     def _complete(self) -> Self:
         if self.kind in ("stage2", "causal") and self.action_contract is None:
             raise ValueError(f"action_contract: a checkpoint of kind {self.kind} needs one")
+        drawn, maps = self.action_contract and self.action_contract.sigma_px_ref, self.config.native_size is None
+        if self.action_contract is not None and maps == (drawn is None):
+            raise ValueError(f"action_contract.sigma_px_ref: {drawn}, of a model of {'maps' if maps else 'vectors'}")
         if (self.kind == "causal") != (self.causal is not None):
             raise ValueError(f"causal: needed by the kind causal and no other, not by {self.kind}")
         shown = {view for views in (self.trained.view_sets if self.trained else ()) for view in views}

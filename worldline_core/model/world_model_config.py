@@ -174,14 +174,14 @@ class ActionContract(StrictModel):
 
     Attributes:
         controls: what is projected: commands, measured joints, or recorded tool poses.
-        sigma_px_ref: width of the Gaussian, pixels on the reference canvas (H, W).
+        sigma_px_ref: width of the Gaussian, pixels on the reference canvas (H, W); None for control vectors, which are not drawn.
         fps: control frames per second of the recordings.
         grid_size: (rows, columns) of the latents and of the maps.
         tokenizer: fingerprint of the encoder that the latents come from.
     """
 
     controls: Literal["action", "state", "ee_pose"]
-    sigma_px_ref: float = Field(gt=0)
+    sigma_px_ref: Annotated[float, Field(gt=0)] | None
     wrist_projection: Literal["current_camera"] = "current_camera"  # as the shipped checkpoints have it
     fps: float = Field(gt=0)
     grid_size: tuple[int, int]
@@ -213,7 +213,8 @@ class ActionContract(StrictModel):
         Raises:
             CheckpointError: naming the first episode that differs, and the field.
         """
-        self.require(where=tracks.root, sigma_px_ref=tracks.sigma_px_ref)
+        if self.sigma_px_ref is not None:
+            self.require(where=tracks.root, sigma_px_ref=tracks.sigma_px_ref)
         for episode_id in episode_ids:
             if episode_id in tracks:
                 self.require(where=f"{tracks.root}, episode {episode_id}", controls=tracks.controls(episode_id))

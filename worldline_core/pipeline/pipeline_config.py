@@ -75,7 +75,9 @@ class PipelineConfig(StrictModel):
     curate: CurateConfig
     curate_banks: CurateConfig | None = None
     filter: FilterConfig
-    render_actions: RenderActionsConfig
+    render_actions: RenderActionsConfig | None = Field(
+        description="null: recordings without cameras; models take control vectors (train_stage2.native_size)"
+    )
     encode_latents: EncodeLatentsConfig
     train_tokenizer: TokenizerConfig | None = Field(default=None, description="null: models.tokenizer is used")
     train_segmenter: SegmenterConfig | None = Field(default=None, description="null: models.segmenter is used")
@@ -172,6 +174,18 @@ class PipelineConfig(StrictModel):
                 raise ValueError(f"rollouts.{name} needs models.{run.checkpoint.removeprefix('shipped_')}")
             if run.checkpoint == "stage1" and self.train_stage1 is None:
                 raise ValueError(f"rollouts.{name} needs train_stage1")
+        if self.render_actions is None:
+            if self.train_stage2.native_size is None or self.curate_banks is not None:
+                raise ValueError(
+                    "render_actions: without it nothing is drawn: set train_stage2.native_size, and curate_banks to null"
+                )
+            mapped = [
+                name for name, run in self.rollouts.items() if run.checkpoint in ("shipped_stage2", "shipped_causal")
+            ]
+            if mapped:
+                raise ValueError(
+                    f"render_actions: without it no action maps drive rollouts.{', rollouts.'.join(mapped)}"
+                )
         if self.train_stage1 is None and self.models.base is None:
             raise ValueError("train_stage1: without it Stage II starts from models.base, and there is none")
         return self

@@ -24,9 +24,11 @@ class Predictor(Protocol):
     """
 
     views: tuple[str, ...]
-    view_sets: tuple[tuple[str, ...], ...] | None
     frames_per_unit: int
     needs_cameras: bool
+
+    @property
+    def view_sets(self) -> tuple[tuple[str, ...], ...] | None: ...
 
     def unit(self, frames: int) -> int: ...
 
@@ -71,7 +73,7 @@ def choose_episodes(config: RolloutConfig, episodes: EpisodeSet) -> list[int]:
 def plan_predictions(
     config: RolloutConfig,
     episodes: EpisodeSet,
-    tracks: ActionTracks,
+    tracks: ActionTracks | None,
     chosen: Sequence[int],
     predictor: Predictor,
     fps: float,
@@ -79,6 +81,7 @@ def plan_predictions(
     """Every prediction to make, and the chosen episodes of which none can be made, each with its reason.
 
     Args:
+        tracks: None for a predictor that no controls drive.
         fps: rate that recordings must have.
 
     Raises:
@@ -117,7 +120,8 @@ def plan_predictions(
     partners = {episodes.rows[position].episode_id: episodes.rows[position].episode_id for position in fitting}
     if config.actions == "shuffled":
         embodiment_of = {row.episode_id: row.embodiment for row in episodes.rows}
-        partners = shuffled_partners(list(partners), embodiment_of, tracks.episode_ids, config.seeds[0])
+        pool = list(partners) if tracks is None else tracks.episode_ids
+        partners = shuffled_partners(list(partners), embodiment_of, pool, config.seeds[0])
     planned: list[Prediction] = []
     for position, views in fitting.items():
         row = episodes.rows[position]
@@ -132,13 +136,13 @@ def plan_predictions(
 
 
 def _views(
-    config: RolloutConfig, row: EpisodeRow, tracks: ActionTracks, predictor: Predictor
+    config: RolloutConfig, row: EpisodeRow, tracks: ActionTracks | None, predictor: Predictor
 ) -> tuple[tuple[str, ...], tuple[str, str] | None]:
     """The views to predict of an episode, or a reason and what is the matter."""
-    if row.episode_id not in tracks:
+    if tracks is not None and row.episode_id not in tracks:
         return (), ("missing_actions", "no action tracks of this episode")
     recorded = tuple(view for view in predictor.views if view in row.views)
-    known = tracks.calibrated_views(row.episode_id) if predictor.needs_cameras else recorded
+    known = tracks.calibrated_views(row.episode_id) if tracks and predictor.needs_cameras else recorded
     views = tuple(view for view in recorded if view in known)
     sets = predictor.view_sets or (views, predictor.views[:1])
     if config.views != "all_present":

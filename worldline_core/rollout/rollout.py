@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from worldline_core.actions.action_tracks import changed_tracks
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
-from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks, open_controls
 from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
@@ -46,7 +46,8 @@ World = WorldLine | TextToVideo | FirstFrameCopy | GeSim
 
 
 def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    """Predict episodes of ``episodes`` with ``tracks``, ``tokenizer`` and, but for copying, ``checkpoint``.
+    """Predict episodes of ``episodes`` with ``tracks`` and, but for copying, ``tokenizer`` and ``checkpoint``. Predictions without
+    actions, and models of control vectors, do without ``tracks``.
 
     Writes a RolloutSet, video by video as it is predicted. Chosen episodes that cannot be predicted are listed in
     ``quarantine.parquet`` with a reason. Predictions already there are kept; a batch is made again as a whole if one of its videos
@@ -64,28 +65,33 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     """
     sampler = config.sampler
     without_model = isinstance(sampler, CopyFirstFrameConfig | GeSimConfig)
-    needed = {"episodes", "tracks", "tokenizer"} | (set() if without_model else {"checkpoint"})
+    needed = {"episodes"} | (set() if without_model else {"tokenizer", "checkpoint"})
     if not needed <= inputs.keys():
         raise ConfigError("The rollout lacks inputs", expected=sorted(needed), got=sorted(inputs))
     episodes = EpisodeSet.open(Path(inputs["episodes"]))
-    tracks = ActionTracks.open(Path(inputs["tracks"]))
     chosen = choose_episodes(config, episodes)
     rates = [float(episodes.rows[position].fps) for position in chosen]
     world: World
+    tracks: ActionTracks | None = None
+    if isinstance(sampler, CopyFirstFrameConfig | TextToVideoConfig) and "tracks" in inputs:
+        tracks = ActionTracks.open(Path(inputs["tracks"]))
     if isinstance(sampler, CopyFirstFrameConfig):
         world = FirstFrameCopy(episodes)
     elif isinstance(sampler, GeSimConfig):
+        tracks = open_controls(inputs, episodes, vectors=False)
+        tracks.episodes = episodes
         world = GeSim(sampler, episodes, tracks, config.stride)
         config = config.model_copy(update={"views": world.views, "batch_size": 1})
     elif isinstance(sampler, TextToVideoConfig):
         world = TextToVideo(config, sampler, Path(inputs["checkpoint"]), Path(inputs["tokenizer"]), episodes)
     else:
         world = _load(config, sampler, inputs, rates)
-    if isinstance(world, GeSim) or (isinstance(world, WorldLine) and world.info.config.native_size is not None):
-        tracks.episodes = episodes
+        tracks = open_controls(
+            inputs, episodes, vectors=not world.needs_cameras, controls=world.contract.controls
+        )  # fmt: skip
     fps = world.contract.fps if isinstance(world, WorldLine) else rates[0]
     planned, left_out = plan_predictions(config, episodes, tracks, chosen, world, fps)
-    if isinstance(world, WorldLine):
+    if isinstance(world, WorldLine) and tracks is not None:
         world.contract.require_tracks(dict.fromkeys(item.controls_of for item in planned), tracks)
     if left_out:
         write_quarantine(output, left_out)
@@ -176,14 +182,14 @@ def _observed(world: World, episodes: EpisodeSet, batch: Sequence[Prediction]) -
 
 
 def _predicted(
-    config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks, batch: Sequence[Prediction]
+    config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks | None, batch: Sequence[Prediction]
 ) -> Iterator[Frames]:
     """Frames of a batch, piece by piece."""
     images = _observed(world, episodes, batch)
     if not isinstance(world, WorldLine):
         yield from world.stream(images, batch)
         return
-    controls = [tracks.tracks(item.controls_of) for item in batch]
+    controls = [cast("ActionTracks", tracks).tracks(item.controls_of) for item in batch]
     if config.actions == "mirrored" or config.actions == "delayed":
         controls = [changed_tracks(control, config.actions) for control in controls]
     yield from world.stream(
@@ -215,11 +221,13 @@ def _write(
 
 
 def _timed_blocks(
-    config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks, item: Prediction
+    config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks | None, item: Prediction
 ) -> dict[str, list[float]] | None:
     """Seconds of the blocks of one long rollout, where the sampler asks for it."""
     sampler = config.sampler
-    if not isinstance(world, WorldLine) or not isinstance(sampler, BlockCausalConfig) or not sampler.timed_blocks:
+    if not isinstance(world, WorldLine) or not isinstance(sampler, BlockCausalConfig) or tracks is None:
+        return None
+    if not sampler.timed_blocks:
         return None
     first = encode_images(world.tokenizer, _observed(world, episodes, [item]).to(config.device))
     index = range(0, world.frames_per_unit + 1, TEMPORAL_FACTOR)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 import torch
@@ -50,10 +50,8 @@ class WorldLine:
             chained. None: all at once.
         frames_per_unit: a prediction has 1 + k times this many frames (k blocks, or k latent frames).
         image_size: (H, W) of the predicted frames.
-        needs_cameras: controls are drawn into the views.
+        needs_cameras: controls are drawn into the views; a model of control vectors needs no cameras.
     """
-
-    needs_cameras = True
 
     def __init__(
         self,
@@ -73,6 +71,7 @@ class WorldLine:
         self.device = device
         self.bfloat16 = bfloat16
         self.views, self.view_sets = info.views, info.view_sets
+        self.needs_cameras = info.config.native_size is None
         self.contract = info.contract
         self.causal = info.causal
         if self.causal is not None:
@@ -311,7 +310,8 @@ class WorldLine:
         if native is not None:
             maps = native_vectors(cut, views, native)
         else:
-            collated, size, sigma = collate_tracks(cut, views=views), cut[0].image_size, self.contract.sigma_px_ref
+            collated, size = collate_tracks(cut, views=views), cut[0].image_size
+            sigma = cast("float", self.contract.sigma_px_ref)
             maps = render_action_maps(collated, size, grid_size=self.contract.grid_size, sigma_px_ref=sigma)
         return stack_controls(maps.to(self.device), count)
 

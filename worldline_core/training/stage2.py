@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.actions.episode_tracks import open_controls
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
@@ -63,7 +63,7 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     """
     parent = Path(inputs["stage1"])
     native = config.native_size is not None
-    tracks = ActionTracks.open(Path(inputs["tracks"]), EpisodeSet.open(Path(inputs["episodes"])) if native else None)
+    tracks = open_controls(inputs, EpisodeSet.open(Path(inputs["episodes"])), vectors=native)
 
     def load_model() -> tuple[WorldModel, CheckpointInfo]:
         model, info = load_checkpoint(
@@ -84,7 +84,7 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         {
             "controls": tracks.tracks(stage.training_rows[0].episode_id).controls,
             "fps": stage.episodes.rows[0].fps,
-            "sigma_px_ref": tracks.sigma_px_ref,
+            "sigma_px_ref": None if native else tracks.sigma_px_ref,
             "grid_size": stage.source.latent_shape[1:],
             "tokenizer": stage.source.description["tokenizer"],
         }
@@ -99,7 +99,7 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
             )  # fmt: skip
         kept = {"sigma_px_ref", "tokenizer", "fps"}
         learnt.require_tracks((row.episode_id for row in stage.rows), tracks)
-        learnt.require(where=inputs["tracks"], **contract.model_dump(include=kept))
+        learnt.require(where=tracks.root, **contract.model_dump(include=kept))
     seen = Counter(row.embodiment for row in stage.training_rows)
     if learnt is not None:
         known = before.metadata.get("embodiments")

@@ -97,6 +97,7 @@ class EpisodeMeasurement:
     """Measures predictions of one episode.
 
     Args:
+        tracks: None measures full frames alone, as of an episode without tracks.
         segmenters: by the suffix of their metrics.
         lpips: None where it is not available.
         metrics: metrics on request, by name.
@@ -105,14 +106,15 @@ class EpisodeMeasurement:
     def __init__(
         self,
         episodes: EpisodeSet,
-        tracks: ActionTracks,
+        tracks: ActionTracks | None,
         row: EpisodeRow,
         views: Sequence[str],
         segmenters: Mapping[str, Segmenter],
         lpips: LPIPS | None,
         metrics: Mapping[str, Metric],
     ) -> None:
-        self.episodes, self.tracks, self.segmenters, self.lpips = episodes, tracks, segmenters, lpips
+        self.tracks = tracks if tracks and row.episode_id in tracks else None
+        self.episodes, self.segmenters, self.lpips = episodes, segmenters if self.tracks else {}, lpips
         self.row, self.episode_id = row, row.episode_id
         self.metrics = metrics
         self.finds_tools = any(metric.needs in ("tool_paths", "changed_controls") for metric in metrics.values())
@@ -153,7 +155,7 @@ class EpisodeMeasurement:
 
     def _path_values(self, places: Sequence[np.ndarray], stride: int) -> dict[str, Any]:
         """Values of a whole video, and where its tools were found: (n, arms, 2), hundredths of the frame's height."""
-        if not places:
+        if not places or self.tracks is None:
             return {}
         scale = 100.0 / self.tracks.tracks(self.episode_id).image_size[0]
         found = scale * np.concatenate(places)
@@ -182,7 +184,9 @@ class EpisodeMeasurement:
                 longest = max(longest, len(predicted))
                 videos[method, seed, view] = _Video(predicted, segmenters, self.thing)
         true = _Video(recording, segmenters, self.thing)
-        known = self._recorded_pieces(true, stride, longest) if view == HEAD and videos else None
+        known = None
+        if view == HEAD and videos and self.tracks is not None:
+            known = self._recorded_pieces(self.tracks, true, stride, longest)
         for begin in range(0, longest, PIECE_FRAMES):
             piece = None if known is None else next(known)
             frames = next(true.pieces)[: longest - begin] if piece is None else piece.frames
@@ -195,7 +199,7 @@ class EpisodeMeasurement:
                         self._add_robot(video, predicted, piece)
         return videos, dict(true.values)
 
-    def _recorded_pieces(self, true: _Video, stride: int, count: int) -> Iterator[_Piece]:
+    def _recorded_pieces(self, tracks: ActionTracks, true: _Video, stride: int, count: int) -> Iterator[_Piece]:
         """The first ``count`` frames of the recorded head view piece by piece; adds the accuracy of masks to ``true``.
 
         Raises: DataError when fewer exact masks than frames are there.
@@ -210,7 +214,7 @@ class EpisodeMeasurement:
         for name, images in (("robot masks", exact), ("labels of things", labels)):
             if images is not None:
                 _require_length(len(images), count, f"{name} of {self.episode_id}, view {HEAD}")
-        points = tool_points(self.tracks, self.episode_id, count, stride)
+        points = tool_points(tracks, self.episode_id, count, stride)
         exact_pieces, label_pieces = (None if x is None else pieces(x, PIECE_FRAMES) for x in (exact, labels))
         first: tuple[np.ndarray, np.ndarray] | None = None
         first_thing: np.ndarray | None = None

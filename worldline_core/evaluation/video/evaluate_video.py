@@ -27,7 +27,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.evaluation.metric_registry import METRICS, requested
-from worldline_core.evaluation.recordings import HEAD, open_rollouts, rows_of, stride_of, tool_points
+from worldline_core.evaluation.recordings import HEAD, open_rollouts, open_tracks, rows_of, stride_of, tool_points
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
     TRUE_METHOD,
@@ -55,16 +55,16 @@ _BY_FRAME_COLUMNS: tuple[str, ...] = ("method", "split", "view", "metric", "fram
 def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Measure every RolloutSet against the recordings.
 
-    Inputs: episodes, tracks, rollouts.<method> (one or more), segmenter (the folder of the learned one).
+    Inputs: episodes, rollouts.<method> (one or more), tracks, segmenter (the folder of the learned one). Full frames alone (PSNR, SSIM,
+    LPIPS) are measured of recordings without tracks.
     Output: scores.parquet (one row per method, episode, view, seed and metric), by_frame.parquet (means over
     trajectories of each frame), summary.json.
     """
     episodes = EpisodeSet.open(inputs["episodes"])
-    tracks = ActionTracks.open(inputs["tracks"])
-    rollouts = open_rollouts(inputs)
+    tracks, rollouts = open_tracks(inputs), open_rollouts(inputs)
     segmenters = {
         f"[{name}]" if place else "": open_segmenter(name, learned=inputs.get("segmenter"), sam3=config.sam3_weights)
-        for place, name in enumerate(config.segmenters)
+        for place, name in enumerate(config.segmenters if tracks else ())
     }
     metrics = requested(config.metrics)
     check_changed_controls(config, list(rollouts))
@@ -92,6 +92,9 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
         return [(method, row, kept_part(path, partial(made.__getitem__, method))) for method, path in files.items()]
 
     rows = rows_of(episodes, set().union(*predicted.values()))
+    if without := sum(tracks is None or row.episode_id not in tracks for row in rows):
+        missing = f"{without} of {len(rows)} recordings have no action tracks"
+        unavailable |= dict.fromkeys(("robot_iou", "end_effector_error_px", *metrics), missing)
     records: list[Measured] = []
     with (
         _workers(on_gpu="sam3" in config.segmenters) as pool,
@@ -100,7 +103,7 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
         for found in pool.map(measure, rows):
             records += found
             progress.advance()
-    pairs = list(controlled_values(config, records, tracks, rollouts))
+    pairs = [] if tracks is None else list(controlled_values(config, records, tracks, rollouts))
     return _write(config, records, pairs, segmenters, unavailable, output)
 
 
