@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -86,21 +86,18 @@ def read_batch(
         DataError: a clip cannot be read, or nothing readable can be found for it.
         ArtifactError: the source does not hold what is asked of it.
     """
-    clips: list[Clip] = []
-    data: list[Tensor] = []
+    read: list[tuple[Clip, Tensor]] = []
     skipped: list[tuple[Clip, str]] = []
     for place, clip in enumerate(batch.clips):
         for attempt in range(_ATTEMPTS):
             try:
-                data.append(source.read(clip, recorded_views(source, batch, clip)))
+                read.append((clip, source.read(clip, recorded_views(source, batch, clip))))
+                break
             except DataError as error:
                 if replacement is None:
                     raise
                 skipped.append((clip, str(error)))
                 clip = replacement(place, attempt)
-            else:
-                clips.append(clip)
-                break
         else:
             raise DataError(
                 "No readable clip was found.",
@@ -109,7 +106,8 @@ def read_batch(
                 got=skipped[-1][1],
                 next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
             )
-    return ReadBatch(replace(batch, clips=tuple(clips)), torch.stack(data), tuple(skipped))
+    clips, data = zip(*read, strict=True)
+    return ReadBatch(replace(batch, clips=clips), torch.stack(data), tuple(skipped))
 
 
 def read_ahead(
@@ -195,48 +193,39 @@ class Batch:
         return tuple(clip.episode_id for clip in self.clips)
 
 
+@dataclass
 class ClipLoader:
     """Turns clips into batches.
 
-    Args:
+    Attributes:
         source: where clips are read from. With resident latents, action tracks are resident, too.
         views: the model's slots.
-        text: turns instructions into ids; its prompts may name a clip's duration and size.
         tracks: controls; the maps get the width that the tracks were made for.
+        text: turns instructions into ids; its prompts may name a clip's duration and size.
+        frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
+            rate.
         native_size: of the control vectors that are given instead of maps, where the model takes these.
         action_frames: control frames whose maps a latent frame takes.
         object_weights: loss weights of clips; None: all places count alike.
-        frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
-            rate.
     """
 
-    def __init__(
-        self,
-        source: ClipSource,
-        *,
-        views: tuple[str, ...],
-        tracks: ActionTracks | None = None,
-        text: TextEncoder | None = None,
-        frame_rates: Mapping[str, float] | None = None,
-        native_size: int | None = None,
-        action_frames: int = 1,
-        object_weights: ObjectWeights | None = None,
-        device: str = "cpu",
-    ) -> None:
-        self.source = source
-        self.views = views
-        self.tracks = tracks
-        self.text = text
-        self.frame_rates = frame_rates or {}
-        self.native_size = native_size
-        self.action_frames = action_frames
-        self.object_weights = object_weights
-        self.device = device
+    source: ClipSource
+    _: KW_ONLY
+    views: tuple[str, ...]
+    tracks: ActionTracks | None = None
+    text: TextEncoder | None = None
+    frame_rates: Mapping[str, float] = field(default_factory=dict)
+    native_size: int | None = None
+    action_frames: int = 1
+    object_weights: ObjectWeights | None = None
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
         self._tracks: dict[str, EpisodeTracks] = {}
         self._resident: ResidentTracks | None = None
-        if isinstance(source, ResidentLatents) and tracks and not native_size:
-            names = [row.episode_id for row in source.rows if row.episode_id in tracks]
-            self._resident = ResidentTracks(tracks, names, views, device)
+        if isinstance(self.source, ResidentLatents) and self.tracks and not self.native_size:
+            names = [row.episode_id for row in self.source.rows if row.episode_id in self.tracks]
+            self._resident = ResidentTracks(self.tracks, names, self.views, self.device)
 
     def batches(
         self, sampler: ClipSampler, reading: ReadingConfig, run: Path | None = None, stop: int | None = None
@@ -275,7 +264,7 @@ class ClipLoader:
             ahead = (index + 1, batches)
             if read.skipped and run is not None:
                 _record_skipped(run, index, read.skipped)
-            return self.finish(read)
+            return self._finish(read)
 
         return load
 
@@ -286,19 +275,14 @@ class ClipLoader:
             ArtifactError: if the source or the tracks lack an episode.
             DataError: if a clip is damaged, or cached latents are not finite.
         """
-        return self.finish(read_batch(self.source, batch))
+        return self._finish(read_batch(self.source, batch))
 
-    def finish(self, read: ReadBatch) -> Batch:
-        """Turn clips that were read into a batch.
-
-        Raises:
-            ArtifactError: if the tracks lack an episode.
-        """
+    def _finish(self, read: ReadBatch) -> Batch:
         frames = read.data if read.data.dtype == torch.uint8 else None
         return self.conditioned(read.batch, self.source.latents(read.data, self.device), frames)
 
     def conditioned(self, batch: ClipBatch, latents: Tensor, frames: Tensor | None = None) -> Batch:
-        """Latents of a batch's clips, with the conditions that this loader adds; raises as `finish` does."""
+        """Latents of a batch's clips, with the conditions that this loader adds. Raises: ArtifactError: the tracks lack an episode."""
         clips, views = batch.clips, batch.views
         maps = None if self.tracks is None else self.action_maps(clips, views)
         ids = mask = None
@@ -310,9 +294,8 @@ class ClipLoader:
         fps = None if rates is None else torch.tensor(rates, device=self.device)
         weights = None
         if self.object_weights is not None:
-            weights = self.object_weights(clips, [recorded_views(self.source, batch, clip) for clip in clips]).to(
-                self.device
-            )
+            recorded = [recorded_views(self.source, batch, clip) for clip in clips]
+            weights = self.object_weights(clips, recorded).to(self.device)
         return Batch(clips, views, latents, maps, ids, mask, frames, fps, weights)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:

@@ -16,7 +16,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import torch
 from einops import rearrange
-from jaxtyping import Float, Int, Shaped, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -130,10 +130,11 @@ class LatentStore(ClipSource):
       clip.
     """
 
+    rows: list[LatentRow]
+
     def __init__(self, root: Path, description: dict[str, Any], rows: Sequence[LatentRow]) -> None:
         super().__init__(rows)
-        self.root = root
-        self.description = description
+        self.root, self.description = root, description
         self.layout: Layout = description["layout"]
         self.start_step = description["start_step"]
         self.strides: tuple[int, ...] = tuple(description["strides"])
@@ -249,38 +250,22 @@ class LatentStore(ClipSource):
             )
 
 
-class ResidentLatents(ClipSource):
-    """All latents of a store on one device, in half precision: what is "read" of a clip are the numbers of its frames."""
+class ResidentLatents(LatentStore):
+    """A store whose latents are all on one device, in half precision."""
 
     def __init__(self, store: LatentStore, device: str) -> None:
-        super().__init__(store.rows)
-        self.store = store
-        self.root, self.start_step, self.image_size = store.root, store.start_step, store.image_size
-        self.latent_shape, self.description = store.latent_shape, store.description
-        self._first: dict[str, tuple[int, int]] = {}  # by tensor: number of its first frame, frames of a view
-        frames: list[Tensor] = []
-        count = 0
+        super().__init__(store.root, store.description, store.rows)
+        self._tensors: dict[str, Tensor] = {}
         for row in with_progress(self.rows, "reading latents", "episode"):
             with store.shard(row.episode_id) as shard:
                 for name in (name for name in shard.keys() if name.startswith(f"{row.episode_id}/")):  # noqa: SIM118
-                    tensor = shard.get_tensor(name)
-                    store.require_finite(tensor, row.episode_id)
-                    self._first[name] = (count, tensor.shape[2])
-                    frames.append(rearrange(tensor, "v c t h w -> (v t) c h w").to(device, torch.float16))
-                    count += len(frames[-1])
-        self._frames = torch.cat(frames)
+                    self.require_finite(tensor := shard.get_tensor(name), row.episode_id)
+                    self._tensors[name] = tensor.to(device, torch.float16)
 
-    def read(self, clip: Clip, views: tuple[str, ...]) -> Int[Tensor, "v t"]:
-        """Numbers of the clip's latent frames; raises as `LatentStore.read` does."""
-        selected = torch.tensor(self.store.stored_views(clip, views))
-        numbers = []
-        for name, first, stop in self.store.parts(clip):
-            number, per_view = self._first[name]
-            numbers.append((number + selected * per_view)[:, None] + torch.arange(first, stop))
-        return torch.cat(numbers, dim=1)
-
-    def latents(self, read: Int[Tensor, "b v t"], device: str) -> Float[Tensor, "b v c t h w"]:
-        return rearrange(self._frames[read.to(device)], "b v t c h w -> b v c t h w").float().contiguous()
+    def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
+        selected = self.stored_views(clip, views)
+        frames = [self._tensors[name][:, :, first:stop] for name, first, stop in self.parts(clip)]
+        return torch.cat(frames, dim=2)[selected].float()
 
 
 class ResidentTracks:
