@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import shutil
@@ -21,7 +22,12 @@ from tests.policies.test_openpi import policy_server
 from worldline_core import WorldLine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import UnavailableError
+from worldline_core.pictures import jpeg_bytes
+from worldline_core.serving import play_session
 from worldline_core.serving.client import SimulatorClient
+from worldline_core.serving.play_session import PlaySession
+from worldline_core.serving.serve_config import ServeConfig
+from worldline_core.serving.session_host import SessionHost
 
 EPISODE = "ur5e_silver-test-s1-00000"
 
@@ -170,6 +176,17 @@ def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, s
             page.screenshot(tmp_path / "saved.png")
             latency = page.value("window.play.latency")
             assert len(latency) >= 1
+            page.value("go(0); untaken = 80; run(true)")
+            page.until("document.getElementById('said').textContent.includes('The server is busy')")
+            page.value("untaken = 1")
+            page.until("document.getElementById('said').textContent === ''")
+            # No label breaks into two lines.
+            assert (
+                page.value(
+                    "Math.max(...[...document.querySelectorAll('.bar label, #tree button')].map((x) => x.offsetHeight))"
+                )
+                < 40
+            )
             drag_and_steer(page, begin)
             assert page.messages == []
     episodes = EpisodeSet.open(Path(saved["path"]))
@@ -278,6 +295,51 @@ def test_driving_branches_a_policy_and_saving(serving: Callable, tmp_path: Path)
     assert episode.cameras["right_wrist"].moving
     assert not episode.cameras["head"].moving
     assert episode.conventions["started_at"] == EPISODE
+
+
+def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(
+    small_world: WorldLine, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(play_session, "KEPT_EVERY", 4)
+    monkeypatch.setattr(play_session, "KEPT_LAST", 2)
+    host = SessionHost(
+        small_world, ServeConfig.model_validate({"episodes": shipped / "recordings", "output": tmp_path})
+    )
+    sent: list[dict[str, Any]] = []
+    pictures: list[bytes] = []
+
+    async def send(content: str | bytes) -> None:
+        if isinstance(content, bytes):
+            head = content[4 : 4 + int.from_bytes(content[:4], "little")]
+            pictures.append(content[4 + len(head) :])
+            content = head.decode()
+        sent.append(json.loads(content))
+
+    async def drive() -> None:
+        session = PlaySession(host, send)
+
+        async def block() -> None:
+            for _ in range(4):
+                await session.receive(json.dumps({"type": "tick", "arms": [{}, {"move": [0, 0, 1]}]}))
+            await session._settled()
+
+        await session.receive(json.dumps({"type": "start", "episode": EPISODE}))
+        for _ in range(9):
+            await block()
+        assert sorted(session._kept) == [0, 4, 7, 8, 9]
+        for _ in range(2):  # from a simulation that is computed again, then from the one that is kept now
+            await session.receive(json.dumps({"type": "go", "node": 2}))
+            await block()
+        assert pictures[-1] == pictures[-2]
+        stored = list(session._frames(session._nodes[3], "head"))
+        assert jpeg_bytes(stored[0], 93) == pictures[3][: len(jpeg_bytes(stored[0], 93))]
+        await session.receive(json.dumps({"type": "save"}))
+        await session.close()
+
+    asyncio.run(drive())
+    host.shut_down()
+    assert sent[-1]["frames"] == 13
+    assert not [message for message in sent if message["type"] == "error"]
 
 
 def test_somebody_at_the_page_takes_the_room_of_a_session(serving: Callable) -> None:

@@ -15,7 +15,6 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from tests.policies.test_openpi import policy_server  # pyright: ignore[reportMissingImports]
 from worldline_core import WorldLine
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import unpack
@@ -69,6 +68,9 @@ def test_a_session_is_the_simulation_of_one_process(url: str, small_world: World
             assert np.array_equal(there.commands, here.commands)
             assert np.array_equal(there.tool_poses, here.tool_poses)
         assert there.num_frames == here.num_frames == 13
+        for seeds, same in ((None, True), ([3], False)):  # the clip's own seed, begun anew
+            branch, onward, controls = there.fork(1, seeds), there.fork(1), np.repeat(here.state[:, None], 4, axis=1)
+            assert np.array_equal(branch.step(controls)[0]["head"], onward.step(controls)[0]["head"]) is same
         branches = there.fork(2)
         controls = np.repeat(here.state[:, None], 4, axis=1)
         both, one = branches.step(np.concatenate((controls, controls + 0.1))), there.step(controls)
@@ -182,6 +184,15 @@ def test_many_sessions_at_once_are_neither_lost_nor_mixed_up(serving: Callable) 
 
 @pytest.mark.slow
 def test_limits_refuse_and_free_again(serving: Callable) -> None:
+    with serving(max_sessions_per_connection=2) as url, SimulatorClient(url) as client, SimulatorClient(url) as other:
+        first = client.start(EPISODE)
+        first.fork(1)
+        for begin in (lambda: client.start(EPISODE), lambda: first.fork(1)):
+            with pytest.raises(UnavailableError, match=r"(?s)A connection has as many sessions.*at most 2"):
+                begin()
+        other.start(EPISODE)
+        first.close()
+        client.start(EPISODE)
     with serving(max_sessions=2, max_clips=3, max_connections=2, max_message_bytes=1 << 20, idle_s=0.6) as url:
         with SimulatorClient(url) as client:
             client.start(EPISODE)
@@ -274,13 +285,15 @@ def test_connections_that_say_nothing_are_closed_and_bounded(
             client.start(EPISODE)  # a websocket stays
 
 
-def test_another_server_is_no_simulator() -> None:
-    for metadata, match in (([], "no map"), ({"name": "x"}, r"(?s)Not a server of the simulator.*got: name")):
-        with policy_server(lambda _: {}, metadata=metadata) as url, pytest.raises(DataError, match=match):
-            SimulatorClient(url)
-    with (
-        policy_server(lambda _: {"error": "no"}, metadata={"protocol": 1}) as url,
-        SimulatorClient(url) as client,
-        pytest.raises(DataError, match="error is not understood"),
-    ):
+@pytest.mark.parametrize("path", ["/v1", "/play/session"])
+def test_a_text_that_is_no_utf8_ends_its_connection_alone(
+    url: str, path: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connect(url + path, proxy=None) as page:
+        page.recv()
+        page.socket.sendall(b"\x81\x82" + bytes(4) + b"\xff\xfe")
+        with pytest.raises(ConnectionClosed, match="1007"):
+            page.recv()
+    assert not [record for record in caplog.records if record.exc_info]
+    with SimulatorClient(url) as client:
         client.start(EPISODE)

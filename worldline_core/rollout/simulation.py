@@ -338,7 +338,7 @@ class Simulation:
         is. The history of a causal model is shared, not copied.
 
         Args:
-            seeds: of the noise of each branch from here on. By default all branches of a clip go on with its noise, so they
+            seeds: of the noise of each branch from here on, which begins anew even with the clip's own. By default all branches of a clip go on with its noise, so they
                 differ by their controls alone, and each equals a simulation that was driven so from its start.
 
         Raises:

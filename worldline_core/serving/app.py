@@ -26,6 +26,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.pages.page import render
@@ -200,6 +201,19 @@ def patient_http(most: int, patience_s: float) -> type[H11Protocol]:
     return PatientHttp
 
 
+class QuietWebSocket(WebSocketsSansIOProtocol):
+    """Uvicorn's websocket, which logs a traceback for a text that is no UTF-8; the connection ends with code 1007 all the same."""
+
+    def send_receive_event_to_app(self) -> None:
+        try:
+            b"".join(self.frames).decode() if self.curr_msg_data_type == "text" else None
+        except UnicodeDecodeError:
+            self.conn.send_close(1007)
+            self.handle_parser_exception()
+            return
+        super().send_receive_event_to_app()
+
+
 def server_token(config: ServeConfig) -> str | None:
     """The token that clients must show, from the environment.
 
@@ -239,7 +253,7 @@ def make_server(world: WorldLine, config: ServeConfig, token: str | None) -> uvi
     host = SessionHost(world, config)
     host.warm_up()
     settings = uvicorn.Config(
-        make_app(host, token), config.host, config.port, http=patient_http(2 * config.max_connections, TAKE_S), ws="websockets-sansio", ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
+        make_app(host, token), config.host, config.port, http=patient_http(2 * config.max_connections, TAKE_S), ws=QuietWebSocket, ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
         timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning", server_header=False,
     )  # fmt: skip
     return uvicorn.Server(settings)

@@ -5,6 +5,7 @@ const play = { blocks: 0, node: null, marks: null, position: null, saved: null, 
 window.play = play;  // what tests and the curious read
 let hello = null, started = null, running = false, behind = false, asked = false, arm = 0, goal = null;
 let nodes = new Map(), queue = [], showing = null, ticks = 0, due = [], begun = 0, seen = [];
+let untaken = 0, busy = false;  // commands that the server has not answered yet, and whether there are too many
 const keys = new Set();
 const token = new URLSearchParams(location.hash.slice(1)).get("token");
 const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/play/session${token ? `?token=${encodeURIComponent(token)}` : ""}`);
@@ -56,9 +57,12 @@ function frame() {
   const policy = $("driver").value;
   if (running && policy) {
     if (!asked && queue.length <= started.frames_per_step / 2) { asked = true; due.push(performance.now()); tell({ type: "advance", policy }); }
+  } else if (running && !behind && untaken >= hello.fps) {
+    busy = true;
+    say(`The server is busy: it has not taken ${untaken} commands (${(untaken / hello.fps).toFixed(1)} s). Further ones wait.`);
   } else if (running && !behind) {
     tell({ type: "tick", arms: started.arms.map((_, index) => (index === arm ? wish() : {})) });
-    ticks += 1;
+    ticks += 1; untaken += 1;
     if (ticks % started.frames_per_step === 0) due.push(performance.now());
   }
   draw();
@@ -107,7 +111,7 @@ async function block(data) {
   for (let i = 0; i < head.frames; i += 1) {
     frames.push({ marks: head.marks[i], pictures: Object.fromEntries(head.views.map((view, v) => [view, pictures[i * head.views.length + v]])) });
   }
-  nodes.set(head.node, { ...head, shown: frames });
+  nodes.set(head.node, { parent: head.parent, driver: head.driver, last: frames.at(-1) });  // all pictures would fill the memory
   play.node = head.node; play.blocks = nodes.size - 1;
   asked = false; behind = false;
   if (head.node === 0) { queue = []; showing = frames[0]; $("first").textContent = `${((performance.now() - begun) / 1000).toFixed(2)} s`; }
@@ -145,7 +149,7 @@ function go(number) {
   run(false);
   const node = nodes.get(number);
   if (!node) return;
-  play.node = number; queue = []; due = []; ticks = 0; asked = false; showing = node.shown.at(-1);
+  play.node = number; queue = []; due = []; ticks = 0; asked = false; showing = node.last;
   tell({ type: "go", node: number });
   tree(); draw();
   say(`At ${number === 0 ? "the start" : `block ${number}`}: what follows is a branch of its own.`);
@@ -167,7 +171,7 @@ socket.addEventListener("message", ({ data }) => {
     say("Choose a recording and press Start.");
     setInterval(frame, 1000 / message.fps);
   } else if (message.type === "started") {
-    started = message; nodes = new Map(); queue = []; showing = null; ticks = 0; due = []; goal = null; asked = false; behind = false;
+    started = message; nodes = new Map(); queue = []; showing = null; ticks = 0; due = []; goal = null; asked = false; behind = false; untaken = 0;
     $("about").textContent = `${message.embodiment} · ${message.instruction}`;
     $("views").replaceChildren(...message.views.map((view) => {
       const figure = document.createElement("figure"), canvas = document.createElement("canvas"), caption = document.createElement("figcaption");
@@ -181,17 +185,18 @@ socket.addEventListener("message", ({ data }) => {
     for (const button of document.querySelectorAll("button:disabled")) button.disabled = false;
     say("Press Run, or any key of those below.");
   } else if (message.type === "marks") {
-    play.marks = message.views; play.position = message.position;
-    $("pending").textContent = `${message.pending} of ${started.frames_per_step}`;
+    play.marks = message.views; play.position = message.position; untaken = Math.max(0, untaken - 1);
+    if (busy && untaken < hello.fps / 2) { busy = false; say(""); }
+    $("pending").textContent = `${message.pending + untaken} of ${started.frames_per_step}`;
   } else if (message.type === "behind") {
-    behind = true; ticks -= 1;
+    behind = true; ticks -= 1; untaken = Math.max(0, untaken - 1);
     if ((ticks + 1) % started.frames_per_step === 0) due.pop();
     say("The simulator is behind: commands wait until its pictures have caught up.");
   } else if (message.type === "saved") {
     play.saved = message;
     say(`Saved ${message.frames} frames: ${message.path}`);
   } else if (message.type === "error") {
-    play.error = message; asked = false; behind = false; due = [];
+    play.error = message; asked = false; behind = false; due = []; untaken = 0;
     run(false);
     say([message.what, message.where, message.expected && `expected ${message.expected}`, message.got && `got ${message.got}`, message.next_step].filter(Boolean).join(" · "), true);
   }

@@ -3,6 +3,9 @@
 Every tick is one frame at the model's rate. When as many commands are there as a block takes, the block is predicted while the
 next ticks come in; one block may wait, then ticks are refused until the pictures catch up. Every block is a node of a tree: to go back is
 to choose a node, and whatever follows there is a branch of its own.
+
+Of a long session little stays in memory: pictures go to a temporary file, and only some nodes keep their simulation; others are
+computed again, which gives the same bytes.
 """
 
 from __future__ import annotations
@@ -10,12 +13,12 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import tempfile
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,7 +32,7 @@ from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.frames import Frames, MadeFrames
-from worldline_core.errors import DataError, WorldLineError
+from worldline_core.errors import DataError, UnavailableError, WorldLineError
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.transforms import nearest_rotation
 from worldline_core.pictures import jpeg_bytes
@@ -42,6 +45,8 @@ from worldline_core.serving.teleoperation import ArmInput, Teleoperation, frame_
 
 BY_HAND = "by hand"
 JPEG_QUALITY = 93
+KEPT_EVERY, KEPT_LAST = 16, 4
+"""Nodes that keep their simulation: by depth in the tree, and the last ones used."""
 
 
 class _Message(BaseModel):
@@ -92,14 +97,16 @@ class Node:
     """A moment, and the block that led to it; the first one holds the observed frame.
 
     Attributes:
-        simulation: as it is there.
-        frames: by view.
+        depth: blocks from the start.
+        given: (n, j), the controls of the block, before the limits.
+        place: of the pictures in the session's file, each view after the other.
         states, commands: (n, j).
     """
 
     parent: int | None
-    simulation: Simulation
-    frames: dict[str, np.ndarray]
+    depth: int
+    given: np.ndarray
+    place: int
     states: np.ndarray
     commands: np.ndarray
     driver: str
@@ -119,6 +126,8 @@ class PlaySession:
         self._start: RecordedStart
         self._hand: Teleoperation | None = None
         self._nodes: list[Node] = []
+        self._kept: dict[int, Simulation] = {}
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115  (until `close`)
         self._current, self._seed = 0, 0
         self._pending: list[np.ndarray] = []
         self._working: asyncio.Task[None] | None = None
@@ -174,8 +183,10 @@ class PlaySession:
         kinematics = self._host.kinematics.get(row.embodiment)
         hand = await asyncio.to_thread(Teleoperation, start, kinematics, simulation.fps)
         first = {view: picture[None] for view, picture in simulation.pictures[0].items()}
-        self._nodes = [Node(None, simulation, first, simulation.states[0], simulation.commands[0], "recording")]
-        self._current, self._seed, self._hand = 0, seed, hand
+        self._nodes, self._kept = [], {}
+        self._file.truncate(0)
+        await self._add(None, simulation, simulation.commands[0], first, "recording")
+        self._seed, self._hand = seed, hand
         self._pending.clear()
         arms = [arm.name for arm in kinematics.embodiment.arms]
         await self._send(json.dumps({
@@ -183,11 +194,11 @@ class PlaySession:
             "instruction": row.instruction, "frames_per_step": simulation.frames_per_step,
             "views": list(first), "seconds": time.monotonic() - begin,
         }))  # fmt: skip
-        await self._send_block(0, time.monotonic() - begin, [hand.marks()["views"]])
+        await self._send_block(first, time.monotonic() - begin, [hand.marks()["views"]])
         await self._send_marks(hand)
 
     async def _tick(self, hand: Teleoperation, message: Tick) -> None:
-        size = self._nodes[0].simulation.frames_per_step
+        size = self._kept[0].frames_per_step
         if len(self._pending) >= size and self._working is not None:
             await self._send(json.dumps({"type": "behind"}))
             return
@@ -237,24 +248,74 @@ class PlaySession:
                 next_step="save it, and start again",
             )  # fmt: skip
         begin, parent = time.monotonic(), self._current
-        simulation = self._nodes[parent].simulation.copy()
-        frames = (await self._host.compute(lambda: simulation.step(rows[None])))[0]
+
+        def predict() -> tuple[Simulation, dict[str, np.ndarray]]:
+            simulation = self._reached(parent)
+            return simulation, simulation.step(rows[None])[0]
+
+        simulation, frames = await self._host.compute(predict)
         seconds = time.monotonic() - begin
-        self._nodes.append(Node(parent, simulation, frames, simulation.states[0], simulation.commands[0], driver))
-        self._current = len(self._nodes) - 1
+        await self._add(parent, simulation, rows, frames, driver)
         tracks = simulation.tracks[0]
         marks = [frame_marks(tracks, frame, list(frames)) for frame in range(len(rows))]
-        await self._send_block(self._current, seconds, marks)
+        await self._send_block(frames, seconds, marks)
 
-    async def _send_block(self, number: int, seconds: float, marks: list[dict[str, Any]]) -> None:
-        node = self._nodes[number]
-        count = len(next(iter(node.frames.values())))
+    async def _add(
+        self, parent: int | None, simulation: Simulation, given: np.ndarray, frames: dict[str, np.ndarray], driver: str
+    ) -> None:
+        """Make a node, and go there."""
+        depth, place = 0 if parent is None else self._nodes[parent].depth + 1, self._file.seek(0, os.SEEK_END)
+        try:
+            await asyncio.to_thread(lambda: self._file.write(b"".join(video.tobytes() for video in frames.values())))
+            self._file.flush()
+        except OSError as error:
+            raise UnavailableError(
+                "The pictures of a block could not be kept", where=tempfile.gettempdir(), got=error.strerror,
+                next_step="save, make room there (or set TMPDIR), and start again",
+            ) from error  # fmt: skip
+        self._nodes.append(Node(parent, depth, given, place, simulation.states[0], simulation.commands[0], driver))
+        self._current = len(self._nodes) - 1
+        self._keep(self._current, simulation)
+
+    def _keep(self, number: int, simulation: Simulation) -> None:
+        self._kept.pop(number, None)
+        self._kept[number] = simulation  # at the end: the last used
+        passing = [kept for kept in self._kept if self._nodes[kept].depth % KEPT_EVERY]
+        for kept in passing[:-KEPT_LAST]:
+            del self._kept[kept]
+
+    def _reached(self, number: int) -> Simulation:
+        """A copy of the simulation at a node, computed again from the nearest one that is kept."""
+        way: list[Node] = []
+        start = number
+        while start not in self._kept:
+            way.append(node := self._nodes[start])
+            start = node.parent or 0
+        simulation = self._kept[start].copy()
+        for node in reversed(way):
+            simulation.step(node.given[None])
+        if way:
+            self._keep(number, simulation.copy())
+        return simulation
+
+    def _frames(self, node: Node, view: str) -> Iterator[np.ndarray]:
+        """The pictures of a node, from the file."""
+        height, width = self._kept[0].image_size
+        size = height * width * 3
+        place = node.place + list(self._kept[0].views).index(view) * len(node.states) * size
+        for frame in range(len(node.states)):
+            content = os.pread(self._file.fileno(), size, place + frame * size)
+            yield np.frombuffer(content, np.uint8).reshape(height, width, 3)
+
+    async def _send_block(self, frames: dict[str, np.ndarray], seconds: float, marks: list[dict[str, Any]]) -> None:
+        node = self._nodes[self._current]
+        count = len(node.states)
         pictures = await asyncio.to_thread(
-            lambda: [jpeg_bytes(video[i], JPEG_QUALITY) for i in range(count) for video in node.frames.values()]
+            lambda: [jpeg_bytes(video[i], JPEG_QUALITY) for i in range(count) for video in frames.values()]
         )
         head = json.dumps({
-            "type": "block", "node": number, "parent": node.parent, "driver": node.driver, "frames": count,
-            "views": list(node.frames), "sizes": [len(picture) for picture in pictures], "seconds": seconds, "marks": marks,
+            "type": "block", "node": self._current, "parent": node.parent, "driver": node.driver, "frames": count,
+            "views": list(frames), "sizes": [len(picture) for picture in pictures], "seconds": seconds, "marks": marks,
         }).encode()  # fmt: skip
         await self._send(len(head).to_bytes(4, "little") + head + b"".join(pictures))
 
@@ -265,7 +326,8 @@ class PlaySession:
                 "No such policy", expected=list(self._host.config.policies) or "policies in the settings", got=name
             )
         self._pending.clear()
-        simulation = self._nodes[self._current].simulation
+        current = self._current
+        simulation = await self._host.compute(lambda: self._reached(current))
         observation: dict[str, Any] = {
             policy.image_keys[view]: picture
             for view, picture in simulation.pictures[0].items()
@@ -305,13 +367,14 @@ class PlaySession:
         if len(way) < 2:
             raise DataError("There is nothing to save yet", expected="a predicted block", got="the start")
         config = self._host.config
-        blocks = {view: [node.frames[view] for node in way] for view in way[0].frames}
-        frames = {
-            view: MadeFrames(
-                partial(chain.from_iterable, videos), (sum(map(len, videos)), *videos[0].shape[1:]), np.uint8
-            )
-            for view, videos in blocks.items()
-        }
+        start = self._kept[0]
+
+        def pictures(view: str) -> Iterator[np.ndarray]:
+            for node in way:
+                yield from self._frames(node, view)
+
+        shape = (sum(len(node.states) for node in way), *start.image_size, 3)
+        frames = {view: MadeFrames(partial(pictures, view), shape, np.uint8) for view in start.views}
         states, commands = (np.concatenate([getattr(node, name) for node in way]) for name in ("states", "commands"))
         notes = {
             "driven_by": ", ".join(dict.fromkeys(node.driver for node in way[1:])), "model": config.model.name,
@@ -319,7 +382,7 @@ class PlaySession:
         }  # fmt: skip
         path = await asyncio.to_thread(
             save_played, config.output, self._row, self._start, self._host.kinematics.get(self._row.embodiment), frames,
-            states, commands, fps=way[0].simulation.fps, notes=notes,
+            states, commands, fps=start.fps, notes=notes,
         )  # fmt: skip
         await self._send(json.dumps({"type": "saved", "path": str(path), "frames": len(states)}))
 
@@ -330,6 +393,7 @@ class PlaySession:
             self._working.cancel()
         for policy in self._policies.values():
             await asyncio.to_thread(policy.close)
+        self._file.close()
 
 
 def save_played(

@@ -48,6 +48,7 @@ class ServeConfig(StrictModel):
         host: address to listen at. Anything but loopback needs a token (environment variable WORLDLINE_TOKEN).
         origins: pages of other servers that may connect (http://host:port).
         max_sessions, max_clips: at a time, those of the page included; clips of all sessions together.
+        max_sessions_per_connection: at a time.
         max_message_bytes: of one request or reply.
         idle_s: seconds after which an idle connection is closed, with its sessions.
         max_blocks: blocks that one session of the page keeps for rewinding and saving.
@@ -67,6 +68,7 @@ class ServeConfig(StrictModel):
     max_connections: int = Field(128, ge=1)
     max_sessions: int = Field(64, ge=1)
     max_clips: int = Field(256, ge=1)
+    max_sessions_per_connection: int = Field(16, ge=1)
     max_message_bytes: int = Field(64 << 20, ge=1 << 16)
     idle_s: float = Field(300.0, gt=0)
     max_blocks: int = Field(300, ge=1)

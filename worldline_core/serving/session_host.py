@@ -172,7 +172,7 @@ class SessionHost:
 
     async def _handle(self, owner: object, request: Request) -> dict[str, Any]:
         if isinstance(request, StartRequest):
-            self._check_room(len(request.seeds))
+            self._check_room(owner, len(request.seeds))
             simulation = await self.compute(lambda: self._start(request))
             return self._opened(owner, simulation, simulation.copy())
         running = self._running.get(request.session)
@@ -186,7 +186,7 @@ class SessionHost:
             shown = {view: np.stack([clip[view] for clip in frames]) for view in simulation.views}
             return {**_state_of(simulation), "frames": shown, "seconds": seconds}
         if isinstance(request, ForkRequest):
-            self._check_room(len(request.clips))
+            self._check_room(owner, len(request.clips))
             branches = await self.compute(lambda: simulation.select(request.clips, request.seeds))
             return self._opened(owner, branches, running.start.select(request.clips))
         if request.op == "reset":
@@ -220,7 +220,7 @@ class SessionHost:
             state=rows, seed=request.seeds,
         )  # fmt: skip
 
-    def _check_room(self, clips: int) -> None:
+    def _check_room(self, owner: object, clips: int) -> None:
         """Raises: UnavailableError when so many more clips exceed a limit; DataError when one session's own do."""
         config = self.config
         frames = self.world.frames_per_unit if self.world.causal is not None else self.world.unit(33)
@@ -229,6 +229,12 @@ class SessionHost:
             raise DataError(
                 "Too many clips for one session", expected=f"replies below {config.max_message_bytes:,} bytes, and at most "
                 f"{config.max_clips} clips", got=f"{clips} clips of {size // clips:,} bytes a step",
+            )  # fmt: skip
+        own = sum(running.owner is owner for running in self._running.values())
+        if own >= config.max_sessions_per_connection:
+            raise UnavailableError(
+                "A connection has as many sessions as it may", expected=f"at most {config.max_sessions_per_connection}",
+                next_step="close some, put several clips into one session, or set max_sessions_per_connection",
             )  # fmt: skip
         sessions = len(self._running) + len(self._players)
         used = len(self._players) + sum(len(running.simulation) for running in self._running.values())
@@ -246,7 +252,7 @@ class SessionHost:
         Raises: UnavailableError where there is no room.
         """
         if player not in self._players:
-            self._check_room(1)
+            self._check_room(player, 1)
             self._players.add(player)
 
     def dismiss(self, player: object) -> None:
@@ -254,7 +260,7 @@ class SessionHost:
         self._players.discard(player)
 
     def _opened(self, owner: object, simulation: Simulation, start: Simulation) -> dict[str, Any]:
-        self._check_room(len(simulation))  # others came while this one was made
+        self._check_room(owner, len(simulation))  # others came while this one was made
         name = secrets.token_urlsafe(12)
         self._running[name] = _Running(owner, start, simulation)
         embodiment = simulation.embodiment
