@@ -65,7 +65,6 @@ def build_parser() -> argparse.ArgumentParser:
     )
     inspect.add_argument("--episode", metavar="ID", help="the episode to show (default: the first one)")
     inspect.add_argument("--video", action="store_true", help="write a video of it: controls drawn over all views")
-    inspect.add_argument("--rerun", action="store_true", help="write a Rerun recording of it (open with: rerun FILE)")
     inspect.set_defaults(run=_inspect)
     verify = commands.add_parser("verify", help="compare the files of finished artifacts with what was written")
     verify.add_argument(
@@ -188,7 +187,6 @@ def _inspect(arguments: argparse.Namespace) -> None:
         episodes=arguments.episodes,
         episode_id=arguments.episode,
         video=arguments.video,
-        rerun=arguments.rerun,
     )
     print(found)
 

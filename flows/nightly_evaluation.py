@@ -34,6 +34,7 @@ def nightly_evaluation(
     A night that became worse than the last good one ends in the state Failed, with the metrics named.
     """
     settings = PipelineConfig.load(preset, config, overrides)
+    settings.check_night()
     with PrefectRun(artifacts.resolve(), settings.runner) as run:
         curated, data, banks = prepare(settings)
         models: Inputs = {**settings.model_folders()}
@@ -43,6 +44,7 @@ def nightly_evaluation(
         report.submit(settings.report, **made, rollout=predicted, models=models)
     history = artifacts.resolve() / "nightly"
     compared = compare_nights({name: made.folder for name, made in run.artifacts.items()}, history, night)
-    show_in_prefect(history, run.artifacts, [history / file for file in compared.pictures.values()])
+    pictures = {what: history / file for what, file in compared.pictures.items()}
+    show_in_prefect(history, run.artifacts, pictures, compared.verdicts)
     refuse_regressions(compared, history)
     return history

@@ -1,4 +1,4 @@
-"""Drawing for every room: text on pictures, contact sheets, strips along time, side-by-side videos.
+"""Drawing for every room: text on pictures, contact sheets, side-by-side videos.
 
 Text uses Pillow's embedded font, so the same call gives the same bytes on every machine.
 """
@@ -6,7 +6,7 @@ Text uses Pillow's embedded font, so the same call gives the same bytes on every
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -121,16 +121,20 @@ def jpeg_bytes(picture: Picture, quality: int = 88) -> bytes:
 
 # Contact sheets
 
-GAP_PX, MARGIN_PX = 4, 12
+GAP_PX, MARGIN_PX, BAND_PX = 4, 12, 10
 
 
 @dataclass(frozen=True)
 class SheetRow:
-    """One row of a sheet: a title, pictures `n h w 3` of one size, and an optional second line in grey."""
+    """One row of a sheet: a title, pictures `n h w 3` of one size, and an optional second line in grey.
+
+    ``timeline`` (m, 3) is a band of colours along the whole clip, below the pictures.
+    """
 
     title: str
     frames: NDArray[np.uint8]
     note: str = ""
+    timeline: NDArray[np.uint8] | None = None
 
 
 def evenly_spaced(count: int, wanted: int) -> list[int]:
@@ -174,7 +178,13 @@ def contact_sheet(
             if text:
                 strip = text_strip(text, width - 2 * MARGIN_PX + 12, height, size_px=size_px, ink=ink)
                 blocks.append(pad(strip, MARGIN_PX - 6, width))
-        blocks += [pad(joined(tile), MARGIN_PX, width), blank(10, width)]
+        pictures = joined(tile)
+        blocks.append(pad(pictures, MARGIN_PX, width))
+        if row.timeline is not None:
+            moments = np.arange(pictures.shape[1]) * len(row.timeline) // pictures.shape[1]
+            band = np.repeat(row.timeline[None, moments], BAND_PX, axis=0)
+            blocks += [blank(GAP_PX, width), pad(band, MARGIN_PX, width)]
+        blocks.append(blank(10, width))
     return np.concatenate(blocks, axis=0)
 
 
@@ -183,12 +193,6 @@ def joined(tiles: NDArray[np.uint8]) -> Picture:
     gap = np.full((tiles.shape[1], GAP_PX, 3), PAPER, dtype=np.uint8)
     pieces = [piece for tile in tiles for piece in (tile, gap)]
     return np.concatenate(pieces[:-1], axis=1)
-
-
-def stacked(pictures: Sequence[Picture]) -> Picture:
-    """Pictures below each other, the narrower ones on paper."""
-    width = max(picture.shape[1] for picture in pictures)
-    return np.concatenate([pad(picture, 0, width) for picture in pictures], axis=0)
 
 
 def blank(height: int, width: int) -> Picture:
@@ -202,98 +206,6 @@ def pad(picture: Picture, left: int, width: int) -> Picture:
     shown = picture[:, : width - left]
     page[:, left : left + shown.shape[1]] = shown
     return page
-
-
-# Strips: a clip along time, with what the filters kept and dropped
-
-KEPT_COLOUR: Colour = (46, 150, 92)
-REASON_COLOURS: dict[str, Colour] = {
-    "static": (120, 126, 138),
-    "reset": (31, 95, 191),
-    "corrupted": (179, 55, 47),
-    "base_motion": (217, 102, 11),
-    "too_dark": (40, 42, 52),
-    "overexposed": (214, 176, 30),
-    "blur": (15, 139, 160),
-    "joint_jump": (160, 60, 140),
-    "joint_speed": (110, 70, 190),
-    "lost_with_them": (202, 204, 210),
-}
-OTHER_COLOUR: Colour = (141, 111, 0)
-_BAND, _CURVE, _LABEL = 12, 76, 18
-
-
-def reason_colour(reason: str) -> Colour:
-    """The colour of a filter's reason in strips and recordings."""
-    return REASON_COLOURS.get(reason, OTHER_COLOUR)
-
-
-@dataclass(frozen=True)
-class ClipStrip:
-    """Content of a strip.
-
-    Attributes:
-        frames: (m, H, W, 3) pictures at the frame numbers `moments` of `count`.
-        dropped: by reason, bool (count,) frames.
-        curve: name, (count,) values and threshold of a detector.
-    """
-
-    title: str
-    note: str
-    frames: NDArray[np.uint8]
-    moments: Sequence[int]
-    count: int
-    dropped: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
-    curve: tuple[str, NDArray[np.floating], float] | None = None
-
-
-def clip_strip(strip: ClipStrip, *, tile_height: int = 96) -> Picture:
-    """Moments of a clip, framed in the colour of their reason, above the clip's timeline and a detector's curve."""
-    size = scaled_size(strip.frames.shape[1], strip.frames.shape[2], tile_height)
-    tiles = scale_frames(strip.frames, size).copy()
-    for tile, moment in zip(tiles, strip.moments, strict=True):
-        colour = next((reason_colour(r) for r, flags in strip.dropped.items() if flags[moment]), KEPT_COLOUR)
-        tile[:4], tile[-4:], tile[:, :4], tile[:, -4:] = colour, colour, colour, colour
-    row = joined(tiles)
-    width = row.shape[1] + 2 * MARGIN_PX
-    blocks = [text_strip(strip.title, width, 24, size_px=15)]
-    if strip.note:
-        blocks.append(text_strip(strip.note, width, 18, size_px=12, ink=MUTED))
-    blocks += [pad(row, MARGIN_PX, width), blank(3, width), pad(_bands(strip, row.shape[1]), MARGIN_PX, width)]
-    if strip.curve is not None:
-        blocks += [blank(3, width), pad(_curve(strip.curve, strip.count, row.shape[1]), MARGIN_PX, width)]
-    return np.concatenate([*blocks, blank(12, width)], axis=0)
-
-
-def _bands(strip: ClipStrip, width: int) -> Picture:
-    """Along time: green where kept, the colour of the reason where dropped; white marks at the moments shown."""
-    colours = np.full((strip.count, 3), KEPT_COLOUR, dtype=np.uint8)
-    for reason, flags in strip.dropped.items():
-        colours[flags] = reason_colour(reason)
-    band = np.repeat(colours[None, np.arange(width) * strip.count // width], _BAND, axis=0)
-    for moment in strip.moments:
-        x = int((moment + 0.5) * width / strip.count)
-        band[-4:, x : x + 2] = 255
-    return band
-
-
-def _curve(curve: tuple[str, NDArray[np.floating], float], count: int, width: int) -> Picture:
-    """The measured values along time with the threshold as a dashed line."""
-    name, values, threshold = curve
-    low, high = min(0.0, float(values.min())), max(float(values.max()), 1.15 * threshold)
-    high = min(high, 6 * threshold) if threshold > 0 else high
-    canvas = Image.new("RGB", (width, _CURVE), (255, 255, 255))
-    draw = ImageDraw.Draw(canvas)
-
-    def y(value: float) -> float:
-        return _CURVE - 4 - (min(value, high) - low) / max(high - low, 1e-9) * (_CURVE - _LABEL - 8)
-
-    for x in range(0, width, 12):
-        draw.line((x, y(threshold), x + 6, y(threshold)), fill=(179, 55, 47), width=1)
-    points = [((i + 0.5) * width / count, y(float(value))) for i, value in enumerate(values)]
-    draw.line(points, fill=INK, width=2, joint="curve")
-    draw.text((6, 3), f"{name.replace('_', ' ')}; dashed: threshold {threshold:.3g}", font=font(12), fill=MUTED)
-    return np.asarray(canvas, dtype=np.uint8)
 
 
 # Side-by-side videos: one clip by several methods, in step
@@ -315,10 +227,15 @@ class WrittenVideo:
     num_frames: int
 
 
-def side_by_side(columns: Mapping[str, Frames], *, tile_height: int = 256, labels: bool = True) -> Iterator[Picture]:
+def side_by_side(
+    columns: Mapping[str, Frames], *, tile_height: int = 256, labels: bool = True, most: int | None = None
+) -> Iterator[Picture]:
     """Pictures of labelled columns of frames `n h w 3`, one after the other.
 
     They end with the shortest column, so that no frozen picture looks like a prediction.
+
+    Args:
+        most: columns of one line; the others go below them (default: all beside each other).
 
     Raises:
         ValueError: no columns, or an empty one.
@@ -327,31 +244,33 @@ def side_by_side(columns: Mapping[str, Frames], *, tile_height: int = 256, label
         raise ValueError("a side-by-side video needs at least one column, and frames in every column")
     first = next(iter(columns.values()))
     height, width = scaled_size(first.shape[1], first.shape[2], tile_height)
-    gap = np.full((height + LABEL_HEIGHT_PX * labels, COLUMN_GAP_PX, 3), STRIP_PAPER, dtype=np.uint8)
     size_px = 26 if width >= 360 else 19 if width >= 260 else 15
-    strips = {
-        label: text_strip(
-            label, width, LABEL_HEIGHT_PX, size_px=size_px, ink=STRIP_INK, paper=STRIP_PAPER, align="centre"
-        )
-        for label in columns
-    }
+    ink = {"size_px": size_px, "ink": STRIP_INK, "paper": STRIP_PAPER}
+    strips = {label: text_strip(label, width, LABEL_HEIGHT_PX, align="centre", **ink) for label in columns}
+    line_length = min(most or len(columns), len(columns))
+    tile = height + LABEL_HEIGHT_PX * labels
+    step = width + COLUMN_GAP_PX
+    size = tile * -(-len(columns) // line_length), step * line_length - COLUMN_GAP_PX, 3
 
     def picture(frames: Mapping[str, Picture]) -> Picture:
-        pieces: list[Picture] = []
-        for label, frame in frames.items():
+        page = np.full(size, STRIP_PAPER, dtype=np.uint8)
+        for place, (label, frame) in enumerate(frames.items()):
+            top, left = tile * (place // line_length), step * (place % line_length)
             body = scale_frames(frame[None], (height, width))[0]
-            pieces += [np.concatenate([strips[label], body], axis=0) if labels else body, gap]
-        return np.concatenate(pieces[:-1], axis=1)
+            page[top + tile - height : top + tile, left : left + width] = body
+            if labels:
+                page[top : top + LABEL_HEIGHT_PX, left : left + width] = strips[label]
+        return page
 
     return map(picture, in_step(columns))
 
 
 def write_side_by_side(
-    path: Path, columns: Mapping[str, Frames], fps: float, *, tile_height: int = 256
+    path: Path, columns: Mapping[str, Frames], fps: float, *, tile_height: int = 256, most: int | None = None
 ) -> WrittenVideo:
     """Write labelled columns as `path` (mp4) with a poster beside it."""
     count = min(map(len, columns.values()), default=0)
-    return write_video(path, side_by_side(columns, tile_height=tile_height), count, fps)
+    return write_video(path, side_by_side(columns, tile_height=tile_height, most=most), count, fps)
 
 
 def write_video(path: Path, frames: Iterable[Picture], count: int, fps: float) -> WrittenVideo:

@@ -6,7 +6,7 @@ import base64
 import functools
 import logging
 import mimetypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,41 +53,52 @@ def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
         return done[0]
 
 
-def _report_pictures(report: Path) -> list[Path]:
+def _report_pictures(report: Path) -> dict[str, Path]:
     """Pictures of a report to show: what was recorded, and what was predicted of the first episode."""
-    return [
-        path
-        for name in ("contact_sheet", "episode0_shipped_head")
-        if (path := report / "media" / f"{name}.jpg").is_file()
-    ]
+    names = {"recorded episodes": "contact_sheet", "recorded beside predicted": "episode0_shipped_head"}
+    files = {what: report / "media" / f"{name}.jpg" for what, name in names.items()}
+    return {what: file for what, file in files.items() if file.is_file()}
 
 
-def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures: Sequence[Path] | None = None) -> None:
+def show_in_prefect(
+    page: Path,
+    done: Mapping[str, ArtifactReference],
+    pictures: Mapping[str, Path] | None = None,
+    verdicts: Mapping[str, str] | None = None,
+) -> None:
     """Add the artifacts `report`, `metrics` and `pictures` (a link, a table, images) to the flow run that calls this.
 
     Args:
         page: folder of the report or comparison, with `index.html`.
         done: the artifacts of the run by the nodes' names; its evaluations fill the table.
-        pictures: files to show (default: the report's). They travel inside of the artifacts: a page that a browser has over
-            http may not show files.
+        pictures: files to show by what they show (default: the report's). They travel inside of the artifacts: a page that a
+            browser has over http may not show files.
+        verdicts: of metrics beside an earlier run, in the order of the table's rows.
     """
     if pictures is None:
-        pictures = _report_pictures(done["report"].folder) if "report" in done else ()
+        pictures = _report_pictures(done["report"].folder) if "report" in done else {}
     scores = {name: Path(str(artifact.path)) for name, artifact in done.items() if name.startswith("evaluate_")}
-    rows = [
-        {"metric": name, "mean": value.mean, "95 % from": value.low, "to": value.high, "trajectories": value.count}
-        for name, value in sorted(collect_metrics(scores).items())
-    ]
+    found, verdicts = collect_metrics(scores), verdicts or {}
+    rows: list[dict[str, Any]] = []
+    for name in dict.fromkeys([*verdicts, *sorted(found)]):
+        value, verdict = found.get(name), {"verdict": verdicts.get(name, "")} if verdicts else {}
+        means = (
+            {}
+            if value is None
+            else {"mean": value.mean, "95 % from": value.low, "to": value.high, "trajectories": value.count}
+        )
+        rows.append({"metric": name, **verdict, **means})
+    worse = sum(verdict.startswith(("worse", "missing")) for verdict in verdicts.values())
+    summary = f"{worse} of {len(verdicts)} metrics became worse or are missing. " if verdicts else ""
     try:
         create_link_artifact((page / "index.html").as_uri(), "Open the report", key="report", description=str(page))
         if rows:
-            create_table_artifact(
-                rows, key="metrics", description="Means with 95 % intervals: what/where/method/metric"
-            )
-        for number, picture in enumerate(pictures):
+            description = f"{summary}Means with 95 % intervals: what/where/method/metric"
+            create_table_artifact(rows, key="metrics", description=description)
+        for number, (what, picture) in enumerate(pictures.items()):
             key = "picture" if number == 0 else f"picture-{number}"
             data = f"data:{mimetypes.guess_type(picture)[0]};base64,{base64.b64encode(picture.read_bytes()).decode()}"
-            create_image_artifact(data, key=key, description=f"{picture.stem}: {page / 'index.html'}")
+            create_image_artifact(data, key=key, description=f"{what} ({page / 'index.html'})")
     except httpx.TransportError as error:
         logger.warning("Prefect shows nothing of this run: its server does not answer (%s)", error)
 

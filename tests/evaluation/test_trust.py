@@ -9,7 +9,6 @@ from scipy.stats import mannwhitneyu
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig, TrustConfig
 from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
-from worldline_core.evaluation.policy.evidence import failure_kind
 from worldline_core.evaluation.policy.judge import confidence_of
 from worldline_core.evaluation.policy.trust import (
     TRUST_COLUMNS,
@@ -239,19 +238,3 @@ def test_trust_needs_tracks_and_training_recordings(recordings, trained, tmp_pat
         evaluate_policy(CONFIG, inputs, tmp_path)
     with pytest.raises(DataError, match="Too few training recordings"):
         evaluate_policy(CONFIG, recordings.inputs, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("family", "stated", "kind"),
-    [
-        ("lift", {"wrong_object_or_drop": True}, "dropped"),
-        ("lift", {"head_view_confirms_target_displacement": False, "target_held_for_two_late_steps": False}, "missed"),
-        ("lift", {"head_view_confirms_target_displacement": True, "target_held_for_two_late_steps": False}, "slipped"),
-        ("lift", {"head_view_confirms_target_displacement": None}, "not seen"),
-        ("grasp", {"target_held_for_two_late_steps": False}, "missed"),
-        ("state_change", {"required_final_state_visible": False, "wrong_object_or_drop": False}, "not done"),
-        ("state_change", {"required_final_state_visible": None}, "not seen"),
-    ],
-)
-def test_evidence_says_what_went_wrong(family, stated, kind):
-    assert failure_kind(family, stated) == kind

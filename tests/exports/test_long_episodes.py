@@ -123,7 +123,7 @@ OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
         recorded.root / "rollouts", output, ["worldarena"], episodes=recorded.root / "episodes"
     ),
     "sheet of a rollout": lambda recorded, output: inspect(recorded.root / "rollouts", output),
-    "inspect": lambda recorded, output: inspect(recorded.root / "episodes", output, episode_id="long", rerun=True),
+    "inspect": lambda recorded, output: inspect(recorded.root / "episodes", output, episode_id="long"),
     "exact masks": measured,
     "curate": curated,
 }

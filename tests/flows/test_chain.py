@@ -70,8 +70,16 @@ def test_nightly_leaves_training_out_but_keeps_the_shipped_models() -> None:
     )
     assert not set(calls) & {"train_stage1", "train_stage2", "distill", "rollout.stage2", "rollout.causal"}
     assert "rollouts.stage2" not in calls["evaluate_video"].inputs
-    # The smoke preset predicts banks by its own model only: without training there is nothing to plan with.
-    assert "evaluate_planning" not in outline(nightly, PipelineConfig.load("smoke"))
+    PipelineConfig.load("tiny").check_night()
+
+
+@pytest.mark.parametrize("changes", [(), ("models.causal=artifacts/shipped/models/causal",), ("rollouts.stage2=null",)])
+def test_a_night_that_measures_no_model_is_refused(changes: tuple[str, ...]) -> None:
+    """Its rollouts wait for a training that no night does: only the copy of the first frame was compared, never red."""
+    with pytest.raises(ConfigError, match=r"(?s)measures no model.*copy_first_frame"):
+        PipelineConfig.load("smoke", None, changes).check_night()
+    shipped = ("models.causal=artifacts/shipped/models/causal", "rollouts.causal.checkpoint=shipped_causal")
+    PipelineConfig.load("smoke", None, shipped).check_night()
 
 
 def test_labels_of_the_banks_are_not_an_input_of_curation(calls: dict[str, TaskCall]) -> None:

@@ -122,7 +122,12 @@ def test_nightly_guards_on_a_real_server_and_worker(
     config, artifacts = tmp_path / "nightly.yaml", tmp_path / "artifacts"
     source = {"kind": "episode_set", "path": "artifacts/shipped/recordings", "name": "shipped", "license": "Apache-2.0",
               "redistribution": "yes", "include": ["*-test-s1-0000[0-1]"]}  # fmt: skip
-    config.write_text(json.dumps({"extends": "smoke", "curate": {"sources": [source]}, "evaluate_policy": None}))
+    # A night needs a model that it does not train itself: banks are not rolled out, so this one costs nothing.
+    own = {
+        "models": {"causal": "artifacts/shipped/models/causal"},
+        "rollouts": {"causal": {"checkpoint": "shipped_causal"}},
+    }
+    config.write_text(json.dumps({"extends": "smoke", "curate": {"sources": [source]}, "evaluate_policy": None, **own}))
     given = {"preset": None, "config": str(config), "artifacts": str(artifacts)}
     first = _run(environment, project_root, "nightly-evaluation/nightly-evaluation", {**given, "night": "first"})
     assert first.returncode == 0, first.stdout + first.stderr + worker_log.read_text()

@@ -10,7 +10,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
-from rerun.chunk import RrdReader
 
 from tests.report.conftest import EPISODES, episode, frames  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.overlays import ARM_COLOURS
@@ -60,9 +59,7 @@ def test_kinds(
 def test_the_page_goes_to_run_by_default(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     folder = tmp_path / "set"
     shutil.copytree(run_artifacts["curate"], folder)
-    found = inspect(folder, rerun=True)
-    assert {path.relative_to(folder).parts[:2] for path in found.written} == {("run", "inspect")}
-    assert found.written[-1].suffix == ".rrd"
+    assert {path.relative_to(folder).parts[:2] for path in inspect(folder).written} == {("run", "inspect")}
 
 
 def test_a_damaged_artifact_is_refused_before_it_is_read(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
@@ -83,23 +80,21 @@ def test_episodes_with_similar_names_get_different_files(tmp_path: Path) -> None
         for name in ("run 1", "run_1"):
             writer.add(episode(name, *EPISODES[0][1:]), frames(0))
     names = [
-        {path.name for path in inspect(tmp_path / "set", tmp_path / "out", episode_id=name, rerun=True).written}
+        {path.name for path in inspect(tmp_path / "set", tmp_path / "out", episode_id=name, video=True).written}
         for name in ("run 1", "run_1")
     ]
     assert names[0] & names[1] == {"index.html", "contact_sheet.jpg"}
-    assert all(any(name.endswith(".rrd") for name in found) for found in names)
+    assert all(any(name.endswith(".mp4") for name in found) for found in names)
 
 
 def test_an_episode_is_shown_with_its_controls(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     folder, name = run_artifacts["render_actions"], "aloha_viperx-1"
-    found = inspect(folder, tmp_path, episodes=run_artifacts["curate"], episode_id=name, video=True, rerun=True)
-    assert [path.name for path in found.written] == ["index.html", f"{name}_controls.jpg", f"{name}.mp4", f"{name}.rrd"]
+    found = inspect(folder, tmp_path, episodes=run_artifacts["curate"], episode_id=name, video=True)
+    assert [path.name for path in found.written] == ["index.html", f"{name}_controls.jpg", f"{name}.mp4"]
     video = decode_video(tmp_path / "aloha_viperx-1.mp4")
     assert len(video) == 9
     assert video.shape[2] > 3 * 256  # three views side by side
     assert np.abs(video[0].astype(int) - video[-1]).max() > 100
-    entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "aloha_viperx-1.rrd").stream()}
-    assert {"/world/cameras/head/true", "/world/cameras/head/actions", "/world/robot"} <= entities
 
 
 def test_tracks_find_their_episodes_by_the_manifest(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
@@ -109,7 +104,7 @@ def test_tracks_find_their_episodes_by_the_manifest(run_artifacts: dict[str, Pat
     assert [path.name for path in without.written] == ["index.html"]
     assert "--episodes FOLDER" in str(without)
     with pytest.raises(ArtifactError, match="--episodes FOLDER"):
-        inspect(tracks, rerun=True)
+        inspect(tracks, video=True)
     shutil.copytree(run_artifacts["curate"], episodes)
     write_json_atomic(tracks / "manifest.json", {"inputs": {"episodes": {"path": "curate/key", "digest": "0"}}})
     assert "aloha_viperx-0_controls.jpg" in {path.name for path in inspect(tracks).written}
@@ -132,19 +127,16 @@ def test_without_kinematics_the_page_notes_it(run_artifacts: dict[str, Path], tm
     robots = pa.array(["no_such_robot"] * index.num_rows)
     index = index.set_column(index.column_names.index("embodiment"), "embodiment", robots)
     pq.write_table(index, folder / "index.parquet")
-    found = inspect(folder, tmp_path, episode_id="aloha_viperx-0", rerun=True)
+    found = inspect(folder, tmp_path, episode_id="aloha_viperx-0")
     assert "no controls are shown" in (tmp_path / "index.html").read_text()
-    assert [path.suffix for path in found.written] == [".html", ".jpg", ".rrd"]
+    assert [path.suffix for path in found.written] == [".html", ".jpg"]
 
 
 def test_predictions_are_shown_beside_the_truth(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     folder = run_artifacts["rollout.shipped_causal"]
-    found = inspect(
-        folder, tmp_path, episodes=run_artifacts["curate"], episode_id="aloha_viperx-2", video=True, rerun=True
-    )
+    found = inspect(folder, tmp_path, episodes=run_artifacts["curate"], episode_id="aloha_viperx-2", video=True)
     names = [path.name for path in found.written]
     assert "aloha_viperx-2_head.mp4" in names
-    assert names[-1] == "aloha_viperx-2.rrd"
     for name in ("nobody", "ur5e_pair-0"):  # the second one was recorded, but not predicted
         with pytest.raises(DataError, match=name):
             inspect(folder, tmp_path, episodes=run_artifacts["curate"], episode_id=name)
@@ -160,7 +152,7 @@ def test_unknown_episodes_and_kinds_without_pictures_are_refused(
     with pytest.raises(DataError, match="nobody"):
         inspect(run_artifacts["curate"], tmp_path, episode_id="nobody")
     with pytest.raises(ConfigError, match="Scores"):
-        inspect(run_artifacts["evaluate_video"], tmp_path, rerun=True)
+        inspect(run_artifacts["evaluate_video"], tmp_path, video=True)
 
 
 def test_unknown_folders_are_named(tmp_path: Path) -> None:

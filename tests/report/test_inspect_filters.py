@@ -1,4 +1,4 @@
-"""`worldline inspect` on a filter step's artifact: kept and dropped clips by reason, timelines, curves."""
+"""`worldline inspect` on a filter step's artifact: kept and dropped clips by reason, with timelines."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.pictures import KEPT_COLOUR, reason_colour
-from worldline_core.report.inspect import FilteredSet, episode_of, inspect
+from worldline_core.report.inspect import KEPT_COLOUR, LOST_COLOUR, clips_by_reason, episode_of, inspect
 from worldline_core.store.atomic import write_json_atomic
 
 CONFIG = FilterConfig(min_segment_frames=8)
@@ -51,27 +50,23 @@ def filtered(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_every_clip_stands_under_its_reasons(filtered: Path) -> None:
-    found = FilteredSet(filtered, filtered.parent.parent / "curate" / "key")
-    assert found.outcomes["healthy"].reasons == ["kept"]
-    assert found.outcomes["black"].reasons == ["too_dark"]
-    assert found.outcomes["dark"].reasons == ["too_dark"]
-    first = found.episodes.rows[found.episodes.position("dark")].start
-    assert [(row.start - first, row.stop - first) for row in found.outcomes["dark"].kept] == [(0, 12), (18, 33)]
-    assert found.outcomes["dark"].cut == {"too_dark": 6}
-    assert found.outcomes["turned"].reasons != ["kept"]
-    assert {name: len(episode.kept) for name, episode in found.outcomes.items()} == {
-        "black": 0, "dark": 2, "healthy": 1, "turned": 1,
+    found = clips_by_reason(filtered)
+    assert next(iter(found)) == "too_dark"
+    assert list(found)[-1] == "kept"
+    assert set(found["kept"]) == {"healthy"}
+    assert {name: clip.decision for name, clip in found["too_dark"].items()} == {
+        "black": "dropped whole", "dark": "6 frames cut",
     }  # fmt: skip
+    assert "threshold bright level" in found["too_dark"]["dark"].numbers
+    assert "turned" in {name for reason, clips in found.items() if reason != "kept" for name in clips}
+    assert [len(found["too_dark"][name].kept) for name in ("black", "dark")] == [0, 2]
     assert [episode_of(name) for name in ("a@00012", "a@b", "a", "a@b@00001")] == ["a", "a@b", "a", "a@b"]
-    assert next(iter(found.by_reason())) == "too_dark"
-    assert list(found.by_reason())[-1] == "kept"
-    assert found.config == CONFIG
 
 
 def test_a_page_shows_kept_and_dropped_clips(filtered: Path, tmp_path: Path) -> None:
     result = inspect(filtered, tmp_path)
     html = (tmp_path / "index.html").read_text()
-    assert "4 episodes: 3 kept in 4 segments, 1 dropped whole" in html
+    assert "4 segments of 4 episodes were kept" in html
     assert "2 episodes, 1 dropped whole" in html
     pictures = [path for path in result.written if path.name.startswith("reason_")]
     assert {"reason_too_dark.jpg", "reason_kept.jpg"} <= {path.name for path in pictures}
@@ -83,11 +78,11 @@ def test_a_page_shows_kept_and_dropped_clips(filtered: Path, tmp_path: Path) -> 
 
 def test_the_timeline_has_the_dropped_frames_at_their_place(filtered: Path, tmp_path: Path) -> None:
     result = inspect(filtered, tmp_path, episode_id="dark")
-    assert [path.name for path in result.written] == ["index.html", "dark_filters.jpg"]
-    with Image.open(tmp_path / "dark_filters.jpg") as image:
+    assert [path.name for path in result.written] == ["index.html", "reason_dark_too_dark.jpg"]
+    with Image.open(tmp_path / "reason_dark_too_dark.jpg") as image:
         picture = np.asarray(image.convert("RGB"))
     row = next(r for r in picture if (np.abs(r.astype(int) - KEPT_COLOUR).max(axis=-1) < 8).mean() > 0.6)
-    dropped = np.flatnonzero(np.abs(row.astype(int) - reason_colour("too_dark")).max(axis=-1) < 8)
+    dropped = np.flatnonzero(np.abs(row.astype(int) - LOST_COLOUR).max(axis=-1) < 8)
     width = len(row) - 24
     assert abs((dropped[0] - 12) / width - 12 / 33) < 0.02
     assert abs((dropped[-1] - 12) / width - 18 / 33) < 0.02
@@ -95,12 +90,12 @@ def test_the_timeline_has_the_dropped_frames_at_their_place(filtered: Path, tmp_
 
 def test_a_kept_episode_is_shown_with_its_controls_as_well(filtered: Path, tmp_path: Path) -> None:
     names = [path.name for path in inspect(filtered, tmp_path, episode_id="healthy").written]
-    assert {"healthy_filters.jpg", "contact_sheet.jpg", "healthy_controls.jpg"} <= set(names)
+    assert {"reason_healthy_kept.jpg", "contact_sheet.jpg", "healthy_controls.jpg"} <= set(names)
     segment = [path.name for path in inspect(filtered, tmp_path, episode_id="dark@00018").written]
-    assert "dark_filters.jpg" in segment
+    assert "reason_dark_too_dark.jpg" in segment
     assert any(name.startswith("dark_00018") and name.endswith("_controls.jpg") for name in segment)
     black = [path.name for path in inspect(filtered, tmp_path, episode_id="black").written]
-    assert black == ["index.html", "black_filters.jpg"]
+    assert black == ["index.html", "reason_black_too_dark.jpg"]
     with pytest.raises(DataError, match="nobody"):
         inspect(filtered, tmp_path, episode_id="nobody")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from worldline_core.report.context import ReportConfig, ReportContext
+from worldline_core.report.context import ReportConfig, ReportContext, share_interval
 from worldline_core.report.report import Figure, first_page, head_view, headline, planning_figure, video_figures
 
 COPY, SHUFFLED = "copy_first_frame", "shipped_stage2_shuffled"
@@ -48,7 +48,10 @@ def context_of(
         rows.append(difference(COPY, (own - copy - 0.01, own - copy + 0.01), "stage2"))
     summaries: dict[str, object] = {"evaluate_video": {"metrics": {"test": methods}, "differences": {"test": rows}}}
     if success is not None:
-        result = {"success": {"mean": success}, "gain": {"mean": 0.1, "low": gain[0], "high": gain[1]}}
+        result = {
+            "success": {"mean": success, "low": success - 0.1, "high": min(1.0, success + 0.1)},
+            "gain": {"mean": 0.1, "low": gain[0], "high": gain[1]},
+        }
         summaries["evaluate_planning"] = {
             "methods": {"banks_shipped_stage2": {"budgets": {"32": result}}},
             "banks": {"a": {}}, "direct_execution": {"mean": 0.64},
@@ -69,7 +72,7 @@ def headline_of(context: ReportContext) -> str:
     ("changes", "expected"),
     [
         ({}, "follows the controls."),
-        ({"success": 0.76}, "follows the controls but does not clearly plan better than chance."),
+        ({"success": 0.76}, "follows the controls but does not clearly plan better than chance on 1 banks."),
         ({"success": 0.9, "gain": (0.1, 0.4)}, "follows the controls and plans better than chance."),
         ({"success": 0.5, "gain": (-0.3, -0.1)}, "follows the controls but plans worse than chance."),
         ({"over_copy": (-0.1, 0.4)}, "does not yet beat a copy of the first frame."),
@@ -77,14 +80,14 @@ def headline_of(context: ReportContext) -> str:
         ({"over_shuffled": (-0.1, 0.1)}, "does not yet follow the controls."),
         (
             {"over_shuffled": (-0.1, 0.1), "success": 0.6},
-            "does not yet follow the controls and does not clearly plan better than chance.",
+            "does not yet follow the controls and does not clearly plan better than chance on 1 banks.",
         ),
     ],
 )
 def test_the_headline_follows_the_numbers(tmp_path: Path, changes: dict, expected: str) -> None:
     found = headline_of(context_of(tmp_path, **changes))
     assert found == f"The shipped simulator {expected}"
-    assert len(found.split()) <= 18
+    assert len(found.split()) <= 21
 
 
 def test_this_run_s_own_model_stands_beside_the_copy(tmp_path: Path) -> None:
@@ -92,25 +95,48 @@ def test_this_run_s_own_model_stands_beside_the_copy(tmp_path: Path) -> None:
     assert view is not None
     own = video_figures(view)[1]
     assert own is not None
-    assert (own.value, own.reference_text) == (
-        "0.496",
-        "copying the first frame: 0.500",
-    )  # two digits show no difference
+    assert (own.shown(own.measured["mean"]), own.comparison) == (
+        "0.496", "worse than copying the first frame: 0.500, within chance",
+    )  # fmt: skip  # two digits show no difference
+
+
+def test_a_perfect_score_of_few_cases_is_no_certainty(tmp_path: Path) -> None:
+    """A bootstrap of five equal values has no spread: 100 % of five banks was shown without any doubt."""
+    certain = {"mean": 1.0, "low": 1.0, "high": 1.0, "count": 5}
+    wide = share_interval(certain)
+    assert wide is not None
+    assert (round(wide["low"], 3), wide["high"]) == (0.478, 1.0)  # 0.025 ** (1 / 5), Clopper and Pearson
+    failed = share_interval({"mean": 0.0, "low": 0.0, "high": 0.0, "count": 10})
+    assert failed is not None
+    assert round(failed["high"], 3) == 0.308
+    spread = {"mean": 0.8, "low": 0.6, "high": 1.0, "count": 5}
+    assert share_interval(spread) is spread
+    assert share_interval(None) is None
+    context = context_of(tmp_path, success=1.0, gain=(0.46, 0.54))
+    summary = tmp_path / "evaluate_planning" / "summary.json"
+    content = json.loads(summary.read_text())
+    content["methods"]["banks_shipped_stage2"]["budgets"]["32"]["success"] |= certain
+    content["direct_execution"]["mean"] = 0.5
+    summary.write_text(json.dumps(content))
+    figure = planning_figure(context)
+    assert figure is not None
+    assert (figure.rests_on, figure.verdict) == ("95\u202f%: 48\u202f% to 100\u202f%, 5 banks", "unclear")
 
 
 @pytest.mark.parametrize(
     ("mean", "bounds", "verdict", "words"),
     [
-        (0.7, (0.1, 0.3), "better", "better than chance: 0.5"),
-        (0.6, (-0.1, 0.3), "unclear", "better than chance: 0.5, within chance"),
-        (0.4, (-0.3, -0.05), "worse", "worse than chance: 0.5"),
-        (0.4, (-0.3, 0.1), "unclear", "worse than chance: 0.5, within chance"),
-        (0.5, (-0.1, 0.1), "unclear", "as chance: 0.5, within chance"),
-        (0.7, None, "unclear", "better than chance: 0.5, within chance"),
+        (0.7, (0.1, 0.3), "better", "better than chance: 0.50"),
+        (0.6, (-0.1, 0.3), "unclear", "better than chance: 0.50, within chance"),
+        (0.4, (-0.3, -0.05), "worse", "worse than chance: 0.50"),
+        (0.4, (-0.3, 0.1), "unclear", "worse than chance: 0.50, within chance"),
+        (0.5, (-0.1, 0.1), "unclear", "as chance: 0.500, within chance"),
+        (0.7, None, "unclear", "better than chance: 0.50, within chance"),
     ],
 )
 def test_a_figure_is_coloured_by_its_reference(mean: float, bounds: tuple, verdict: str, words: str) -> None:
-    figure = Figure(str(mean), "right", mean, 0.5, "chance: 0.5", bounds, "")
+    measured = {"mean": mean, "low": mean - 0.1, "high": mean + 0.1, "count": 9}
+    figure = Figure("right", measured, "recordings", "chance", 0.5, bounds, "")
     assert (figure.verdict, figure.comparison) == (verdict, words)
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from tests.report.conftest import EPISODES, write_episode_set  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import ArtifactError
+from worldline_core.pictures import COLUMN_GAP_PX, LABEL_HEIGHT_PX
 from worldline_core.report.context import ReportConfig, ReportContext
 from worldline_core.report.data import data_section
 from worldline_core.report.report import report
@@ -124,7 +125,9 @@ def test_videos_play_in_browsers(full_report: Path) -> None:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert sum(1 for _ in container.decode(stream)) == 9
-        assert stream.width > 4 * 96  # truth, Stage II, causal, shuffled actions, copy of the first frame
+        # Truth, Stage II, causal; below them shuffled actions, copy of the first frame: a phone shows three columns.
+        assert stream.width == 3 * 96 + 2 * COLUMN_GAP_PX
+        assert stream.height == 2 * (64 + LABEL_HEIGHT_PX)
     content = path.read_bytes()
     assert content.index(b"moov") < content.index(b"mdat")  # the index comes first: playable while loading
 
@@ -169,7 +172,7 @@ def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
     assert "0.930" in found["quality"]  # the segmenter's own accuracy
     assert ", colour</th>" in found["quality"]  # by a second segmenter
     assert "recorded videos (ceiling)" in found["decisions"]
-    assert re.search(r"<td[^>]*>0\.95</td><td[^>]*>.*?0\.50.*?</td><td[^>]*>0\.95</td>", found["decisions"])
+    assert re.search(r"0\.95</span>.*?0\.50.*?</td><td[^>]*>0\.95</td>", found["decisions"])
     for points in re.findall(r'<polyline points="([^"]*)"', found["decisions"]):
         x = [float(point.partition(",")[0]) for point in points.split()]
         assert x == sorted(x)  # from few candidates to many

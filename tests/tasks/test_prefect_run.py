@@ -103,23 +103,28 @@ def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     scores = ArtifactReference(step="evaluate_planning", path=tmp_path, digest="0" * 64)
 
-    pictures = [tmp_path / "worst.jpg", tmp_path / "second.jpg"]
-    for colour, picture in zip(("red", "blue"), pictures, strict=True):
+    pictures = {"e1, causal: ssim became worse by 0.1": tmp_path / "worst.jpg", "second": tmp_path / "second.jpg"}
+    for colour, picture in zip(("red", "blue"), pictures.values(), strict=True):
         Image.new("RGB", (8, 6), colour).save(picture)
+
+    verdicts = {"video/gone": "missing", "planning/N=32/causal/success": "worse by 0.200"}
 
     @flow
     def shown() -> None:
-        show_in_prefect(tmp_path / "latest", {"evaluate_planning": scores, "report": scores}, pictures)
+        show_in_prefect(tmp_path / "latest", {"evaluate_planning": scores, "report": scores}, pictures, verdicts)
 
     shown()
     with get_client(sync_client=True) as client:
-        found = {
-            artifact.key: artifact.data for artifact in client.read_artifacts(sort=ArtifactSort.CREATED_DESC)[::-1]
-        }
+        read = client.read_artifacts(sort=ArtifactSort.CREATED_DESC)[::-1]
+        found = {artifact.key: artifact.data for artifact in read}
+        described = {artifact.key: str(artifact.description) for artifact in read}
     assert (tmp_path / "latest" / "index.html").as_uri() in str(found["report"])
-    row = {"metric": "planning/N=32/causal/success", "mean": 0.75, "95 % from": 0.5, "to": 1.0, "trajectories": 9}
-    assert json.loads(str(found["metrics"])) == [row]
-    for key, picture in zip(("picture", "picture-1"), pictures, strict=True):
+    row = {"metric": "planning/N=32/causal/success", "verdict": "worse by 0.200", "mean": 0.75, "95 % from": 0.5, "to": 1.0,
+           "trajectories": 9}  # fmt: skip
+    assert json.loads(str(found["metrics"])) == [{"metric": "video/gone", "verdict": "missing"}, row]
+    assert "2 of 2 metrics became worse or are missing" in described["metrics"]
+    assert "e1, causal: ssim became worse by 0.1" in described["picture"]
+    for key, picture in zip(("picture", "picture-1"), pictures.values(), strict=True):
         # A browser shows it wherever the page comes from: the picture itself is in its address.
         with urllib.request.urlopen(str(found[key])) as reply:
             assert (reply.headers["Content-type"], reply.read()) == ("image/jpeg", picture.read_bytes())

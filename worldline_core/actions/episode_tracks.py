@@ -90,6 +90,11 @@ class EpisodeTracks:
     def num_frames(self) -> int:
         return len(self.depth)
 
+    @property
+    def controls_label(self) -> str:
+        """The kind of the projected controls in words: commands, or what was measured where none were recorded."""
+        return {"action": "commands", "state": "measured joints", "ee_pose": "measured tool poses"}[self.controls]
+
     def clip(self, frames: Sequence[int] | np.ndarray) -> EpisodeTracks:
         """Tracks at these frame numbers.
 

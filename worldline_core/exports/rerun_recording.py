@@ -87,7 +87,7 @@ def write_rerun_recording(path: Path, content: RecordingContent) -> None:
                 _log_images(stream, f"world/cameras/{view}/actions", heat, "image/png", episode.fps)
                 stream.log(f"world/cameras/{view}/actions", rr.EncodedImage.from_fields(draw_order=10.0), static=True)
         _log_signals(stream, episode)
-        _log_description(stream, episode)
+        _log_description(stream, episode, "none" if tracks is None else tracks.controls_label)
         stream.disconnect()
 
 
@@ -176,9 +176,10 @@ def _log_signals(stream: rr.RecordingStream, episode: Episode) -> None:
             stream.send_columns(entity, _timeline(len(column), episode.fps), rr.Scalars.columns(scalars=column))
 
 
-def _log_description(stream: rr.RecordingStream, episode: Episode) -> None:
+def _log_description(stream: rr.RecordingStream, episode: Episode, tools: str) -> None:
     names = ("episode_id", "embodiment", "scene", "task_family", "instruction", "outcome", "split")
-    text = "\n".join(f"{name.replace('_', ' ')}: {getattr(episode, name)}" for name in names)
+    lines = [f"{name.replace('_', ' ')}: {getattr(episode, name)}" for name in names]
+    text = "\n".join([*lines, f"tools and action maps: {tools}"])
     stream.log("description", rr.TextDocument(text, media_type=rr.MediaType.TEXT), static=True)
 
 

@@ -27,7 +27,7 @@ class Verdict:
         passed: whether the episode as a whole may stay.
         numbers: measured values, next to the thresholds they were held against.
         bad_frames: bool (n,) frames that must not be trained on, where the detector can tell.
-        curves: by name, for `worldline inspect`.
+        curves: by name.
     """
 
     reason: str

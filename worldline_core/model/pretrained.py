@@ -1,26 +1,22 @@
-"""World models of a folder or the Hugging Face hub, and the card of a checkpoint."""
+"""World models of a folder or the Hugging Face hub, and folders that can be published."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
-from math import isfinite
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.errors import ArtifactError, CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import CheckpointInfo, read_checkpoint_info
+from worldline_core.model.model_card import write_model_card
 from worldline_core.model.tokenizers import VideoTokenizer, load_tokenizer, tokenizer_fingerprint
 from worldline_core.store.artifact_files import MANIFEST_NAME, is_stored, linked_folder, read_manifest, verify_artifact
 
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
-UNKNOWN = "not stated"
 
 
 def pretrained_folder(source: Path | str) -> Path:
@@ -129,79 +125,5 @@ def write_pretrained(folder: Path, output: Path) -> Path:
         for path in sorted(source.iterdir()):
             if path.suffix in {".json", ".safetensors"} and path.name != MANIFEST_NAME:
                 shutil.copyfile(path, target / path.name)
-    (output / "README.md").write_text(_model_card(folder, None), encoding="utf-8")
+    write_model_card(folder, output)
     return output
-
-
-def write_model_card(folder: Path, license_name: str | None = None) -> Path:
-    """Write the card of a finished checkpoint to its ``run/card``, which is no part of its digest.
-
-    Raises:
-        ArtifactError: the checkpoint is damaged.
-    """
-    verify_artifact(folder)
-    path = folder / "run" / "card" / "README.md"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(_model_card(folder, license_name), encoding="utf-8")
-    return path
-
-
-def _model_card(folder: Path, license_name: str | None) -> str:
-    from huggingface_hub import EvalResult, ModelCardData
-
-    info, manifest = read_checkpoint_info(folder), _manifest_with_sources(folder)
-    reached = info.metadata.get("metrics") or manifest.get("metrics", {})
-    metrics = {
-        name: value for name, value in sorted(reached.items()) if type(value) in (int, float) and isfinite(value)
-    }
-    data = ModelCardData(
-        library_name="worldline",
-        license=license_name,
-        tags=["robotics", "world-model", "image-to-video"],
-        model_name=f"WorldLine {info.kind}" if metrics else None,
-        eval_results=[
-            EvalResult("image-to-video", "robotics", "the recordings that it was trained on", name, value)
-            for name, value in metrics.items()
-        ]
-        or None,
-    )
-    contract = {} if info.action_contract is None else info.action_contract.model_dump(mode="json")
-    causal = {} if info.causal is None else {"causal": info.causal.model_dump(mode="json")}
-    trained = {"views together": list(info.view_sets), "strides": list(info.strides), "weights": info.dtype}
-    sections = (
-        f"---\n{data.to_yaml()}\n---",
-        f"# WorldLine {info.kind}",
-        "## Trained on\n\n" + "\n".join(_training(info, manifest)),
-        "## Reached\n\n" + ("\n".join(f"- {name}: {value:.4g}" for name, value in metrics.items()) or UNKNOWN),
-        "## Contract\n\n" + "\n".join(f"- {n}: {json.dumps(v)}" for n, v in (contract | causal | trained).items()),
-        f"## Licence\n\nOf the weights: {license_name or UNKNOWN}. The licences of what it was trained on hold as well.",
-    )
-    return "\n\n".join(sections) + "\n"
-
-
-def _manifest_with_sources(folder: Path) -> dict[str, Any]:
-    """A folder's manifest, with ``sources``: licence by source of the recordings that it was trained on, where they are."""
-    manifest = read_manifest(folder)
-    found = manifest.get("inputs", {}).get("episodes", {}).get("path")
-    store = folder.resolve().parent.parent
-    for _ in range(2):  # a filtered set points to the curated one, which has the table
-        episodes = None if found is None else (store / found).resolve()
-        # A manifest that came with the weights may name any place: only its own store is read.
-        if episodes is None or not episodes.is_relative_to(store) or not episodes.is_dir():
-            break
-        if table := read_source_table(episodes):
-            manifest["sources"] = {source.label: source.license for source in table}
-            break
-        found = read_manifest(episodes).get("inputs", {}).get("episodes", {}).get("path")
-    return manifest
-
-
-def _training(info: CheckpointInfo, manifest: Mapping[str, Any]) -> Iterator[str]:
-    facts, licences = info.metadata, manifest.get("sources", {})
-    counts = dict.fromkeys(licences, UNKNOWN) | facts.get("sources", {})
-    yield f"- episodes: {facts.get('episodes', UNKNOWN)}"
-    for source, count in sorted(counts.items()):
-        yield f"- source {source}: {count} episodes, licence {licences.get(source, UNKNOWN)}"
-    yield f"- steps: {facts.get('step', UNKNOWN)}, seed {facts.get('seed', UNKNOWN)}"
-    for name, version in sorted(manifest.get("environment", {}).get("packages", {}).items()):
-        yield f"- {name} {version}"

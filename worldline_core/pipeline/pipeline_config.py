@@ -12,7 +12,7 @@ from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.config import StrictModel, load_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.errors import UnavailableError
+from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.evaluation_config import (
     PlanningConfig,
     PolicyEvaluationConfig,
@@ -143,6 +143,22 @@ class PipelineConfig(StrictModel):
         """Folders of the weights that the run starts from or compares with, those that it names."""
         named = self.models.model_dump().items()
         return {name: project_path(Path.cwd(), path) for name, path in named if path is not None}
+
+    def check_night(self) -> None:
+        """Raises ConfigError where a night predicts by no model that exists: it could never become worse."""
+        checkpoints = self.checkpoints({})
+        if not any(
+            run.imported or (run.checkpoint and run.checkpoint in checkpoints) for run in self.rollouts.values()
+        ):
+            raise ConfigError(
+                "A night of this preset measures no model: it trains none, and rolls out none that is there",
+                where="rollouts",
+                expected="a rollout of " + " or ".join(filter(None, checkpoints))
+                if any(checkpoints)
+                else "models.stage2",
+                got={name: run.checkpoint for name, run in self.rollouts.items()},
+                next_step="take the preset demo or tiny, or name a model and a rollout of it",
+            )
 
     def shipped_checkpoints(self) -> dict[str, Path]:
         """Folders of the checkpoints that a rollout may name and this run does not make."""

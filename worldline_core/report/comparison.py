@@ -53,7 +53,7 @@ HISTORY_FILE = "history.jsonl"
 """A `Night` a line, oldest first; its scores by recording are in `scores/`."""
 PICTURES = "pictures"
 HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "accuracy", "success")
-MOST_CHARTS, MOST_LINES, MOST_TICKS, MOST_PICTURES = 8, 8, 8, 4
+MOST_CHARTS, MOST_TICKS, MOST_PICTURES = 8, 8, 4
 
 Verdict = Literal["better", "worse", "same", "new", "missing"]
 
@@ -152,14 +152,10 @@ def compare_runs(
 
 def as_table(rows: Sequence[Difference]) -> str:
     """Rows as aligned text."""
-    heading = ("metric", "group", "method", "first", "second", "difference", "95 %", "n", "better")
-    lines = [heading] + [
-        (
-            r.metric, f"{r.what} {r.group}", r.method, f"{r.first:.3f}", f"{r.second:.3f}", f"{r.difference:+.3f}",
-            f"[{r.low:+.3f}, {r.high:+.3f}]", f"{r.recordings}", r.better,
-        )
-        for r in rows
-    ]  # fmt: skip
+    lines = [("metric", "group", "method", "first", "second", "difference", "95 %", "n", "better")]
+    for r in rows:
+        values = f"{r.first:.3f}", f"{r.second:.3f}", f"{r.difference:+.3f}", f"[{r.low:+.3f}, {r.high:+.3f}]"
+        lines.append((r.metric, f"{r.what} {r.group}", r.method, *values, f"{r.recordings}", r.better))
     lines = [tuple(map(visible, line)) for line in lines]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(text.ljust(w) for text, w in zip(line, widths, strict=True)).rstrip() for line in lines)
@@ -247,6 +243,13 @@ class NightlyComparison:
     @property
     def regressions(self) -> list[str]:
         return [change.metric for change in self.worse]
+
+    @property
+    def verdicts(self) -> dict[str, str]:
+        """Every metric's verdict, those that became worse first; with what was lost, where the paired test says."""
+        order = [*self.worse, *(change for change in self.changes if change not in self.worse)]
+        lost = {c.metric: f" by {-c.test.mean:.3f}" for c in self.worse if c.test}
+        return {change.metric: change.verdict + lost.get(change.metric, "") for change in order}
 
 
 def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -> NightlyComparison:
@@ -402,20 +405,19 @@ def _write_pictures(history: Path, compared: NightlyComparison, artifacts: Mappi
         return {}
     episodes = EpisodeSet.open(artifacts["filter"])
     recorded = {row.episode_id for row in episodes.rows}
-    tests = [(change.metric.split("/")[2], change.test) for change in compared.worse if change.test]
-    lost = [(method, recording) for method, test in tests for recording, _ in test.worst]
+    lost = [
+        (change.metric.split("/")[2], recording, f": {change.metric.split('/', 3)[3]} became worse by {-value:.3f}")
+        for change in compared.worse if change.test for recording, value in change.test.worst
+    ]  # fmt: skip
+    shown: dict[tuple[str, str], str] = {}
+    for method, recording, what in lost or [(name, rollout.episode_ids[0], "") for name, rollout in rollouts.items()]:
+        if method in rollouts and recording in recorded and HEAD in rollouts[method].views(recording):
+            shown.setdefault((method, recording), f"{recording}, {method}{what}")
     written: dict[str, str] = {}
-    for method, recording in lost or [(name, rollout.episode_ids[0]) for name, rollout in rollouts.items()]:
-        rollout, what = rollouts.get(method), f"{recording}, {method}"
-        if rollout is None or recording not in recorded or what in written or HEAD not in rollout.views(recording):
-            continue
+    for (method, recording), what in [*shown.items()][:MOST_PICTURES]:
         written[what] = f"{PICTURES}/{digest_value([compared.night, what])[:16]}.jpg"
-        sheet = contact_sheet(
-            compared_rows(rollout, episodes, recording, [HEAD]), title=f"{compared.night}: {recording}"
-        )
+        sheet = contact_sheet(compared_rows(rollouts[method], episodes, recording, [HEAD]), title=what)
         write_bytes_atomic(history / written[what], jpeg_bytes(sheet))
-        if len(written) == MOST_PICTURES:
-            break
     return written
 
 
@@ -444,7 +446,7 @@ def _trends(nights: Sequence[Night]) -> list[Markup]:
     shown = []
     for (where, metric), members in sorted(grouped.items())[:MOST_CHARTS]:
         lines = []
-        for index, name in enumerate(members[:MOST_LINES]):
+        for index, name in enumerate(members[:8]):
             points = [(float(i + 1), night.metrics[name]) for i, night in enumerate(nights) if name in night.metrics]
             x, means, low, high = zip(*((i, v.mean, v.low, v.high) for i, v in points), strict=True)
             lines.append(charts.Series(name.split("/")[2], x, means, low, high, colour=f"c{index}", markers=True))

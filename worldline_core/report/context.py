@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from markupsafe import Markup
 from pydantic import Field
@@ -59,20 +59,13 @@ class ReportConfig(StrictModel):
     )
 
 
-@dataclass(frozen=True)
-class Method:
+class Method(NamedTuple):
     """A method as the report shows it: model and controls (`kind`), and the origin of its weights (`group`)."""
 
     name: str
     kind: str
     group: str
-
-    @property
-    def label(self) -> str:
-        found = re.fullmatch(r"(?:shipped_)?(stage2|causal)_(\d+)_steps", self.name)
-        if found:
-            return f"{KINDS[found[1]][0]}, {found[2]} steps"
-        return KINDS[self.kind][0] or self.name.replace("_", " ")
+    label: str
 
     @property
     def long_label(self) -> str:
@@ -87,18 +80,19 @@ class Method:
 def method(name: str) -> Method:
     """The method of a name: `shipped_stage2_shuffled`, `causal`, `stage2.zero`, `copy_first_frame`, `true`, ..."""
     words = set(re.split(r"[._-]+", name))
+    kind, group = "other", "shipped" if "shipped" in words else "run"
     if name == TRUE_METHOD:
-        return Method(name, TRUE_METHOD, TRUE_METHOD)
-    if "copy" in words:
-        return Method(name, "copy", "baseline")
-    group = "shipped" if "shipped" in words else "run"
-    if "steps" in words:  # another number of steps is another method
-        return Method(name, "other", group)
-    if found := words & {"stage1", "backbone"}:
-        return Method(name, found.pop(), "baseline")
-    base = next((word for word in ("causal", "stage2") if word in words), "other")
-    control = "_zero" if words & {"zero", "no"} else "_shuffled" if "shuffled" in words else ""
-    return Method(name, base + control if base != "other" else base, group)
+        kind, group = TRUE_METHOD, TRUE_METHOD
+    elif "copy" in words:
+        kind, group = "copy", "baseline"
+    elif "steps" in words:  # another number of steps is another method
+        if steps := re.fullmatch(r"(?:shipped_)?(stage2|causal)_(\d+)_steps", name):
+            return Method(name, kind, group, f"{KINDS[steps[1]][0]}, {steps[2]} steps")
+    elif found := words & {"stage1", "backbone"}:
+        kind, group = found.pop(), "baseline"
+    elif base := next((word for word in ("causal", "stage2") if word in words), None):
+        kind = base + ("_zero" if words & {"zero", "no"} else "_shuffled" if "shuffled" in words else "")
+    return Method(name, kind, group, KINDS[kind][0] or name.replace("_", " "))
 
 
 def in_order(names: Iterable[str]) -> list[Method]:
@@ -110,6 +104,14 @@ def in_order(names: Iterable[str]) -> list[Method]:
 def predicting(names: Iterable[str]) -> list[Method]:
     """All methods but the recorded videos, in the report's order."""
     return [m for m in in_order(names) if m.name != TRUE_METHOD]
+
+
+def share_interval(measured: JsonObject | None) -> JsonObject | None:
+    """A mean share with its interval; where all cases agree, a bootstrap sees no spread: the exact bound of n equal cases."""
+    if measured is None or measured["low"] < measured["high"] or measured["mean"] not in (0, 1):
+        return measured
+    unseen = 1 - 0.025 ** (1 / max(int(measured.get("count", 1)), 1))
+    return {**measured, "low": max(0.0, measured["low"] - unseen), "high": min(1.0, measured["high"] + unseen)}
 
 
 @dataclass(frozen=True)
@@ -145,14 +147,14 @@ class VideoScores:
     def value(self, group: str, method: str, metric: str) -> JsonObject | None:
         """`{"mean", "low", "high", "count"}` of a metric, or None."""
         found = (s["metrics"].get(group, {}).get(method, {}).get(metric) for s in self.summaries)
-        return next((value for value in found if value is not None), None)
+        return next(filter(None, found), None)
 
     def difference(self, group: str, first: str, second: str, metric: str) -> JsonObject | None:
         """Paired difference `first - second` over the trajectories that both have, or None."""
-        for row in (row for s in self.summaries for row in s.get("differences", {}).get(group, [])):
-            if (row["first"], row["second"], row["metric"]) == (first, second, metric):
+        for row in (row for s in self.summaries for row in s.get("differences", {}).get(group, ())):
+            if row["metric"] == metric and (row["first"], row["second"]) == (first, second):
                 return row
-            if (row["first"], row["second"], row["metric"]) == (second, first, metric):
+            if row["metric"] == metric and (row["first"], row["second"]) == (second, first):
                 return {**row, "mean": -row["mean"], "low": -row["high"], "high": -row["low"]}
         return None
 
@@ -177,6 +179,12 @@ class VideoScores:
             if (row["method"], row["metric"], row["view"], row["split"]) == (method, metric, view, split):
                 values[row["episode_id"]].append(row["value"])
         return {name: sum(items) / len(items) for name, items in sorted(values.items())}
+
+    def along_time(self, group: str, method: str, metric: str) -> list[tuple[float, float]]:
+        """(frame, mean) of a metric of the head view, frame by frame."""
+        key = method, group, "head", metric
+        rows = [row for row in self.by_frame if (row["method"], row["split"], row["view"], row["metric"]) == key]
+        return sorted((float(row["frame"]), float(row["mean"])) for row in rows)
 
     def primary(self, group: str) -> Method | None:
         """The method that heads the page: the first Stage II, long-trained weights before this run's."""

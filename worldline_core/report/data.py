@@ -7,6 +7,7 @@ from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ UNKNOWN = "unknown"
 PICTURES = "pictures"
 PAGE_ROWS, ROWS_PER_SOURCE, MOMENTS, OVERLAYS = 12, 6, 6, 4
 SHEET_WIDTH = 1180
-MOST_INSTRUCTIONS, MOST_LEAKS = 15, 12
+MOST_INSTRUCTIONS, MOST_LEAKS = 15, 4
 LONGEST_CELL = 300
 """Characters of one cell of a Markdown table."""
 HUB_LICENSES = re.compile(
@@ -93,10 +94,6 @@ class DatasetFacts:
         )
 
     @property
-    def num_frames(self) -> int:
-        return sum(row.video_frames for row in self.rows)
-
-    @property
     def num_episodes(self) -> int:
         """Recorded episodes of which something was kept."""
         return len({(row.dataset, row.episode_index) for row in self.rows})
@@ -105,11 +102,14 @@ class DatasetFacts:
     def summary(self) -> str:
         """Two sentences about size and outcomes."""
         rows, outcomes = self.rows, Counter(row.outcome for row in self.rows)
+        distinct = {
+            name: len({getattr(row, name) for row in rows} - {""}) for name in ("embodiment", "scene", "instruction")
+        }
         return (
-            f"{recorded_time(rows)} in {self.num_episodes} episodes ({len(rows)} segments), {self.num_frames} frames per view;"
-            f" {len({row.embodiment for row in rows})} embodiments, {len({row.scene for row in rows})} scenes,"
-            f" {len({row.instruction for row in rows if row.instruction})} instructions. Outcomes: {outcomes['success']} successes,"
-            f" {outcomes['failure']} failures, {outcomes['unknown']} unknown; they are labels for evaluation and never reach a model."
+            f"{recorded_time(rows)} in {self.num_episodes} episodes ({len(rows)} segments); "
+            + ", ".join(f"{count} {name}s" for name, count in distinct.items())
+            + f". Outcomes: {outcomes['success']} successes, {outcomes['failure']} failures, {outcomes['unknown']} unknown;"
+            " they are labels for evaluation and never reach a model."
         )
 
     @property
@@ -123,11 +123,16 @@ class DatasetFacts:
         return f"None of the {len(tested)} test scenes is among the {len(learnt)} scenes of training and validation."
 
     @property
+    def num_found(self) -> int:
+        """Episodes that the sources held."""
+        return len(self.curated) + len(self.refused_by_curation)
+
+    @property
     def funnel(self) -> Table:
         """Numbers left after each step, in episodes, then in segments."""
         filtered = [("kept by the filters", self.num_episodes), ("segments of these", len(self.rows))]
         steps = [
-            ("episodes found", len(self.curated) + len(self.refused_by_curation)),
+            ("episodes found", self.num_found),
             ("kept by curation", len(self.curated)),
             *(filtered if self.filtered else []),
             ("fit for Stage I", sum(row.stage1_ok for row in self.rows)),
@@ -137,7 +142,7 @@ class DatasetFacts:
 
     @property
     def reason_table(self) -> Table:
-        """Step, reason, count and an example's detail of everything that was refused, the most frequent first."""
+        """Step, reason, count and an example of everything that was refused, the most frequent first."""
         rows: list[list[object]] = []
         for step, refused in {
             "curation": [(row.reason, f"{row.episode_id}: {row.detail}") for row in self.refused_by_curation],
@@ -147,9 +152,7 @@ class DatasetFacts:
                 for f in self.findings
                 if f["cut_frames"]
             ],
-            "kept for Stage I only": [
-                (r.stage2_reason, r.episode_id) for r in self.rows if r.stage2_reason is not None
-            ],
+            "kept for Stage I only": [(row.stage2_reason, row.episode_id) for row in self.rows if row.stage2_reason],
         }.items():
             first = dict(reversed(refused))
             for reason, count in most_frequent(reason for reason, _ in refused):
@@ -179,18 +182,17 @@ class DatasetFacts:
         """Origin of the episodes, their numbers, and what their licences allow."""
         rows = []
         for name in self.names:
-            own = [row for row in self.rows if row.source == name]
-            noted, weight = self.source_facts(name), self.weights.get(name)
+            own, noted = [row for row in self.rows if row.source == name], self.source_facts(name)
+            weight = self.weights.get(name)
             share = f"{100 * float(weight['share']):.1f} %" if isinstance(weight, dict) else None
-            kind, found = (None, None) if noted is None else (noted.kind, noted.found)
+            found, rights = (
+                (None, (UNKNOWN, UNKNOWN)) if noted is None else (noted.found, (noted.license, noted.redistribution))
+            )
             kept = len({(row.dataset, row.episode_index) for row in own})
             rates = ", ".join(sorted({f"{row.fps:g}" for row in own})) or None
-            rights = (UNKNOWN, UNKNOWN) if noted is None else (noted.license, noted.redistribution)
-            rows.append([name, kind, found, kept, recorded_time(own), rates, share, *rights])
-        headings = (
-            "Source", "Kind", "Found", "Kept", "Recorded", "fps", "Share in training", "Licence", "Redistribution",
-        )  # fmt: skip
-        return Table(headings, rows, range(2, 7))
+            rows.append([name, found, kept, recorded_time(own), rates, share, *rights])
+        headings = "Source", "Found", "Kept", "Recorded", "fps", "Share in training", "Licence", "Redistribution"
+        return Table(headings, rows, range(1, 6))
 
     def count_table(self, heading: str, value_of: Callable[[EpisodeRow], str]) -> Table:
         """Scenes, episodes, recorded time and outcomes by a property of the rows."""
@@ -221,20 +223,19 @@ class DatasetFacts:
         return Table(("Instruction", "Episodes"), [(text or "(none)", count) for text, count in found], [1])
 
     @property
-    def revealing(self) -> int:
-        """Rows whose instruction reveals the outcome, which models must not see."""
-        return sum(mentions_outcome(row.instruction) for row in self.rows)
-
-    @property
-    def leakage(self) -> tuple[str, Table]:
-        """Scenes on both sides of the split that look alike, in words and as a table."""
+    def leakage(self) -> str:
+        """Scenes that both sides of the split share, or that look alike on them."""
+        notes = [self.split_note]
+        if revealing := sum(mentions_outcome(row.instruction) for row in self.rows):
+            notes.append(f"Warning: {revealing} instructions reveal the outcome, which models must not see.")
         leaks = self.curation.get("scene_leaks", [])
-        rows = [(leak["learning_scene"], leak["testing_scene"], leak["distance"]) for leak in leaks[:MOST_LEAKS]]
+        pairs = [f"{leak['learning_scene']} and {leak['testing_scene']}" for leak in leaks[:MOST_LEAKS]]
         if self.curation.get("leakage_action", "off") == "off":
-            text = "Leakage was not looked for (curate.leakage.action)."
+            notes.append("First images of scenes were not compared (curate.leakage.action).")
         else:
-            text = f"{len(leaks)} pairs of scenes across the split look alike (first images; bits of 256)."
-        return text, Table(("Learnt from", "Tested on", "Differing bits"), rows, [2])
+            named = f" ({'; '.join(pairs)})" if pairs else ""
+            notes.append(f"{len(leaks)} pairs of scenes across the split look alike by their first images{named}.")
+        return " ".join(notes)
 
 
 def _origin(folder: Path, rows: Sequence[EpisodeRow]) -> Path | None:
@@ -260,18 +261,16 @@ def recorded_time(rows: Iterable[EpisodeRow]) -> str:
 
 
 def choose_rows(rows: Sequence[EpisodeRow], positions: Iterable[int], most: int) -> list[int]:
-    """Up to `most` positions, taken in turn from every pair of embodiment and task; failures and successes in turn come first."""
-    groups: dict[tuple[str, str], list[int]] = defaultdict(list)
+    """Up to `most` positions, taken in turn from every embodiment, task and outcome."""
+    groups: dict[tuple[str, ...], list[int]] = defaultdict(list)
     for position in positions:
-        groups[rows[position].embodiment, rows[position].task_family].append(position)
-    ordered = [
-        sorted(group, key=lambda i: (rows[i].outcome != ("failure" if turn % 2 else "success"), rows[i].episode_id))
-        for turn, (_, group) in enumerate(sorted(groups.items()))
-    ]
-    if len(ordered) > most:
-        return sorted(ordered[i][0] for i in evenly_spaced(len(ordered), most))
-    depths = range(max(map(len, ordered), default=0))
-    return sorted([group[depth] for depth in depths for group in ordered if depth < len(group)][:most])
+        row = rows[position]
+        groups[row.embodiment, row.task_family, row.outcome].append(position)
+    first = [groups[name][0] for name in sorted(groups)]
+    if len(first) > most:
+        return sorted(first[i] for i in evenly_spaced(len(first), most))
+    turns = zip_longest(*(groups[name] for name in sorted(groups)))
+    return sorted([position for turn in turns for position in turn if position is not None][:most])
 
 
 def sheet_rows(episodes: EpisodeSet, positions: Iterable[int]) -> tuple[list[SheetRow], list[str]]:
@@ -347,7 +346,9 @@ def hub_metadata(facts: DatasetFacts, title: str) -> DatasetCardData:
         license_name=None if known else name,
         task_categories=["robotics"],
         tags=["LeRobot", "WorldLine", "robotics", *sorted({row.embodiment for row in facts.rows})],
-        size_categories=[_SIZES[bisect_right([10**power for power in range(3, 10)], facts.num_frames)]],
+        size_categories=[
+            _SIZES[bisect_right([10**power for power in range(3, 10)], sum(row.video_frames for row in facts.rows))]
+        ],
         configs=[{"config_name": Path(d).name, "data_files": f"{d}/data/*/*.parquet"} for d in datasets] or None,
     )
 
@@ -370,12 +371,18 @@ def markdown_table(table: Table) -> str:
 # The page "Data and filters"
 
 
+def dataset_facts(context: ReportContext) -> DatasetFacts | None:
+    """Facts of the run's filtered set, or of the curated one; None without either."""
+    curated = context.inputs.get("curate")
+    folder = context.inputs.get("filter") or curated
+    return None if folder is None else DatasetFacts.read(folder, curated)
+
+
 def data_section(context: ReportContext) -> Section:
     """Counts of the recordings, the way from source to training with its reasons, and controls over the pictures."""
-    folder = context.inputs.get("filter") or context.inputs.get("curate")
-    if folder is None:
+    facts, episodes = dataset_facts(context), context.episodes
+    if facts is None or episodes is None:
         return Section("data", TITLE, missing="no EpisodeSet was given (inputs curate or filter).")
-    facts, episodes = DatasetFacts.read(folder, context.inputs.get("curate")), EpisodeSet.open(folder)
     rows, problems = sheet_rows(episodes, choose_rows(facts.rows, range(len(facts.rows)), PAGE_ROWS))
     sheet = context.picture("contact_sheet", contact_sheet(rows), alt="Recorded episodes") if rows else None
     overlays, unreadable = overlay_pictures(context, episodes)
@@ -389,12 +396,12 @@ def overlay_pictures(context: ReportContext, episodes: EpisodeSet) -> tuple[list
     folder = context.inputs.get("render_actions")
     if folder is None:
         return [], ["No action tracks were given (input render_actions)."]
-    tracks = ActionTracks.open(folder)
-    first: dict[str, int] = {}
-    rows = episodes.rows
-    for index in sorted(
+    tracks, rows = ActionTracks.open(folder), episodes.rows
+    held_out_first = sorted(
         range(len(rows)), key=lambda i: (rows[i].split not in ("test", "ood_test"), rows[i].episode_id)
-    ):
+    )
+    first: dict[str, int] = {}
+    for index in held_out_first:
         if rows[index].bank is None and len(rows[index].views) > 1 and rows[index].episode_id in tracks:
             first.setdefault(rows[index].embodiment, index)
     shown: list[tuple[Markup, EpisodeRow]] = []

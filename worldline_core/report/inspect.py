@@ -1,13 +1,13 @@
 """`worldline inspect`: counts of any artifact; for episodes, tracks and predictions a page with pictures of them.
 
 The page shows a contact sheet, one episode with its controls drawn over it (or beside its prediction), and, for a filtered set,
-kept and dropped clips by reason with the curves that decided.
+kept and dropped clips by reason.
 """
 
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,31 +18,15 @@ import numpy as np
 from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.actions.overlays import OverlayStyle, write_overlay_video
-from worldline_core.config import validate
 from worldline_core.data.episodes.episode_index import EpisodeRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
-from worldline_core.exports.export import export_rollout, recording_content, shown_tracks
-from worldline_core.exports.rerun_recording import write_rerun_recording
-from worldline_core.filters.filter import inspect as find_defects
-from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.filters.signals import measure
-from worldline_core.filters.verdict import REASONS, Curve, Finding
+from worldline_core.exports.export import export_rollout, shown_tracks
+from worldline_core.filters.verdict import REASONS
 from worldline_core.pages.page import render, words
-from worldline_core.pictures import (
-    KEPT_COLOUR,
-    ClipStrip,
-    Picture,
-    SheetRow,
-    clip_strip,
-    contact_sheet,
-    evenly_spaced,
-    jpeg_bytes,
-    reason_colour,
-    stacked,
-)
+from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
 from worldline_core.report.data import FINDINGS_FILE, choose_rows, episode_overlay, most_frequent, sheet_rows
 from worldline_core.report.videos import compared_rows
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -59,7 +43,7 @@ COUNTED = {
 PICTURED = ("EpisodeSet", "ActionTracks", "RolloutSet")
 SHEET_ROWS, MOMENTS, CLIPS_PER_REASON = 8, 6, 4
 KEPT = "kept"
-LOST_WITH_THEM = "lost_with_them"
+KEPT_COLOUR, LOST_COLOUR = (46, 150, 92), (179, 55, 47)
 
 
 @dataclass(frozen=True)
@@ -82,7 +66,6 @@ def inspect(
     episodes: Path | None = None,
     episode_id: str | None = None,
     video: bool = False,
-    rerun: bool = False,
 ) -> Inspection:
     """Verify and describe an artifact, and write a page with pictures of it.
 
@@ -91,7 +74,6 @@ def inspect(
         episodes: the EpisodeSet of tracks or predictions, or the one that was filtered; default: by the manifest.
         episode_id: the episode to show; default: the first one.
         video: also write a video of the episode, with its controls drawn over all views or its prediction beside the truth.
-        rerun: also write a Rerun recording of the episode.
 
     Raises:
         ArtifactError: the folder is damaged, of no known kind, or its EpisodeSet is unknown.
@@ -102,11 +84,11 @@ def inspect(
     kind = kind_of(folder)
     lines = describe(kind, folder)
     if kind not in PICTURED:
-        if video or rerun or episode_id is not None:
+        if video or episode_id is not None:
             raise ConfigError("There are no pictures of this kind of artifact", expected=" | ".join(PICTURED), got=kind)
         return Inspection(kind, lines)
     subject = _Subject(kind, folder, episodes, output or folder / "run" / "inspect")
-    subject.write(episode_id, video=video, rerun=rerun)
+    subject.write(episode_id, video=video)
     names = [path.name for path in subject.written]
     title = f"{kind} {folder.resolve().name}"
     page = render("report/inspect.html", title=title, lines=lines, subject=subject, names=names)
@@ -120,9 +102,9 @@ def describe(kind: str, folder: Path) -> list[str]:
     step, version, digest = (manifest.get(key) for key in ("step", "version", "digest"))
     first = [f"step {step}, version {version}, digest {str(digest)[:16]}"] if manifest else []
     if kind == "Scores":
-        values: dict[str, list[float]] = {}
+        values: dict[str, list[float]] = defaultdict(list)
         for row in read_rows(folder / "scores.parquet"):
-            values.setdefault(f"{row['split']:10} {row['metric']:28} {row['method']:28}", []).append(row["value"])
+            values[f"{row['split']:10} {row['metric']:28} {row['method']:28}"].append(row["value"])
         return [*first, *(f"{name} mean {np.mean(v):9.4f}  n {len(v)}" for name, v in sorted(values.items()))]
     if kind == "Checkpoint":
         content = read_json(folder / "checkpoint.json")
@@ -148,15 +130,15 @@ class _Subject:
         if linked is not None:
             verify_artifact(linked)
         self.episodes_folder = folder if kind == "EpisodeSet" else linked
-        self.filtered = None
+        self.curated = None
         self.notes: list[str] = []
         self.written: list[Path] = []
-        self.reasons: list[dict[str, object]] = []
+        self.reasons: list[tuple[object, ...]] = []
         if kind == "EpisodeSet" and (folder / FINDINGS_FILE).is_file():
             if linked is None:
                 self.notes.append("dropped clips are not shown: the unfiltered set is unknown (--episodes FOLDER)")
             else:
-                self.filtered = FilteredSet(folder, linked)
+                self.curated = EpisodeSet.open(linked)
 
     @cached_property
     def episodes(self) -> EpisodeSet:
@@ -173,36 +155,30 @@ class _Subject:
     def rollouts(self) -> RolloutSet:
         return RolloutSet.open(self.folder)
 
-    @cached_property
-    def recorded_tracks(self) -> ActionTracks | None:
-        folder = self.folder if self.kind == "ActionTracks" else linked_folder(self.folder, "tracks")
-        return None if folder is None else ActionTracks.open(folder)
-
-    def picture(self, name: str, picture: Picture) -> None:
+    def picture(self, name: str, picture: Picture) -> str:
         self.written.append(self.output / f"{name}.jpg")
         write_bytes_atomic(self.written[-1], jpeg_bytes(picture))
+        return self.written[-1].name
 
-    def write(self, episode_id: str | None, *, video: bool, rerun: bool) -> None:
+    def write(self, episode_id: str | None, *, video: bool) -> None:
         """Write everything that the page shows."""
-        if self.filtered is not None:
-            whole = None
-            if episode_id is not None:  # a segment is shown with the episode that it was cut from
-                whole = episode_id if episode_id in self.filtered.outcomes else episode_of(episode_id)
-            self.write_filters(self.filtered, whole)
-            if whole in self.filtered.outcomes and episode_id not in {row.episode_id for row in self.episodes.rows}:
+        if self.curated is not None:
+            judged = self.write_filters(self.curated, episode_id)
+            if judged and episode_id not in {row.episode_id for row in self.episodes.rows}:
                 return  # dropped, or cut into segments with other names
+        rows: list[SheetRow] = []
         if self.kind == "EpisodeSet":
-            every = choose_rows(self.episodes.rows, range(len(self.episodes)), SHEET_ROWS)
-            rows, unreadable = sheet_rows(self.episodes, every)
+            chosen = choose_rows(self.episodes.rows, range(len(self.episodes)), SHEET_ROWS)
+            rows, unreadable = sheet_rows(self.episodes, chosen)
             self.notes += unreadable
-        else:
-            rows = self.prediction_rows() if self.kind == "RolloutSet" else []
+        elif self.kind == "RolloutSet":
+            rows = self.prediction_rows()
         if rows:
             self.picture("contact_sheet", contact_sheet(rows))
-        if self.episodes_folder is None and episode_id is None and not (video or rerun):
+        if self.episodes_folder is None and episode_id is None and not video:
             self.notes.append("one episode is not shown: the EpisodeSet is unknown (--episodes FOLDER)")
         else:
-            self.write_episode(self.first_episode if episode_id is None else episode_id, video=video, rerun=rerun)
+            self.write_episode(self.first_episode if episode_id is None else episode_id, video=video)
 
     @property
     def first_episode(self) -> str:
@@ -215,209 +191,109 @@ class _Subject:
 
     def prediction_rows(self) -> list[SheetRow]:
         """Moments of up to eight predictions, head view first."""
-        index = read_rows(self.folder / "index.parquet")
-        views = {str(row["episode_id"]): str(row["view"]) for row in reversed(index)}
         names, rows = sorted(self.rollouts.episode_ids), list[SheetRow]()
         for name in [names[i] for i in evenly_spaced(len(names), SHEET_ROWS)]:
-            frames = VideoFrames(self.rollouts.clip(name, views[name]))
+            view = self.rollouts.views(name)[0]
+            frames = VideoFrames(self.rollouts.clip(name, view))
             shown = frames[evenly_spaced(len(frames), MOMENTS)]
-            rows.append(SheetRow(f"{self.rollouts.method}  ·  {name}", shown, views[name]))
+            rows.append(SheetRow(f"{self.rollouts.method}  ·  {name}", shown, view))
         return rows
 
-    def write_episode(self, episode_id: str, *, video: bool, rerun: bool) -> None:
-        """Moments of one episode, with its controls or beside its prediction; a video and a Rerun recording of the same."""
+    def write_episode(self, episode_id: str, *, video: bool) -> None:
+        """Moments of one episode, with its controls or beside its prediction; a video of the same."""
         stem, position = safe_stem(episode_id), self.episodes.position(episode_id)
-        row, tracks = self.episodes.rows[position], None
-        sigma = SIGMA_PX_REFERENCE if self.recorded_tracks is None else self.recorded_tracks.sigma_px_ref
-        try:
-            if self.recorded_tracks is not None:
-                tracks = self.recorded_tracks.tracks(episode_id)
-            else:
-                tracks = shown_tracks(self.episodes.episode(position))
-        except WorldLineError as error:
-            self.notes.append(f"no controls are shown: {error.what} ({error.where})")
+        row = self.episodes.rows[position]
         title = f"{row.embodiment}  ·  {row.instruction}"
-        rollouts = {self.rollouts.method: self.rollouts} if self.kind == "RolloutSet" else {}
-        if rollouts:
+        if self.kind == "RolloutSet":
             rows = compared_rows(self.rollouts, self.episodes, episode_id, self.rollouts.views(episode_id))
             self.picture(f"{stem}_prediction", contact_sheet(rows, title=title))
             if video:
+                rollouts = {self.rollouts.method: self.rollouts}
                 self.written += export_rollout(rollouts, self.episodes, None, episode_id, self.output, ("mp4",))
-        elif tracks is not None:
-            sheet = episode_overlay(self.episodes, position, tracks, sigma, f"{episode_id}  ·  {title}")
-            self.picture(f"{stem}_controls", sheet)
-            if video:
-                frames = {view: VideoFrames(self.episodes.clip(position, view)) for view in row.views}
-                self.written.append(self.output / f"{stem}.mp4")
-                write_overlay_video(self.written[-1], frames, tracks, row.fps, style=OverlayStyle(sigma), title=title)
-        if rerun:
-            content = recording_content(rollouts, self.episodes, tracks, episode_id, sigma_px_ref=sigma)
-            self.written.append(self.output / f"{stem}.rrd")
-            write_rerun_recording(self.written[-1], content)
+            return
+        recorded = ActionTracks.open(self.folder) if self.kind == "ActionTracks" else None
+        try:
+            tracks = recorded.tracks(episode_id) if recorded else shown_tracks(self.episodes.episode(position))
+        except WorldLineError as error:
+            self.notes.append(f"no controls are shown: {error.what} ({error.where})")
+            return
+        sigma = SIGMA_PX_REFERENCE if recorded is None else recorded.sigma_px_ref
+        title = f"{episode_id}  ·  {title}  ·  {tracks.controls_label}"
+        self.picture(f"{stem}_controls", episode_overlay(self.episodes, position, tracks, sigma, title))
+        if video:
+            frames = {view: VideoFrames(self.episodes.clip(position, view)) for view in row.views}
+            self.written.append(self.output / f"{stem}.mp4")
+            write_overlay_video(self.written[-1], frames, tracks, row.fps, style=OverlayStyle(sigma), title=title)
 
-    def write_filters(self, filtered: FilteredSet, episode_id: str | None) -> None:
-        """Strips of one episode, or of up to four episodes of every reason."""
-        if episode_id in filtered.outcomes:
-            episode = filtered.outcomes[episode_id]
-            strips = [filtered.strip(episode, reason) for reason in episode.reasons]
-            self.picture(f"{safe_stem(episode_id)}_filters", stacked(strips))
-        for reason, episodes in filtered.by_reason().items() if episode_id is None else ():
-            strips, name = list[Picture](), f"reason_{safe_stem(reason)}"
-            for episode in episodes[:CLIPS_PER_REASON]:
-                try:
-                    strips.append(filtered.strip(episode, reason))
-                except DataError as error:
-                    self.notes.append(f"No picture of {episode.episode_id}: {error.what}")
-            if strips:
-                self.picture(name, stacked(strips))
-            self.reasons.append({
-                "name": "kept whole" if reason == KEPT else reason,
-                "colour": KEPT_COLOUR if reason == KEPT else reason_colour(reason),
-                "text": "No detector found a defect." if reason == KEPT else REASONS.get(reason, ""),
-                "count": len(episodes),
-                "dropped": sum(episode.dropped == reason for episode in episodes),
-                "picture": f"{name}.jpg" if strips else None,
-            })  # fmt: skip
+    def write_filters(self, curated: EpisodeSet, episode_id: str | None) -> bool:
+        """Clips of up to four episodes of every reason, or of one episode; False where the filters judged no such episode."""
+        clips = clips_by_reason(self.folder)
+        judged = {name for found in clips.values() for name in found}
+        whole = episode_id if episode_id is None or episode_id in judged else episode_of(episode_id)
+        for reason, found in clips.items():
+            names = [name for name in found if whole in (None, name)][:CLIPS_PER_REASON]
+            rows = list[SheetRow]()
+            for name in names:
+                shown, unreadable = sheet_rows(curated, [curated.position(name)])
+                self.notes += unreadable
+                rows += [found[name].shown(row, reason, curated) for row in shown]
+            name = safe_stem(reason) if whole is None else f"{safe_stem(whole)}_{safe_stem(reason)}"
+            if names:
+                picture = self.picture(f"reason_{name}", contact_sheet(rows, tile_height=96)) if rows else None
+                dropped = sum(not clip.kept for clip in found.values())
+                self.reasons.append((reason, REASONS.get(reason, ""), len(found), dropped, picture))
+        return episode_id in judged
 
 
 # Filtered sets
 
 
 @dataclass(frozen=True)
-class FilteredEpisode:
-    """One curated episode after the filters.
-
-    Attributes:
-        dropped: the reason why it was dropped whole; None for a kept one.
-        kept: its segments in the filtered set.
-        cut: frames cut out of a kept episode, by reason.
-    """
+class FilteredClip:
+    """A curated episode as an example of a reason: what the filters did, the numbers behind it, and the segments kept."""
 
     episode_id: str
-    dropped: str | None
+    decision: str
+    numbers: str
     kept: Sequence[EpisodeRow]
-    cut: Counter[str]
 
-    @property
-    def reasons(self) -> list[str]:
-        """Every reason that it is an example of; `kept` for one without any."""
-        if self.dropped is not None:
-            return [self.dropped]
-        barred = [row.stage2_reason or "unfit for Stage II" for row in self.kept if not row.stage2_ok]
-        return list(dict.fromkeys([*self.cut, *barred])) or [KEPT]
-
-    def decision(self, reason: str) -> str:
-        """The filters' decision, in words."""
-        if reason == KEPT:
-            return "kept whole"
-        cut = f"{self.cut[reason]} frames cut" if reason in self.cut else "kept for Stage I only"
-        return f"{words(reason)}: {cut if self.dropped is None else 'dropped whole'}"
+    def shown(self, pictures: SheetRow, reason: str, curated: EpisodeSet) -> SheetRow:
+        """The episode's row of a sheet with the decision, and a colour for each recorded frame: kept or not."""
+        row = curated.rows[curated.position(self.episode_id)]
+        colours = np.full((row.video_frames, 3), LOST_COLOUR, dtype=np.uint8)
+        for segment in self.kept:
+            colours[segment.start - row.start : segment.stop - row.start] = KEPT_COLOUR
+        return SheetRow(f"{words(reason)}: {self.decision}  ·  {pictures.note}", pictures.frames, self.numbers, colours)
 
 
-def read_outcomes(folder: Path) -> dict[str, FilteredEpisode]:
-    """Every episode that a filter step has judged, by id.
+def clips_by_reason(folder: Path) -> dict[str, dict[str, FilteredClip]]:
+    """By reason and episode, everything that a filter step judged: the most frequent reason first, `kept` last.
 
     Raises: DataError, ArtifactError: a table of the step is missing or damaged.
     """
-    dropped = {row.episode_id: row.reason for row in read_quarantine(folder)}
-    kept: dict[str, list[EpisodeRow]] = {}
+    kept: dict[str, list[EpisodeRow]] = defaultdict(list)
     for row in read_index(folder):
-        kept.setdefault(episode_of(row.episode_id), []).append(row)
-    cut: dict[str, Counter[str]] = {name: Counter() for name in sorted({*dropped, *kept})}
+        kept[episode_of(row.episode_id)].append(row)
+    clips: dict[str, dict[str, FilteredClip]] = defaultdict(dict)
+    for row in read_quarantine(folder):
+        clips[row.reason][row.episode_id] = FilteredClip(row.episode_id, "dropped whole", row.detail, ())
+    cut = set[str]()
     for row in read_rows(folder / FINDINGS_FILE):
-        if row["cut_frames"] and row["episode_id"] not in dropped:
-            cut[row["episode_id"]][row["detector"]] += row["cut_frames"]
-    return {name: FilteredEpisode(name, dropped.get(name), kept.get(name, ()), counts) for name, counts in cut.items()}
+        if row["cut_frames"] and (name := row["episode_id"]) in kept:
+            cut.add(name)
+            measured = {k: v for k, v in json.loads(row["numbers"]).items() if isinstance(v, float)}
+            numbers = "  ·  ".join(f"{words(key)} {value:.3g}" for key, value in measured.items())
+            decision = f"{row['cut_frames']} frames cut"
+            clips[row["detector"]].setdefault(name, FilteredClip(name, decision, numbers, kept[name]))
+    for name, rows in sorted(kept.items()):
+        barred = {row.stage2_reason or "unfit for Stage II" for row in rows if not row.stage2_ok}
+        for reason in sorted(barred) or ([] if name in cut else [KEPT]):
+            decision = "kept whole" if reason == KEPT else "kept for Stage I only"
+            clips[reason].setdefault(name, FilteredClip(name, decision, "", rows))
+    return dict(sorted(clips.items(), key=lambda item: (item[0] == KEPT, -len(item[1]), item[0])))
 
 
 def episode_of(name: str) -> str:
     """The episode that a kept row was cut from: `episode@00120` is a segment of `episode`."""
     episode, _, start = name.rpartition("@")
     return episode if episode and len(start) == 5 and start.isdigit() else name
-
-
-class FilteredSet:
-    """A filter step's artifact beside the EpisodeSet that it filtered."""
-
-    def __init__(self, folder: Path, curated: Path) -> None:
-        self.episodes = EpisodeSet.open(curated)
-        self.outcomes = read_outcomes(folder)
-        config = read_json(folder / "manifest.json").get("config")
-        self.config = FilterConfig() if config is None else validate(FilterConfig, config, where=folder)
-
-    @property
-    def summary(self) -> str:
-        episodes = self.outcomes.values()
-        dropped, segments = sum(e.dropped is not None for e in episodes), sum(len(e.kept) for e in episodes)
-        return (
-            f"{len(episodes)} episodes: {len(episodes) - dropped} kept in {segments} segments, {dropped} dropped whole."
-        )
-
-    def by_reason(self) -> dict[str, list[FilteredEpisode]]:
-        """Episodes by reason, the most frequent first, the kept ones last."""
-        groups: dict[str, list[FilteredEpisode]] = {}
-        for episode in self.outcomes.values():
-            for reason in episode.reasons:
-                groups.setdefault(reason, []).append(episode)
-        return dict(sorted(groups.items(), key=lambda item: (item[0] == KEPT, -len(item[1]), item[0])))
-
-    def strip(self, episode: FilteredEpisode, reason: str) -> Picture:
-        """An episode with kept and dropped frames along time, and the curve of the detector that gave the reason.
-
-        Raises: DataError when the episode's images cannot be read.
-        """
-        i = self.episodes.position(episode.episode_id)
-        row = self.episodes.rows[i]
-        thumbnails = {view: self.episodes.thumbnails(i, view) for view in row.views}
-        findings = find_defects(self.config.for_source(row.source), measure(self.episodes.episode(i), thumbnails))
-        decisive = next((f for f in findings if f.verdict.reason == reason and not f.verdict.clean), None)
-        view, curve, note = row.primary_view, None, ""
-        moments = {*evenly_spaced(row.video_frames, MOMENTS)}
-        if decisive is not None:
-            view = decisive.view if decisive.view in row.views else view
-            note = "  ·  ".join(
-                f"{words(k)} {v:.3g}" for k, v in decisive.verdict.numbers.items() if isinstance(v, float)
-            )
-            if decisive.verdict.bad_frames is not None:
-                bad = np.flatnonzero(decisive.verdict.bad_frames[: row.video_frames])
-                moments |= {int(bad[n]) for n in evenly_spaced(len(bad), 2)}
-            if decisive.verdict.curves:
-                name, found = deciding_curve(decisive)
-                curve = (name, found.values[: row.video_frames], found.threshold)
-        return clip_strip(
-            ClipStrip(
-                title=f"{episode.decision(reason)}  ·  {episode.episode_id}  ·  {words(view)}",
-                note=note,
-                frames=np.asarray(self.episodes.frames(i, view, sorted(moments))),
-                moments=sorted(moments),
-                count=row.video_frames,
-                dropped=dropped_frames(row, episode.kept, findings),
-                curve=curve,
-            )
-        )
-
-
-def dropped_frames(row: EpisodeRow, kept: Sequence[EpisodeRow], findings: Sequence[Finding]) -> dict[str, np.ndarray]:
-    """By reason, bool (frames,): those that did not get into any kept segment."""
-    lost = np.ones(row.video_frames, dtype=bool)
-    for segment in kept:
-        lost[segment.start - row.start : segment.stop - row.start] = False
-    bands: dict[str, np.ndarray] = {}
-    for finding in findings:
-        bad, reason = finding.verdict.bad_frames, finding.verdict.reason
-        if bad is not None and (bad & lost).any():
-            bands[reason] = bands.get(reason, np.zeros_like(lost)) | (bad & lost)
-    rest = lost & ~np.logical_or.reduce([*bands.values(), np.zeros_like(lost)])
-    # Healthy frames that went with the dropped ones: of an episode that is dropped whole, or too few in a row.
-    return bands | ({LOST_WITH_THEM: rest} if rest.any() else {})
-
-
-def deciding_curve(finding: Finding) -> tuple[str, Curve]:
-    """The curve of a detector whose threshold best separates dropped frames from the others."""
-    bad = finding.verdict.bad_frames
-
-    def separation(item: tuple[str, Curve]) -> float:
-        above = item[1].values > item[1].threshold
-        return 0.0 if bad is None or bad.all() or not bad.any() else abs(float(above[bad].mean() - above[~bad].mean()))
-
-    return max(finding.verdict.curves.items(), key=separation)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,12 +26,13 @@ from worldline_core.report.context import (
     Section,
     VideoScores,
     predicting,
+    share_interval,
 )
-from worldline_core.report.data import data_section
+from worldline_core.report.data import data_section, dataset_facts
 from worldline_core.report.results import decisions_section, most_candidates, quality_section
 from worldline_core.report.training import provenance_section, training_section
 from worldline_core.report.videos import overview_video, videos_section
-from worldline_core.store.artifact_files import JsonObject, read_rows
+from worldline_core.store.artifact_files import JsonObject
 from worldline_core.store.atomic import remove_unfinished
 
 __all__ = ["ReportConfig", "report"]
@@ -72,28 +73,47 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
 
 @dataclass(frozen=True)
 class Figure:
-    """One number of the first page beside its reference; `bounds` is the 95 % interval of their difference."""
+    """One number of the first page beside a reference.
 
-    value: str
+    Attributes:
+        measured: mean, its 95 % interval and the count of `cases` that it rests on.
+        bounds: 95 % interval of the difference to the reference; the verdict is its sign.
+        where: the model and the recordings.
+        shares: shown in per cent.
+    """
+
     what: str
-    mean: float
+    measured: JsonObject
+    cases: str
+    beside: str
     reference: float
-    reference_text: str
     bounds: tuple[float, float] | None
-    how: str
+    where: str
+    shares: bool = False
+
+    def shown(self, value: float) -> str:
+        """A value of this figure: one digit more where two of them look equal."""
+        mean, reference = self.measured["mean"], self.reference
+        return percent(value) if self.shares else number(value, 2 if number(mean) != number(reference) else 3)
+
+    @property
+    def rests_on(self) -> str:
+        low, high = (self.shown(float(self.measured[bound])) for bound in ("low", "high"))
+        return f"95{NARROW_SPACE}%: {low} to {high}, {self.measured['count']} {self.cases}"
 
     @property
     def verdict(self) -> str:
-        """`better` or `worse` where the interval leaves the reference out, else `unclear`."""
+        """`better` or `worse` where the interval of the difference leaves out zero, else `unclear`."""
         if self.bounds is not None and self.bounds[0] > 0:
             return "better"
         return "worse" if self.bounds is not None and self.bounds[1] < 0 else "unclear"
 
     @property
     def comparison(self) -> str:
-        order = "better than" if self.mean > self.reference else "worse than" if self.mean < self.reference else "as"
+        mean = self.measured["mean"]
+        order = "better than" if mean > self.reference else "worse than" if mean < self.reference else "as"
         doubt = ", within chance" if self.verdict == "unclear" else ""
-        return f"{order} {self.reference_text}{doubt}"
+        return f"{order} {self.beside}: {self.shown(self.reference)}{doubt}"
 
 
 class HeadView(NamedTuple):
@@ -108,43 +128,32 @@ class HeadView(NamedTuple):
         """The first method of a kind with weights of one of some groups."""
         return next((m for m in self.scores.methods(self.group) if m.kind == kind and m.group in groups), None)
 
-    def value(self, method: Method | None) -> JsonObject | None:
-        return None if method is None else self.scores.value(self.group, method.name, f"{self.metric}@head")
+    def difference(self, second: Method | None, first: Method | None = None) -> tuple[float, float] | None:
+        """Interval of the paired difference of two methods (default: the main one and `second`)."""
+        names = (first or self.primary).name, "" if second is None else second.name
+        found = self.scores.difference(self.group, *names, self.metric)
+        return None if found is None else (found["low"], found["high"])
 
-    def difference(self, second: Method | None, first: Method | None = None) -> JsonObject | None:
-        first = first or self.primary
-        name = f"{self.metric}@head"
-        return None if second is None else self.scores.difference(self.group, first.name, second.name, name)
-
-    def beside_copy(self, method: Method | None, what: str, how: str = "") -> Figure | None:
+    def figure(self, method: Method | None, what: str) -> Figure | None:
         """A method's IoU beside that of copying the first frame."""
         copy = self.method("copy", "baseline")
-        mean, reference = self.value(method), self.value(copy)
+        mean, reference = (
+            None if m is None else self.scores.value(self.group, m.name, self.metric) for m in (method, copy)
+        )
         if method is None or mean is None or reference is None:
             return None
-        difference = self.difference(copy, method)
-        bounds = (difference["low"], difference["high"]) if difference else None
-        digits = 2 if number(mean["mean"]) != number(reference["mean"]) else 3
-        text = f"copying the first frame: {number(reference['mean'], digits)}"
-        how = f"{how}{mean['count']} recordings{interval_words(bounds)}"
-        return Figure(number(mean["mean"], digits), what, mean["mean"], reference["mean"], text, bounds, how)
+        where = f"{method.long_label}; {SPLIT_LABELS[self.group]}, head view"
+        bounds = self.difference(copy, method)
+        return Figure(what, mean, "recordings", "copying the first frame", reference["mean"], bounds, where)
 
 
 def head_view(context: ReportContext) -> HeadView | None:
     """The scores that head the page; None where no robot IoU was measured."""
     scores = context.video_scores
-    group = scores.groups[0] if scores.groups else None
-    primary = scores.primary(group) if group else None
-    metric = scores.iou_metric(group, primary.name) if group and primary else None
-    return None if group is None or primary is None or metric is None else HeadView(scores, group, primary, metric)
-
-
-def interval_words(bounds: tuple[float, float] | None, *, points: bool = False) -> str:
-    """The interval of a difference in words; `points` writes shares as percentage points."""
-    if bounds is None:
-        return ""
-    low, high = (number(100 * v if points else float(v), 0 if points else 3, signed=True) for v in bounds)
-    return f"; difference, 95{NARROW_SPACE}% interval: {low} to {high}{' points' if points else ''}"
+    group = scores.groups[0] if scores.groups else ""
+    primary = scores.primary(group)
+    metric = primary and scores.iou_metric(group, primary.name)
+    return HeadView(scores, group, primary, f"{metric}@head") if primary and metric else None
 
 
 def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
@@ -169,13 +178,11 @@ def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
 
 def video_figures(view: HeadView) -> tuple[Figure | None, Figure | None]:
     """The main method, and this run's own method of the same kind, beside a copy of the first frame."""
-    what = "how well the predicted robot covers the recorded one (robot IoU; 1 is perfect)"
-    where = SPLIT_LABELS.get(view.group, view.group)
-    main = view.beside_copy(view.primary, what, f"{view.primary.long_label}; {where}, head view, ")
+    main = view.figure(view.primary, "overlap of the predicted robot with the recorded one (IoU)")
     own = view.method(view.primary.kind, "run")
     if own is None or own.name == view.primary.name:
         return main, None
-    return main, view.beside_copy(own, f"the same for the {own.label} that this run trained itself")
+    return main, view.figure(own, f"the same for the {own.label} that this run trained itself")
 
 
 def planning_figure(context: ReportContext) -> Figure | None:
@@ -186,12 +193,24 @@ def planning_figure(context: ReportContext) -> Figure | None:
         return None
     values = summary["methods"][order[0].name]
     found, direct = most_candidates(values), float(summary["direct_execution"]["mean"])
-    mean, bounds = float(found["success"]["mean"]), (float(found["gain"]["low"]), float(found["gain"]["high"]))
-    what = f"of the plans chosen among {max(values['budgets'], key=int)} by their predicted videos succeed"
-    how = f"{order[0].long_label}; {len(summary['banks'])} banks{interval_words(bounds, points=True)}"
-    if ceiling := summary["methods"].get(TRUE_METHOD):
-        how += f"; by recorded videos {percent(most_candidates(ceiling)['success']['mean'])}"
-    return Figure(percent(mean), what, mean, direct, f"a blind choice: {percent(direct)}", bounds, how)
+    success = {"count": len(summary["banks"]), **found["success"]}
+    measured = share_interval(success) or success
+    # The bootstrap of the gain sees as little of a choice that never failed as that of the success.
+    bounds = found["gain"] if measured is success else {key: measured[key] - direct for key in ("low", "high")}
+    what = f"of plans succeed, chosen among {max(values['budgets'], key=int)} by their predicted videos"
+    where = order[0].long_label + by_recorded_videos(
+        summary["methods"].get(TRUE_METHOD), lambda v: most_candidates(v)["success"]
+    )
+    return Figure(
+        what,
+        measured,
+        "banks",
+        "a blind choice",
+        direct,
+        (float(bounds["low"]), float(bounds["high"])),
+        where,
+        shares=True,
+    )
 
 
 def policy_figure(context: ReportContext) -> Figure | None:
@@ -200,15 +219,19 @@ def policy_figure(context: ReportContext) -> Figure | None:
     methods = summary["methods"] if summary else {}
     order = predicting(methods)
     first = next((m for m in order if m.kind == "stage2"), order[0] if order else None)
-    found = methods[first.name].get("all", {}).get("accuracy") if first else None
+    found = share_interval(methods[first.name].get("all", {}).get("accuracy")) if first else None
     if first is None or found is None:
         return None
-    mean, bounds = float(found["mean"]), (float(found["low"]) - 0.5, float(found["high"]) - 0.5)
-    how = f"{first.long_label}; {found['count']} recordings{interval_words(bounds, points=True)}"
-    if ceiling := methods.get(TRUE_METHOD, {}).get("all", {}).get("accuracy"):
-        how += f"; from recorded videos {percent(ceiling['mean'])}"
-    what = "of the outcomes judged from predicted videos are right"
-    return Figure(percent(mean), what, mean, 0.5, f"guessing: {percent(0.5)}", bounds, how)
+    what = "of outcomes judged from predicted videos are right"
+    bounds = float(found["low"]) - 0.5, float(found["high"]) - 0.5
+    where = first.long_label + by_recorded_videos(methods.get(TRUE_METHOD), lambda v: v.get("all", {}).get("accuracy"))
+    return Figure(what, found, "recordings", "guessing", 0.5, bounds, where, shares=True)
+
+
+def by_recorded_videos(values: JsonObject | None, measured: Callable[[JsonObject], JsonObject | None]) -> str:
+    """The same from the recorded videos, the ceiling of what predicted ones can reach; nothing where it was not measured."""
+    found = None if values is None else measured(values)
+    return "" if found is None else f"; from recorded videos {percent(found['mean'])}"
 
 
 def headline(context: ReportContext, view: HeadView | None, controls: Figure | None, planning: Figure | None) -> str:
@@ -216,32 +239,22 @@ def headline(context: ReportContext, view: HeadView | None, controls: Figure | N
     clauses: list[tuple[bool, str]] = []
     if view is not None and controls is not None:
         shuffled = view.difference(view.method(f"{view.primary.kind}_shuffled", view.primary.group))
-        follows = shuffled is None or shuffled["low"] > 0
+        follows = shuffled is None or shuffled[0] > 0
         if controls.verdict != "better":
             clauses.append((False, "does not yet beat a copy of the first frame"))
         else:
             clauses.append((follows, "follows the controls" if follows else "does not yet follow the controls"))
     if planning is not None:
         results = {"better": "plans better than chance", "worse": "plans worse than chance"}
-        clauses.append(
-            (planning.verdict == "better", results.get(planning.verdict, "does not clearly plan better than chance"))
-        )
+        unclear = f"does not clearly plan better than chance on {planning.measured['count']} {planning.cases}"
+        clause = results.get(planning.verdict, unclear)
+        clauses.append((planning.verdict == "better", clause))
     if not clauses:
-        counts = episode_counts(context)
-        kept = f"{number(counts[1])} of {number(counts[0])} episodes were kept; no prediction" if counts else "Nothing"
+        facts = dataset_facts(context)
+        kept = f"{facts.num_episodes} of {facts.num_found} episodes were kept; no prediction" if facts else "Nothing"
         return f"{kept} was measured yet."
     subject = "The shipped simulator" if view is None or view.primary.group == "shipped" else "This run's simulator"
     if len(clauses) == 1:
         return f"{subject} {clauses[0][1]}."
     (good, first), (also, second) = clauses
     return f"{subject} {first} {'and' if good == also else 'but'} {second}."
-
-
-def episode_counts(context: ReportContext) -> tuple[int, int] | None:
-    """Episodes found and kept; None without a curated set."""
-    curated, filtered = context.inputs.get("curate"), context.inputs.get("filter")
-    if curated is None:
-        return None
-    rows, refused = read_rows(curated / "index.parquet"), read_rows(curated / "quarantine.parquet")
-    kept = len(rows) if filtered is None else len({row["episode_id"] for row in read_rows(filtered / "index.parquet")})
-    return len(rows) + len(refused), kept

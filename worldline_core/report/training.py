@@ -10,10 +10,15 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup, escape
 
+from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.evaluation.paired import EVALUATIONS
+from worldline_core.model.model_card import DESCRIPTIONS, model_card, model_facts
 from worldline_core.pages.charts import Series, line_chart
 from worldline_core.pages.page import Table, code, number, render, words
 from worldline_core.report.context import ReportContext, Section
+from worldline_core.report.model_figures import measurements
 from worldline_core.store.artifact_files import JsonObject, read_json, read_json_lines
+from worldline_core.store.atomic import write_bytes_atomic
 
 STAGES = {
     "train_tokenizer": "Video tokenizer",
@@ -29,12 +34,12 @@ CURVES = {
     "squared latent error": ("validation/sample_error", "validation/rollout_error"),
 }
 """Held-out values of each chart, by the label of its axis; their names with a condition's suffix are shown as well."""
-CONDITIONS = {
-    "": ("held-out scenes", "c1"),
-    "_shuffled_actions": ("held-out, shuffled actions", "c3"),
-    "_no_actions": ("held-out, no actions", "c4"),
-    "_copy": ("held-out, copy first frame", "c5"),
-}
+CONDITIONS = (
+    ("", "held-out scenes", "c1"),
+    ("_shuffled_actions", "held-out, shuffled actions", "c3"),
+    ("_no_actions", "held-out, no actions", "c4"),
+    ("_copy", "held-out, copy first frame", "c5"),
+)
 
 Curve = tuple[list[float], list[float]]
 """Steps and values."""
@@ -60,7 +65,7 @@ def training_section(context: ReportContext) -> Section:
             "training", "Training", missing="no training stage was given (inputs train_stage1, train_stage2, ...)."
         )
     lead = (
-        "This run's own training, from the base model on. Pale: every logged mean; strong: running mean. Held-out losses always use"
+        "This run's own training, from the base model on. Training loss: a running mean. Held-out losses always use"
         " the same clips, noise and noise levels, with the averaged weights."
     )
     table = Table(("Stage", "Steps", "First loss", "Last loss", "Last held-out loss"), rows, range(1, 5))
@@ -89,57 +94,54 @@ def stage_charts(title: str, curves: Mapping[str, Curve]) -> list[Markup]:
     """The loss with its held-out values, and held-out errors, logarithmic where all values are positive."""
     charts = []
     for label, names in CURVES.items():
-        series = smooth(*curves["loss"]) if label == "loss" and "loss" in curves else []
-        for name in names:
-            for suffix, (condition, colour) in CONDITIONS.items():
-                if name + suffix in curves:
-                    steps, values = curves[name + suffix]
-                    series.append(Series(condition, steps, values, colour=colour, markers=len(steps) < 40))
+        series = [Series("training", *smooth(*curves["loss"]))] if label == "loss" and "loss" in curves else []
+        for name, (suffix, condition, colour) in ((name, found) for name in names for found in CONDITIONS):
+            if name + suffix in curves:
+                steps, values = curves[name + suffix]
+                series.append(Series(condition, steps, values, colour=colour, markers=len(steps) < 40))
         if series:
             positive = all(value > 0 for item in series for value in item.y)
             charts.append(line_chart(series, title=f"{title}: {label}", x_label="step", y_label=label, log_y=positive))
     return charts
 
 
-def smooth(steps: Sequence[float], values: Sequence[float]) -> list[Series]:
-    """The curve in pale, thinned to means over equal stretches, and its running mean over a twentieth of it."""
-    width = math.ceil(len(values) / MOST_POINTS)
-    starts = range(0, len(values), width)
-    means = [float(np.mean(values[i : i + width])) for i in starts]
-    at = [steps[min(i + width, len(steps)) - 1] for i in starts]
-    window = max(1, len(means) // 20)
-    running = [float(np.mean(means[max(0, i + 1 - window) : i + 1])) for i in range(len(means))]
-    return [Series("training", at, means, faint=True), Series("training", at, running)]
+def smooth(steps: Sequence[float], values: Sequence[float]) -> Curve:
+    """Running mean over a twentieth of the curve, thinned."""
+    window, every = max(1, len(values) // 20), math.ceil(len(values) / MOST_POINTS)
+    sums = np.cumsum([0.0, *values])
+    stops = np.arange(1, len(values) + 1)
+    starts = np.maximum(0, stops - window)
+    means = (sums[stops] - sums[starts]) / (stops - starts)
+    return list(steps[::-every][::-1]), means[::-every][::-1].tolist()
 
 
 def stage_row(title: str, curves: Mapping[str, Curve]) -> list[object]:
     """Name, number of steps, first and last smoothed loss, last held-out loss."""
-    steps, values = curves.get("loss", ([], []))
-    _, held_out = curves.get("validation/loss", ([], []))
-    means = smooth(steps, values)[1].y if values else []
-    shown = [*(means[:1] or [None]), *(means[-1:] or [None]), *(held_out[-1:] or [None])]
-    return [title, int(max(steps)) if steps else None, *[None if v is None else number(v, 4) for v in shown]]
+    steps, means = smooth(*curves["loss"]) if "loss" in curves else ([], [])
+    held_out = curves.get("validation/loss", ([], []))[1]
+    values = (next(iter(found), None) for found in (means, means[::-1], held_out[::-1]))
+    return [title, int(max(steps)) if steps else None, *(None if v is None else number(v, 4) for v in values)]
 
 
 def provenance_section(context: ReportContext) -> Section:
-    """The weights with their cards, and the origin of each artifact; times and versions are filled in when the page opens."""
+    """The models with their cards, and the origin of each artifact; times and versions are filled in when the page opens."""
     if not context.inputs:
         return Section("provenance", "Provenance", missing="no artifact was given.")
     manifests = {name: read_json(folder / "manifest.json") for name, folder in sorted(context.inputs.items())}
-    cards = {
-        name: path.read_text(encoding="utf-8", errors="replace")
-        for name, folder in context.variants("models").items()
-        if (path := folder / "MODEL_CARD.md").is_file()
-    }
     rows: list[list[object]] = []
     for name, manifest in manifests.items():
         seeds = ", ".join(f"{key} {json.dumps(value)}" for key, value in sorted((manifest.get("seeds") or {}).items()))
         digest = code(str(manifest["digest"])[:16]) if manifest.get("digest") else None
         rows.append([name, digest, manifest.get("version"), seeds or None])
+    models = models_of(context)
+    facts = [model_facts(folder) for folder in models.values()]
+    headings = [*dict.fromkeys(key for found in facts for key in found)]
+    listed = [[name, *map(found.get, headings)] for name, found in zip(models, facts, strict=True)]
     return context.section(
         "provenance",
         "Provenance",
         "The same configuration on the same inputs gives the same digests.",
+        models=Table(["Model", *map(str.capitalize, headings)], listed) if listed else None,
         artifacts=Table(("Artifact", "Digest", "Version", "Seeds"), rows, caption="Artifacts that this report shows"),
         machine=context.slot("machine", render("report/machine.html", **machine_facts(manifests)), "See run/run.js."),
         configs={
@@ -147,8 +149,27 @@ def provenance_section(context: ReportContext) -> Section:
             for name, manifest in manifests.items()
             if manifest.get("config") is not None
         },
-        cards=cards,
+        cards={name: written_card(context, name, folder) for name, folder in models.items()},
     )
+
+
+def models_of(context: ReportContext) -> dict[str, Path]:
+    """The folders of the run's weights by name: its own models, then those that it was given."""
+    found = {name.removeprefix("models."): path for name, path in context.inputs.items()}
+    return {name: path for name, path in found.items() if any((path / file).is_file() for file in DESCRIPTIONS)}
+
+
+def written_card(context: ReportContext, name: str, folder: Path) -> str:
+    """The card that came with a model; else one from the run's artifacts, which is written to ``cards/<name>.md``."""
+    given = folder / "MODEL_CARD.md"
+    if given.is_file() or not (folder / DESCRIPTIONS[0]).is_file():
+        return (
+            given.read_text(encoding="utf-8", errors="replace") if given.is_file() else "No card came with this model."
+        )
+    evaluations = [path for step in EVALUATIONS for path in context.variants(step).values()]
+    text = model_card(folder, measurements(folder, evaluations))
+    write_bytes_atomic(context.output / "cards" / f"{safe_stem(name)}.md", text.encode())
+    return text.partition("\n---\n")[2]
 
 
 def machine_facts(manifests: Mapping[str, JsonObject]) -> dict[str, object]:

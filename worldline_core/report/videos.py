@@ -6,12 +6,12 @@ Episodes are never picked by hand: shown are the best, the median and the worst 
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,12 +38,12 @@ GROUP_CAPTIONS = {
     "shipped": "Long-trained: the checkpoints that ship with the project",
     "run": "This run: what its own training reached",
 }
-MOST_COLUMNS = 6
+MOST_COLUMNS, IN_A_LINE = 6, 3
+"""Of one video: a phone shows three columns beside each other."""
 MOMENTS = 6
 
 
-@dataclass(frozen=True)
-class ChosenEpisode:
+class ChosenEpisode(NamedTuple):
     """An episode, the reason why it is shown, and its score."""
 
     episode_id: str
@@ -68,28 +68,28 @@ def choose_episodes(scores: VideoScores, available: Sequence[str]) -> list[Chose
     chosen: list[ChosenEpisode] = []
     for group in scores.groups:
         first = scores.primary(group)
-        metric = scores.iou_metric(group, first.name) if first is not None else None
+        metric = first and scores.iou_metric(group, first.name)
         if first is None or metric is None or group == "train":
             continue
         values = scores.per_episode(first.name, metric, "head", group)
         ranked = best_median_worst({name: value for name, value in values.items() if name in available})
-        for label, episode, value in ranked if not chosen else ranked[:1]:
-            reason = f"{label} of {len(values)} on {SPLIT_LABELS.get(group, group)}"
-            chosen.append(ChosenEpisode(episode, reason, value))
+        where = f"of {len(values)} on {SPLIT_LABELS.get(group, group)}"
+        chosen += [
+            ChosenEpisode(episode, f"{label} {where}", value)
+            for label, episode, value in (ranked[:1] if chosen else ranked)
+        ]
     ordered = sorted(available)
-    places = sorted({0, len(ordered) // 2, len(ordered) - 1}) if ordered and not chosen else []
     return chosen or [
-        ChosenEpisode(ordered[i], f"number {i + 1} of {len(ordered)} by name (no scores)") for i in places
+        ChosenEpisode(ordered[i], f"number {i + 1} of {len(ordered)} by name (no scores)")
+        for i in evenly_spaced(len(ordered), 3)
     ]
 
 
 def chosen_episodes(context: ReportContext) -> list[ChosenEpisode]:
     """The episodes shown in video; the first is the median of the held-out ones."""
-    if context.episodes is None:
-        return []
-    known = {row.episode_id for row in context.episodes.rows}
-    predicted = sorted({name for rollout in context.rollouts.values() for name in rollout.episode_ids if name in known})
-    return choose_episodes(context.video_scores, predicted)
+    known = {row.episode_id for row in context.episodes.rows} if context.episodes else set()
+    predicted = {name for rollout in context.rollouts.values() for name in rollout.episode_ids}
+    return choose_episodes(context.video_scores, sorted(predicted & known))
 
 
 def videos_section(context: ReportContext) -> Section:
@@ -114,21 +114,16 @@ def videos_section(context: ReportContext) -> Section:
 def card(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, number: int) -> dict[str, Any]:
     """One episode: its description, its videos by view, and the recordings beside it."""
     row = episodes.rows[episodes.position(item.episode_id)]
-    views = [view for view in VIEWS if view in row.views]
-    wanted = [(view, group) for view in views for group in GROUP_CAPTIONS]
+    wanted = [(view, group) for view in VIEWS if view in row.views for group in GROUP_CAPTIONS]
     # The report runs last and alone; encoder and resizing let go of the interpreter, so threads use the other cores.
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         videos = list(pool.map(lambda place: video(context, episodes, item, place[0], place[1], number), wanted))
-    panels = []
-    for view in views:
-        made = [found for (of, _), found in zip(wanted, videos, strict=True) if of == view and found is not None]
-        if made:
-            widest = max(found["video"].width for found in made)
-            panels.append((view, [{**found, "share": found["video"].width / widest} for found in made]))
-    return {
-        "item": item, "row": row, "number": number, "panels": panels,
-        "tone": {"success": "good", "failure": "bad"}.get(row.outcome, ""),
-    }  # fmt: skip
+    panels: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for (view, _), found in zip(wanted, videos, strict=True):
+        if found is not None:
+            panels[view].append(found)
+    tone = {"success": "good", "failure": "bad"}.get(row.outcome, "")
+    return {"item": item, "row": row, "number": number, "panels": list(panels.items()), "tone": tone}
 
 
 def methods_of_group(context: ReportContext, episode_id: str, group: str) -> list[Method]:
@@ -150,9 +145,9 @@ def video(
     columns = {"true": VideoFrames(episodes.clip(index, view))}
     columns |= {method.label: VideoFrames(context.rollouts[method.name].clip(name, view)) for method in methods}
     path = context.media / f"episode{number}_{group}_{view}.mp4"
-    made = write_side_by_side(path, columns, episodes.rows[index].fps, tile_height=context.config.tile_height)
-    caption = f"{GROUP_CAPTIONS[group]} ({words(view)} view, {made.num_frames} frames). Columns: {', '.join(columns)}."
-    return {"video": made, "caption": caption}
+    size = {"tile_height": context.config.tile_height, "most": IN_A_LINE}
+    made = write_side_by_side(path, columns, episodes.rows[index].fps, **size)
+    return {"video": made, "caption": f"{GROUP_CAPTIONS[group]} ({words(view)} view, {made.num_frames} frames)."}
 
 
 def overview_video(context: ReportContext) -> dict[str, Any] | None:

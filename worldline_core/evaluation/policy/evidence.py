@@ -8,7 +8,6 @@ not print its router; this one goes by the verbs. A null is never taken for the 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, StrictBool
@@ -129,22 +128,3 @@ def establishes_success(evidence: Evidence) -> bool:
 def overturns(done: Fact, evidence: Evidence) -> bool:
     """P4 or P5 turns an unsuccessful verdict, but not against a wrong object or a drop that was seen."""
     return done is True and evidence.wrong_object_or_drop is not True
-
-
-def failure_kind(family: EvidenceFamily, stated: Mapping[str, Any]) -> str:
-    """Names the failure of an unsuccessful video.
-
-    ``dropped`` (or the wrong object), ``missed`` (never moved or never held), ``slipped`` (raised, and not held in the end), ``not done``
-    (the final state of a placing, closing or pressing is not visible), or ``not seen`` where the facts are hidden in every view.
-    """
-    if stated.get("wrong_object_or_drop"):
-        return "dropped"
-    held = stated.get("target_held_for_two_late_steps")
-    if family == "state_change":
-        return "not done" if stated.get("required_final_state_visible") is False else "not seen"
-    if family == "grasp":
-        return "missed" if held is False else "not seen"
-    raised = stated.get("head_view_confirms_target_displacement")
-    if raised is False or (raised and stated.get("target_on_original_support_at_end")):
-        return "missed"
-    return "slipped" if held is False else "not seen"
