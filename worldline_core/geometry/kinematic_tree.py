@@ -161,10 +161,11 @@ def read_mjcf(text: str, where: object) -> TreeBody:
     Raises: DataError when the text is not MJCF, or uses something this reader does not know.
     """
     root = parse_xml(text, where)
-    worldbody, *others = root.findall("worldbody") or [None]
-    if root.tag != "mujoco" or worldbody is None:
+    worlds = root.findall("worldbody")
+    if root.tag != "mujoco" or not worlds:
         raise DataError("Not an MJCF file", where=where, expected="<mujoco> with a <worldbody>", got=f"<{root.tag}>")
     _check_expanded(root, where)
+    worldbody, *others = worlds
     for other in others:
         worldbody.extend(list(other))
     for tag in ("include", "frame", "replicate", "attach"):
