@@ -23,6 +23,9 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import ImageTransform
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematic_tree import read_tree, tool_poses
+from worldline_core.geometry.transforms import euler_fixed_xyz_from_rotation
 
 Make = Callable[..., tuple]
 
@@ -305,9 +308,12 @@ def test_states_and_videos_of_different_length(tmp_path: Path) -> None:
             encode_video(path, rng.integers(0, 255, (6, 16, 24, 3), dtype=np.uint8), 5)
             videos.append({"video_path": str(path.relative_to(tmp_path / "droid"))})
         gripper = np.linspace(0, 1.02, states)[:, None]
-        pose = np.concatenate([rng.normal(size=(states, 6)), gripper], axis=1)
         bent = np.array([0.0, 0.0, 0.0, -1.6, 0.0, 1.6, 0.0])  # a Panda's elbow and wrist cannot be straight
         joints = np.concatenate([bent + 0.1 * rng.normal(size=(states, 7)), gripper], axis=1)
+        robot = load_embodiment("droid_franka")
+        tools = tool_poses(robot, read_tree(robot), joints)[:, 0]
+        angles = euler_fixed_xyz_from_rotation(tools[:, :3, :3])
+        pose = np.concatenate([tools[:, :3, 3], angles, gripper], axis=1)
         described = {
             "texts": ["pick"],
             "success": 1,

@@ -13,6 +13,9 @@ import numpy as np
 from tools.corrupted.content import FPS, gripper_motion, joint_motion, pictures
 from tools.corrupted.labels import Kind, Label
 from worldline_core.data.video.encoder import encode_video
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematic_tree import read_tree, tool_poses
+from worldline_core.geometry.transforms import euler_fixed_xyz_from_rotation
 
 _BENT = np.array([0.0, 0.0, 0.0, -1.6, 0.0, 1.6, 0.0])
 """A Panda's elbow and wrist cannot be straight."""
@@ -129,10 +132,14 @@ def _record(root: Path, name: str, random: np.random.Generator) -> Record:
     path.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(path, ignore_errors=True)
     encode_video(path, pictures(random), FPS, preset="ultrafast")
+    joints = _BENT + 0.3 * motion
+    robot = load_embodiment("droid_franka")
+    tools = tool_poses(robot, read_tree(robot), np.concatenate([joints, opening], axis=1))[:, 0]
+    poses = np.concatenate([tools[:, :3, 3], euler_fixed_xyz_from_rotation(tools[:, :3, :3])], axis=1)
     return {
         "texts": ["pick the block"],
         "success": 1,
         "videos": [{"video_path": str(path.relative_to(root))}],
-        "states": np.concatenate([motion[:, :6], 1 - opening], axis=1).tolist(),
-        "joints": np.concatenate([_BENT + 0.3 * motion, 1 - opening], axis=1).tolist(),
+        "states": np.concatenate([poses, 1 - opening], axis=1).tolist(),
+        "joints": np.concatenate([joints, 1 - opening], axis=1).tolist(),
     }

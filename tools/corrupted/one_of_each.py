@@ -163,18 +163,23 @@ def _enerverse_ac(root: Path, random: np.random.Generator) -> Source:
     return {"kind": "enerverse_ac", "fps": FPS}
 
 
+_Z1_REST = np.array([0.0, 1.5, -1.0, 0.0, 0.0, 0.0])
+
+
 def _unitree_h5(root: Path, random: np.random.Generator) -> Source:
     for folder in ("transitions/stack", "videos/stack/cam"):
         (root / folder).mkdir(parents=True)
     gripper = {"closed": 0.0, "open": 1.0}
     with require_h5py().File(root / "transitions/stack/0.h5", "w") as file:
         for key in ("observation.state", "action"):
-            file[key] = np.hstack([joint_motion(random, 6, _LENGTH), gripper_motion(random, _LENGTH)[:, None]])
+            joints = _Z1_REST + 0.3 * joint_motion(random, 6, _LENGTH)
+            file[key] = np.hstack([joints, gripper_motion(random, _LENGTH)[:, None]])
     encode_video(root / "videos/stack/cam/0.mp4", pictures(random, _LENGTH), FPS, preset="ultrafast")
     (root / "stack.csv").write_text("videoid,data_dir,instruction\n0,stack/cam,stack the box\n")
     with require_h5py().File(root / "episode_0.hdf5", "w") as file:
         for key in ("observations/qpos", "action"):
-            file[key] = np.hstack([joint_motion(random, 6, _LENGTH), gripper_motion(random, _LENGTH)[:, None]])
+            joints = _Z1_REST + 0.3 * joint_motion(random, 6, _LENGTH)
+            file[key] = np.hstack([joints, gripper_motion(random, _LENGTH)[:, None]])
         file["observations/images/cam"] = pictures(random, _LENGTH)
         file["language_raw"] = "stack the box"
     return {

@@ -258,12 +258,12 @@ def check_embodiment_name(name: str) -> None:
     names = embodiment_names()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=1)
-        raise ConfigError(
-            "Unknown embodiment",
-            expected=f"one of {', '.join(names)}",
-            got=name,
-            next_step=f"did you mean {close[0]!r}?" if close else f"add configs/embodiments/{name}.yaml",
-        )
+        next_step = f"did you mean {close[0]!r}?" if close else f"add configs/embodiments/{name}.yaml"
+        if name == "none":
+            next_step = (
+                "a robot without a description has no kinematics: describe it (docs/embodiments.md), then curate again"
+            )
+        raise ConfigError("Unknown embodiment", expected=f"one of {', '.join(names)}", got=name, next_step=next_step)
 
 
 def load_embodiment(name_or_path: str | Path, description_path: Path | str | None = None) -> Embodiment:

@@ -14,10 +14,13 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from worldline_core.errors import DataError
+from worldline_core.geometry.embodiment import Embodiment, read_description
 from worldline_core.geometry.transforms import rotation_about_axis, rotation_from_euler_fixed_xyz
 
 _UNDECLARED_PREFIX = re.compile(r"</?([A-Za-z_][\w.-]*):|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=")
@@ -383,3 +386,51 @@ def _urdf_joints(joint: ET.Element, where: object) -> list[TreeJoint]:
     axis = joint.find("axis")
     direction = _unit(_numbers("1 0 0" if axis is None else axis.get("xyz", "1 0 0"), 3, place), place)
     return [TreeJoint(name, moves, direction, np.zeros(3))]
+
+
+def read_tree(embodiment: Embodiment) -> TreeBody:
+    """The tree of an embodiment's description, with its mounts.
+
+    Raises: UnavailableError, DataError: it cannot be read.
+    """
+    text, path = read_description(embodiment), embodiment.description_path
+    tree = read_urdf(text, path) if embodiment.description.format == "urdf" else read_mjcf(text, path)
+    mounts = embodiment.description.mounts
+    return mounted(tree, {name: offset.matrix() for name, offset in mounts.items()}) if mounts else tree
+
+
+def tool_poses(
+    embodiment: Embodiment, tree: TreeBody, state: np.ndarray, posture: Mapping[str, float] = MappingProxyType({})
+) -> np.ndarray:
+    """T_base_tool (n, a, 4, 4) of a state (n, j), as `ArmKinematics.tool_poses` without torch; fingers are at zero.
+
+    Args:
+        posture: positions [rad, m] of joints outside the state; the embodiment's own where not given.
+    """
+    positions: dict[str, np.ndarray] = {
+        name: np.full(len(state), value) for name, value in {**embodiment.posture, **posture}.items()
+    }
+    for arm in embodiment.arms:
+        start = embodiment.joint_columns(arm).start
+        positions.update({name: state[:, start + i] for i, name in enumerate(arm.joints)})
+    poses: dict[str, np.ndarray] = {}
+
+    def place(body: TreeBody, T_root_parent: np.ndarray) -> None:
+        T = T_root_parent @ body.T_parent_body
+        for joint in body.joints:
+            position = np.asarray(positions.get(joint.name, np.zeros(len(state))), dtype=np.float64)[:, None]
+            step = np.tile(np.eye(4), (len(state), 1, 1))
+            if joint.kind == "revolute":  # about the joint's own place
+                step[:, :3, :3] = Rotation.from_rotvec(position * joint.axis).as_matrix()
+                step[:, :3, 3] = joint.position - step[:, :3, :3] @ joint.position
+            else:
+                step[:, :3, 3] = position * joint.axis
+            T = T @ step
+        poses[body.name] = T
+        for child in body.children:
+            place(child, T)
+
+    place(tree, np.tile(np.eye(4), (len(state), 1, 1)))
+    T_base_root = np.linalg.inv(poses[embodiment.base_link])
+    tools = [T_base_root @ poses[arm.end_effector_link] @ arm.T_link_tool.matrix() for arm in embodiment.arms]
+    return np.stack(tools, axis=1)

@@ -16,21 +16,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError, WorldLineError
-from worldline_core.geometry.embodiment import Embodiment, load_embodiment, read_description
-from worldline_core.geometry.kinematic_tree import TreeBody, mounted, read_mjcf, read_urdf
+from worldline_core.geometry.embodiment import Embodiment, load_embodiment
+from worldline_core.geometry.kinematic_tree import TreeBody, read_tree
 from worldline_core.geometry.tensor_transforms import invert
 
 if TYPE_CHECKING:  # imports a plotting library: seconds that most commands and processes need not wait
     from pytorch_kinematics.chain import Chain
     from pytorch_kinematics.frame import Frame, Joint
-
-
-def read_tree(embodiment: Embodiment) -> TreeBody:
-    """The tree of an embodiment's description, with its mounts. Raises: UnavailableError, DataError: it cannot be read."""
-    text, path = read_description(embodiment), embodiment.description_path
-    tree = read_urdf(text, path) if embodiment.description.format == "urdf" else read_mjcf(text, path)
-    mounts = embodiment.description.mounts
-    return mounted(tree, {name: offset.matrix() for name, offset in mounts.items()}) if mounts else tree
 
 
 class ArmKinematics:

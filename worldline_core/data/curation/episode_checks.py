@@ -7,16 +7,28 @@ from functools import lru_cache, partial
 import numpy as np
 
 from worldline_core.data.curation.curate_config import AVAILABLE, CurateConfig
+from worldline_core.data.episodes.conventions import arm_blocks, is_gripper
 from worldline_core.data.episodes.episode import NO_EMBODIMENT, CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, check_intrinsics
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_finite, check_length, collect_faults
 from worldline_core.errors import ConfigError
-from worldline_core.geometry.embodiment import Embodiment, check_embodiment_name, load_embodiment
+from worldline_core.geometry.embodiment import (
+    Embodiment,
+    check_embodiment_name,
+    embodiment_names,
+    load_embodiment,
+)
+from worldline_core.geometry.kinematic_tree import TreeBody, read_tree, tool_poses
+from worldline_core.geometry.transforms import rotation_angle
 
 MAX_JOINT_RAD = 4 * np.pi
 """No joint of a manipulator turns further; larger numbers are degrees or encoder ticks."""
 _GRIPPER_MARGIN = 0.05
+_MOVES_RAD, _APART_RAD, _MUCH_CLOSER = 0.1, 0.1, 0.25
+"""Commands that are as far from the states of joints that move, and so much closer once they are read otherwise."""
+_POSE_FRAMES, _POSE_ERROR_M, _POSE_ERROR_DEG = 64, 0.05, 10.0
+"""How many frames of tool poses are compared with kinematics; descriptions and mounts that are a little off stay below."""
 _JOINT_TOLERANCE_RAD = 0.05
 _TIME_TOLERANCE_FRAMES = 0.25
 """Largest distance of a frame from its place on the grid of its rate."""
@@ -32,6 +44,8 @@ def check_episode(config: CurateConfig, loaded: LoadedEpisode) -> None:
         partial(check_lengths, loaded),
         partial(check_times, episode),
         partial(check_joints, episode),
+        partial(check_commands, episode),
+        partial(check_tool_poses, episode),
         *(partial(check_camera, episode, camera) for camera in episode.cameras.values()),
         partial(check_views, config, loaded),
     ):
@@ -101,20 +115,21 @@ def check_joints(episode: Episode) -> None:
             ) from error
     if episode.state_kind != "joints":
         return
-    names = episode.state_names or ()
-    joints = [i for i in range(episode.state.shape[1]) if i >= len(names) or not names[i].endswith("gripper")]
-    worst = float(np.abs(episode.state[:, joints]).max()) if joints else 0.0
-    if worst > MAX_JOINT_RAD:
-        raise RejectedInputError(
-            "joint_out_of_range",
-            "Joint positions are no angles in radians",
-            where=where,
-            expected=f"at most {MAX_JOINT_RAD:.2f} rad",
-            got=worst,
-            next_step="declare the unit of the source",
-            evidence={"max_abs_rad": worst},
-        )
+    joints, grippers = _joints_and_grippers(episode)
+    for what, values in (("Joint positions", episode.state), ("Commands of joints", episode.action)):
+        worst = float(np.abs(values[:, joints]).max()) if joints else 0.0
+        if worst > MAX_JOINT_RAD:
+            raise RejectedInputError(
+                "joint_out_of_range",
+                f"{what} are no angles in radians",
+                where=where,
+                expected=f"at most {MAX_JOINT_RAD:.2f} rad",
+                got=worst,
+                next_step="declare the unit of the source",
+                evidence={"max_abs_rad": worst},
+            )
     if not described:
+        _check_openings(episode.state[:, grippers], where)
         return
     embodiment = _embodiment(episode.embodiment)
     if embodiment.state_size != episode.state.shape[1]:
@@ -141,17 +156,116 @@ def check_joints(episode: Episode) -> None:
                 "frames_outside": int(outside.any(axis=1).sum()),
             },
         )
-    columns = [embodiment.gripper_column(arm) for arm in embodiment.arms]
-    opening = episode.state[:, columns]
-    if opening.min() < -_GRIPPER_MARGIN or opening.max() > 1 + _GRIPPER_MARGIN:
+    _check_openings(episode.state[:, [embodiment.gripper_column(arm) for arm in embodiment.arms]], where)
+
+
+def _joints_and_grippers(episode: Episode) -> tuple[list[int], list[int]]:
+    """State columns of joints, and those that are called grippers."""
+    names = [*(episode.state_names or ()), *[""] * episode.state.shape[1]][: episode.state.shape[1]]
+    grippers = [column for column, name in enumerate(names) if is_gripper(name)]
+    return [column for column in range(len(names)) if column not in grippers], grippers
+
+
+def _check_openings(opening: np.ndarray, where: str) -> None:
+    if opening.size and not (opening.min() >= -_GRIPPER_MARGIN and opening.max() <= 1 + _GRIPPER_MARGIN):
         raise RejectedInputError(
             "invalid_gripper",
             "Gripper opening is not in 0 closed .. 1 open",
             where=where,
             expected="0..1",
             got=f"{opening.min():.3f}..{opening.max():.3f}",
+            next_step="declare the readings of the gripper when it is closed and open",
             evidence={"min": float(opening.min()), "max": float(opening.max())},
         )
+
+
+def check_commands(episode: Episode) -> None:
+    """Compare commands with the states of joints that move.
+
+    Raises: RejectedInputError (contradicting_tracks) where commands are far from the states, and close once they are read
+        with another sign or unit, for the other arm, as differences, or with an inverted gripper.
+    """
+    if not episode.commanded or episode.state_kind != "joints":
+        return
+    joints, grippers = _joints_and_grippers(episode)
+    state, command = episode.state.astype(np.float64), episode.action.astype(np.float64)
+    moving = np.ptp(state, axis=0) > _MOVES_RAD
+    blocks = arm_blocks(episode)
+    arms = [[column for column in block if column in joints] for block in blocks] or [joints]
+    readings: list[tuple[str, list[int], np.ndarray]] = [
+        ("degrees, the states radians", joints, np.deg2rad(command)),
+        ("radians, the states degrees", joints, np.rad2deg(command)),
+        *(("of the other sign", columns, -command) for columns in (*arms, *([column] for column in joints))),
+        *(("relative to the states, or never written", columns, state + command) for columns in arms),
+        *(("inverted openings", [column], 1 - command) for column in grippers),
+    ]
+    if len(blocks) == 2 and len(blocks[0]) == len(blocks[1]):
+        exchanged = command.copy()
+        exchanged[:, [*blocks[0], *blocks[1]]] = command[:, [*blocks[1], *blocks[0]]]
+        readings.append(("of the other arm", joints, exchanged))
+    for meaning, columns, other in readings:
+        used = [column for column in columns if moving[column]]
+        apart, closer = (float(np.abs(values - state)[:, used].mean()) if used else 0.0 for values in (command, other))
+        if apart > _APART_RAD and closer < _MUCH_CLOSER * apart:
+            names = episode.state_names or [f"column {column}" for column in range(state.shape[1])]
+            raise RejectedInputError(
+                "contradicting_tracks",
+                f"States and commands contradict each other: the commands look {meaning}",
+                where=f"episode {episode.episode_id}, {', '.join(names[column] for column in used)}",
+                expected="commands close to the states",
+                got=f"{apart:.3f} apart on average, {closer:.3f} if they are {meaning}",
+                next_step="declare columns and units of both as they are, or leave the commands out",
+                evidence={"apart": apart, "apart_otherwise": closer},
+            )
+
+
+def check_tool_poses(episode: Episode) -> None:
+    """Compare the recorded tools' motion with that of the joints, where the robot's kinematic description is here.
+
+    Raises: RejectedInputError (contradicting_tracks).
+    """
+    if episode.T_base_ee is None or episode.state_kind != "joints" or episode.embodiment not in embodiment_names():
+        return
+    embodiment, tree = _embodiment(episode.embodiment), _tree(episode.embodiment)
+    if tree is None or embodiment.state_size != episode.state.shape[1]:
+        return
+    frames = np.unique(np.linspace(0, episode.num_frames - 1, _POSE_FRAMES).round().astype(int))
+    recorded = episode.T_base_ee[frames]
+    expected = tool_poses(
+        embodiment, tree, episode.state[frames].astype(np.float64), embodiment.noted_posture(episode.conventions)
+    )
+    where = f"episode {episode.episode_id}"
+    if recorded.shape != expected.shape:
+        raise RejectedInputError(
+            "length_mismatch",
+            "Recorded tool poses and embodiment differ in the number of arms",
+            where=f"{where}, {embodiment.name}",
+            expected=expected.shape[1],
+            got=recorded.shape[1],
+        )
+    # From the embodiment's tools to the recorded ones, as at the first frame: both may be other points of a gripper.
+    offset = np.linalg.inv(expected[0]) @ recorded[0]
+    apart = np.linalg.inv(expected @ offset) @ recorded
+    metres, degrees = np.linalg.norm(apart[..., :3, 3], axis=-1), np.rad2deg(rotation_angle(apart[..., :3, :3]))
+    wrong = ((metres > _POSE_ERROR_M) | (degrees > _POSE_ERROR_DEG)).any(axis=1)
+    if wrong.sum() >= min(3, len(frames) - 1):
+        raise RejectedInputError(
+            "contradicting_tracks",
+            "The joints do not move the tools as the recorded tool poses do",
+            where=f"{where}, {embodiment.name}",
+            expected=f"at most {100 * _POSE_ERROR_M:g} cm and {_POSE_ERROR_DEG:g} deg apart",
+            got=f"up to {100 * metres.max():.1f} cm and {degrees.max():.1f} deg, in {wrong.mean():.0%} of the frames",
+            next_step="`worldline calibrate check` tells wrong units and orders of angles (conventions.pose_unit, euler, "
+            "quaternion); else compare order and sign of the joints with the embodiment",
+            evidence={"max_m": float(metres.max()), "max_deg": float(degrees.max()), "share": float(wrong.mean())},
+        )
+
+
+@lru_cache(maxsize=32)
+def _tree(name: str) -> TreeBody | None:
+    """The kinematic description; None where it is not here."""
+    embodiment = _embodiment(name)
+    return read_tree(embodiment) if embodiment.description_path.is_file() else None
 
 
 @lru_cache(maxsize=32)

@@ -27,6 +27,11 @@ from worldline_core.geometry.transforms import (
 )
 
 
+def is_gripper(name: str) -> bool:
+    """True if a state column is called a gripper, in any source's spelling (`right/gripper`, `gripper.pos`)."""
+    return "gripper" in name.lower()
+
+
 def arm_blocks(episode: Episode) -> tuple[tuple[int, ...], ...]:
     """State columns of each arm: a block ends with its gripper. Empty where the state is not named like that."""
     names = episode.state_names or ()

@@ -30,6 +30,7 @@ Reason = Literal[
     "nan_state",
     "joint_out_of_range",
     "invalid_gripper",
+    "contradicting_tracks",
     "singular_intrinsics",
     "invalid_extrinsics",
     "invalid_distortion",

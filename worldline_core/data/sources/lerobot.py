@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
+from worldline_core.data.episodes.conventions import is_gripper
 from worldline_core.data.episodes.episode import REPEATS_STATE, TRAINING_SPLITS, Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import (
@@ -248,6 +249,15 @@ def state_columns(config: LeRobotSourceConfig, features: Features, where: str) -
     """
     if config.arms is None:
         names = flat_names(features.get("observation.state", {}))
+        if config.angle_unit == "deg" and (
+            undeclared := [n for n in names if is_gripper(n) and n not in config.grippers]
+        ):
+            raise ConfigError(
+                "Columns of grippers are no angles in degrees",
+                where=where,
+                got=", ".join(undeclared),
+                next_step="declare their readings: grippers: {" + undeclared[0] + ": {closed: ..., open: ...}}",
+            )
         state, action = (
             [_Block(feature, [i], config.grippers.get(name)) for i, name in enumerate(names)]
             if config.grippers
