@@ -161,7 +161,9 @@ def test_protobuf_messages_come_back(tmp_path: Path, toy: Any, foxglove: dict[st
     assert np.abs(episode.T_base_ee[:, 0] - episode.cameras["head"].T_base_camera).max() < 1e-9
     silent = declared(tmp_path)
     silent["arms"][0]["state"]["joints"]["names"] = ["a", "silent"]  # not set in any message, and not 0
-    assert np.isnan(load(silent).episode.state).tolist() == [[False, True, False]] * episode.num_frames
+    with pytest.raises(RejectedInputError, match="not finite") as caught:
+        load(silent)
+    assert caught.value.reason == "nan_state"
 
 
 def test_json_messages_are_read_like_protobuf(tmp_path: Path, toy: Any, foxglove: dict[str, Any]) -> None:

@@ -169,6 +169,30 @@ def test_missing_header_times_are_not_taken_for_times(tmp_path: Path, toy: Any) 
         load(toy.declared(tmp_path))
 
 
+@pytest.mark.parametrize(
+    ("joint", "value", "seconds", "kept"),
+    [(2, np.nan, 1.0, False), (1, np.inf, 1.51, False), (0, np.nan, 2.0, False), (2, np.nan, 9.0, True)],
+)
+def test_readings_between_the_frames_are_finite_too(
+    tmp_path: Path, toy: Any, joint: int, value: float, seconds: float, kept: bool
+) -> None:
+    def change(sent: list[Any]) -> list[Any]:
+        number = min(int(seconds * 100), len(sent) - 1)
+        position = [value if i == joint else each for i, each in enumerate(sent[number].message["position"])]
+        sent[number] = replace(sent[number], message={**sent[number].message, "position": position})
+        return sent
+
+    recording = toy.robot()
+    recording.change("/joint_states", change)
+    recording.write(tmp_path / "a.mcap")
+    if kept:  # after the last frame's neighbours
+        assert np.isfinite(load(toy.declared(tmp_path, fps=10)).episode.state).all()
+        return
+    error = rejection(toy.declared(tmp_path))
+    assert error.reason == "nan_state"
+    assert error.evidence["at_s"] == pytest.approx(seconds, abs=0.02)
+
+
 def test_a_slow_camera_is_refused(tmp_path: Path, toy: Any) -> None:
     toy.robot(camera_fps=15).write(tmp_path / "a.mcap")
     error = rejection(toy.declared(tmp_path))

@@ -21,6 +21,7 @@ h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
 from tools.corrupted.attacks import ATTACKS, Attack, ending, jpeg_of_scans
 from tools.corrupted.one_of_each import write_one_of_each
+from worldline_core.data.episodes.source import GripperRange
 from worldline_core.data.guards.plain_files import (
     column_names,
     decode_image,
@@ -32,7 +33,8 @@ from worldline_core.data.guards.plain_files import (
     read_table,
 )
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.hdf5 import open_hdf5
+from worldline_core.data.lerobot.dataset import _numeric_column
+from worldline_core.data.sources.hdf5 import ArmPlace, Columns, open_hdf5
 from worldline_core.data.video.clip import VideoClip, read_clip
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (30, 50, 3), dtype=np.uint8)
@@ -147,6 +149,53 @@ def test_a_dataset_that_was_written_in_part_is_unreadable(tmp_path: Path) -> Non
             with pytest.raises(RejectedInputError, match=f"h5, {key}") as caught:
                 file.array(key, (None, 2))
             assert caught.value.reason == "unreadable"
+
+
+ONE_ARM = (ArmPlace("right", Columns("state", slice(0, 6), (7,)), Columns("state", slice(6, 7), (7,))),)
+
+
+@pytest.mark.parametrize(
+    ("rows", "kept"),
+    [
+        (slice(40, 50), False), (slice(0, 5), False), (slice(20, 22), False), (slice(0, 50), False), (slice(0, 0), True),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("fill", [0.0, -1.0])
+def test_joints_that_hold_fill_values_were_never_written(tmp_path: Path, rows: slice, fill: float, kept: bool) -> None:
+    values = 0.5 + 0.3 * np.sin(np.arange(50)[:, None] / 10 + np.arange(7))
+    values[rows] = fill
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("state", data=values, fillvalue=fill, chunks=(50, 7))
+    with open_hdf5(tmp_path / "a.h5") as file:
+        if kept:
+            assert len(file.arms(ONE_ARM, GripperRange(closed=-1, open=1)).values) == 50
+            return
+        with pytest.raises(RejectedInputError, match=r"state\n.*\n.*fill values in") as caught:
+            file.arms(ONE_ARM, GripperRange(closed=-1, open=1))
+        assert caught.value.reason == "unreadable"
+
+
+def test_a_robot_may_come_to_its_zero(tmp_path: Path) -> None:
+    values = np.clip(np.linspace(0.5, -0.5, 50), 0, 1)[:, None] * np.ones(7)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["state"] = values
+    with open_hdf5(tmp_path / "a.h5") as file:
+        assert np.array_equal(file.arms(ONE_ARM, GripperRange(closed=0, open=1)).values, values)
+
+
+@pytest.mark.parametrize("shape", [(3, 1_000_000), (3, 1001), (3, 10, 101)])
+def test_states_of_more_columns_than_a_robot_has_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("state", shape, "f4", compression="gzip", data=np.zeros(shape, np.float32))
+    with (
+        open_hdf5(tmp_path / "a.h5") as file,
+        pytest.raises(RejectedInputError, match="more columns than a robot") as caught,
+    ):
+        file.array("state", [None] * len(shape))
+    assert caught.value.reason == "too_large"
+    column = pa.chunked_array([pa.array([np.zeros(int(np.prod(shape[1:])))] * 3)])
+    with pytest.raises(RejectedInputError, match="more columns than a robot"):
+        _numeric_column(column, 3, "data")
 
 
 def encoded(kind: str, **settings: object) -> bytes:

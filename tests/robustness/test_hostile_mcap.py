@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import tracemalloc
 from pathlib import Path
@@ -195,6 +196,15 @@ def test_protobuf_messages_of_a_million_joints_are_not_unpacked() -> None:
         MessageDecoder("a").decode(
             channel, Schema(1, descriptors, "protobuf", "foxglove.JointStates"), b"\x12\x00" * 1_000_000
         )
+
+
+def test_messages_of_more_joints_than_a_robot_has_are_refused() -> None:
+    channel = Channel(1, "/a", "json", {}, 1)
+    message = {"timestamp": {"sec": 1, "nsec": 0}, "joints": [{"name": "a", "position": 1.0}] * 1001}
+    stamped = json.dumps(message).encode()
+    with pytest.raises(RejectedInputError, match="more columns than a robot") as caught:
+        MessageDecoder("a").decode(channel, Schema(1, b"{}", "jsonschema", "foxglove.JointStates"), stamped)
+    assert caught.value.reason == "too_large"
 
 
 @pytest.mark.parametrize(

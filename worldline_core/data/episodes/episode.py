@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from pydantic import TypeAdapter
 
-from worldline_core.data.guards.rejection import RejectedInputError, check_length
+from worldline_core.data.guards.rejection import RejectedInputError, check_columns, check_length
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import ImageTransform
 
@@ -192,6 +192,7 @@ class Episode(EpisodeDescription):
             )
         if len(shape) != 2 or shape[0] != frames or frames == 0:
             raise DataError("State has a wrong shape", where=where, expected=f"({frames} > 0, J)", got=shape)
+        check_columns(shape[1], where)
         if self.action.shape != shape:
             raise RejectedInputError(
                 "length_mismatch",

@@ -63,6 +63,8 @@ RATE_TOLERANCE = 1e-2
 MAX_SIDE_PX = 16_384
 MAX_PIXELS = 40_000_000
 """One image; 8K video has 33 million pixels."""
+MAX_COLUMNS = 1_000
+"""Columns of one track of a robot, which has some hundreds at most."""
 MAX_CHUNK_BYTES = 256 << 20
 """One compressed chunk of an MCAP file once unpacked; recorders write 1 to 10 MB."""
 
@@ -174,6 +176,13 @@ def check_shape(what: str, where: object, found: Sequence[int], wanted: Sequence
             got=tuple(found),
             evidence={"shape": list(found)},
         )
+
+
+def check_columns(count: int, where: object) -> None:
+    """Raises: RejectedInputError (too_large) for a track, or a message, with more columns than any robot has."""
+    if count > MAX_COLUMNS:
+        what = "Track has more columns than a robot"
+        raise too_large(what, where=where, limit=MAX_COLUMNS, got=count, unit="columns")
 
 
 def check_texts(texts: Mapping[str, object], where: object) -> None:

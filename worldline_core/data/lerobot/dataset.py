@@ -32,7 +32,7 @@ from worldline_core.data.guards.plain_files import (
     read_table,
     validated,
 )
-from worldline_core.data.guards.rejection import RejectedInputError, check_length, unreadable
+from worldline_core.data.guards.rejection import RejectedInputError, check_columns, check_length, unreadable
 from worldline_core.data.guards.source_paths import (
     AnyPath,
     fill_template,
@@ -622,6 +622,7 @@ def _numeric_column(column: pa.ChunkedArray, length: int, where: str) -> np.ndar
     widths = pc.min_max(pc.list_value_length(values)).as_py()  # pyright: ignore[reportAttributeAccessIssue]
     if len(values) == 0 or widths["min"] != widths["max"]:
         raise RejectedInputError("length_mismatch", "Rows of a data column differ in length", where=where, got=widths)
+    check_columns(widths["max"], where)
     return _numeric(values.flatten(), where).reshape(len(values), -1)
 
 

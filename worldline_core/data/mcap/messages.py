@@ -25,7 +25,7 @@ from mcap_ros2._vendor.rosidl_adapter.parser import InvalidSpecification, Invali
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
 
 from worldline_core.data.guards.plain_files import parse_json
-from worldline_core.data.guards.rejection import RejectedInputError, too_large
+from worldline_core.data.guards.rejection import RejectedInputError, check_columns, too_large
 
 _MAX_MESSAGE_BYTES = 1 << 20
 """One message that holds no image: it becomes objects, up to one per byte, and a megabyte is ten thousand transforms."""
@@ -291,10 +291,14 @@ class MessageDecoder:
             raise too_large(what, where=where, limit=_MAX_MESSAGE_BYTES, got=len(data), unit="bytes")
         try:
             raw = decode(data)
-            return kind, _header_time(raw), _READERS[kind](raw)
+            stamp_ns, value = _header_time(raw), _READERS[kind](raw)
         except _FAULTS as error:
             what, where = "Message cannot be decoded", f"{self._where}, topic {channel.topic}"
             raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200]) from error
+        if kind in ("joints", "numbers"):
+            names = value.names if isinstance(value, Joints) else value
+            check_columns(len(names), f"{self._where}, topic {channel.topic}")
+        return kind, stamp_ns, value
 
     def _channel(self, channel: Channel, schema: Schema | None) -> tuple[Kind, Callable[[bytes], Any]]:
         name = schema.name if schema is not None else ""

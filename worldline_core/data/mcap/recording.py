@@ -302,12 +302,22 @@ class _Recording:
         return resampled(signal.times_ns, signal.values, grid, hold=readings.resample == "hold")
 
     def _check_values(self, arm: ArmReadings, grid: np.ndarray) -> None:
-        """Readings around the episode, in radians and as openings, come from one publisher and can be interpolated."""
+        """Readings around the episode, in radians and as openings, are finite, of one publisher, and can be interpolated."""
         for readings in (arm.joints, arm.gripper):
             signal, where = self.signals[readings], self.at(readings.topic)
             first, last = np.searchsorted(signal.times_ns, grid[[0, -1]]).tolist()
             used = slice(max(first - 1, 0), last + 1)
             times, values = signal.times_ns[used], signal.values[used]
+            if not (finite := np.isfinite(values).all(axis=1)).all():
+                at_s = float((times[np.argmin(finite)] - grid[0]) / 1e9)
+                raise RejectedInputError(
+                    "nan_state",
+                    "Readings of a topic are not finite",
+                    where=where,
+                    expected="finite numbers between the episode's beginning and end",
+                    got=f"{int((~finite).sum())} of {len(finite)} messages, the first at {at_s:.3f} s",
+                    evidence={"messages": int((~finite).sum()), "at_s": at_s},
+                )
             if readings is arm.gripper:  # which may be switched: it has no speed
                 check_alternation(times, arm.gripper.range.opening(values)[0], where)
                 continue

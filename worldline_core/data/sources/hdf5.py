@@ -21,6 +21,7 @@ from worldline_core.data.guards.plain_files import decode_image
 from worldline_core.data.guards.rejection import (
     Reason,
     RejectedInputError,
+    check_columns,
     check_finite,
     check_image_size,
     check_shape,
@@ -33,6 +34,7 @@ _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowErro
 # Images are read a block at a time: a compressed chunk is unpacked once, and little is in memory.
 _BLOCK_IMAGES = 16
 _BLOCK_BYTES = 64 << 20
+_JUMP_RAD = 0.2
 _IMAGE_MARKS = b"\xff\xd8", b"\x89PNG"
 
 
@@ -121,6 +123,7 @@ class Hdf5File:
         if dataset.dtype.kind not in "fiu":
             raise self._rejected("unreadable", "Dataset is not numeric", key, "numbers", dataset.dtype)
         check_shape("Dataset", f"{self._path}, {key}", dataset.shape, shape)
+        check_columns(math.prod(dataset.shape[1:]), f"{self._path}, {key}")
         with self._reading(key):
             values = np.asarray(dataset[()], dtype=np.float64)
         check_finite(key, values, self._path)
@@ -143,8 +146,10 @@ class Hdf5File:
         Args:
             length: number of frames; None: as many as there are.
 
-        Raises: RejectedInputError: length_mismatch or invalid_gripper for a dataset of another width.
+        Raises: RejectedInputError: length_mismatch or invalid_gripper for a dataset of another width; unreadable where no
+            joint of a frame was written (HDF5 fills the gaps).
         """
+        written = np.zeros(0, bool)
         blocks: list[np.ndarray] = []
         openings: list[np.ndarray] = []
         names: list[str] = []
@@ -152,6 +157,8 @@ class Hdf5File:
         for arm in places:
             joints = self.columns(arm.joints, length, "length_mismatch", track)
             length = len(joints)
+            own = (joints != self._dataset(arm.joints.dataset.format(track=track)).fillvalue).any(axis=1)
+            written = written | own if blocks else own
             blocks.append(joints)
             names += joint_names({arm.name: joints.shape[1]}, gripper=arm.gripper is not None)
             if arm.gripper is not None and gripper is not None:
@@ -159,7 +166,14 @@ class Hdf5File:
                 overshoot += outside
                 blocks.append(opening)
                 openings.append(opening)
-        return Arms(np.hstack(blocks), tuple(names), np.hstack(openings or [blocks[0][:, :0]]), overshoot)
+        values = np.hstack(blocks)
+        # A robot may be at the fill value, zero; it does not jump there and back.
+        jumps = (np.abs(np.diff(values, axis=0)) > _JUMP_RAD).any(axis=1) & (np.diff(written.astype(int)) != 0)
+        if jumps.any() or not written.any():
+            got = f"fill values in {int((~written).sum())} of {len(written)} rows"
+            key = places[0].joints.dataset.format(track=track)
+            raise self._rejected("unreadable", "Joints were not written", key, "joints in every row", got)
+        return Arms(values, tuple(names), np.hstack(openings or [blocks[0][:, :0]]), overshoot)
 
     def columns(self, columns: Columns, length: int | None, reason: Reason, track: str = "") -> np.ndarray:
         """Columns of a numeric dataset (length, D), or (length,) with D = 1, as float64 (length, len(chosen)).
