@@ -186,7 +186,6 @@ def test_the_page_escapes_what_it_shows_and_json_holds_only_its_own_numbers() ->
 def by_hand(episode: Episode, view: str, n: int) -> np.ndarray:
     camera = episode.cameras[view]
     pose = camera.T_base_camera[n if camera.moving else 0]
-    assert episode.T_base_ee is not None
     x, y, z = pose[:3, :3].T @ (episode.T_base_ee[n, 0, :3, 3] - pose[:3, 3])
     return np.array([camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]])
 
@@ -201,7 +200,6 @@ def test_tools_are_drawn_where_the_recorded_camera_puts_them(episode: Episode, l
         for n in (0, 10):
             assert np.allclose(tracks.uv[n, 0, 0], by_hand(recorded, view, n), atol=1e-3)
     moved = recorded_tracks(episode, "head", None, tool_offset_z_m=0.1)
-    assert episode.T_base_ee is not None
     expected = episode.T_base_ee[:, :, :3, 3] + 0.1 * episode.T_base_ee[:, :, :3, 2]
     assert np.allclose(moved.T_base_tool[:, :, :3, 3], expected, atol=1e-6)
 

@@ -99,8 +99,6 @@ def test_a_reader_that_ends_first_is_no_error(project_root: Path) -> None:
     code = "import sys; from flows.command_line import main; sys.argv[1:] = ['embodiment', 'list']; main()"
     command = [sys.executable, "-c", code]
     with subprocess.Popen(command, cwd=project_root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
-        assert run.stdout is not None
         run.stdout.close()
-        assert run.stderr is not None
         assert run.stderr.read() == ""
     assert run.returncode == 141

@@ -102,7 +102,6 @@ def test_protobuf_decoders_read_the_export(tmp_path: Path, sample: Make) -> None
     with (tmp_path / "a.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         for schema, channel, message, decoded in reader.iter_decoded_messages():
-            assert schema is not None
             name = schema.name.removeprefix("foxglove.")
             published = getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
             assert published.FromString(message.data).SerializeToString() == message.data

@@ -34,7 +34,6 @@ def test_agibot_v1(tmp_path: Path, shared_data: Path) -> None:
         assert (row.num_frames, row.video_frames) == (300, 4)
         assert curated.frames(i, "left_wrist").shape == (4, 48, 64, 3)
         raw = np.load(next((shared_data / "agibot_gesim").glob(f"{row.scene.rsplit('-', 1)[1]}/actions.npy")))
-        assert episode.T_base_ee is not None
         distance = np.linalg.norm(episode.T_base_ee[:, 0, :3, 3] - raw[:, :3], axis=1)
         assert np.allclose(distance, 0.23, atol=1e-6)
         # A wrist camera is fixed to its arm: millimetres, as its README measured.
@@ -135,7 +134,6 @@ def test_droid_subset_with_its_kinematics(tmp_path: Path, shared_data: Path) -> 
     for i, row in enumerate(curated.rows):
         episode = curated.episode(i)
         assert set(row.views) == {"head", "exterior_2", "right_wrist"}
-        assert episode.T_base_ee is not None
         tools = np.asarray(kinematics.tool_poses(episode.state.astype(np.float64)))
         assert np.abs(tools[..., :3, 3] - episode.T_base_ee[..., :3, 3]).max() < 2e-3, row.episode_id
         assert np.abs(tools[..., :3, 2] - episode.T_base_ee[..., :3, 2]).max() < 1e-2, row.episode_id

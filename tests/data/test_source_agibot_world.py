@@ -116,7 +116,6 @@ def test_published_layout_comes_through_curation(tmp_path: Path) -> None:
     assert np.allclose(episode.state[:, 7], np.linspace(1, 0, LENGTH), atol=1e-6)  # 35 open .. 120 closed
     assert np.allclose(episode.action[:, 7], np.linspace(1, 0, LENGTH), atol=1e-6)  # 0 open .. 1 closed
     assert np.allclose(episode.state[:, 15], 1)
-    assert episode.T_base_ee is not None
     # About x by `angle`, so that the tool's z is (0, -sin, cos): the quaternion is xyzw.
     angle = 0.3 + 0.05 * np.arange(LENGTH)
     along = np.stack([np.zeros(LENGTH), -np.sin(angle), np.cos(angle)], axis=1)

@@ -99,7 +99,6 @@ def test_a_robot_with_hands_has_joints_alone(tmp_path: Path) -> None:
     _, curated = run(tmp_path, settings(tmp_path / "raw", "h5_tienkung_xsens_1rgb", gripper_state=None))
     episode = curated.episode(0)
     assert np.allclose(episode.state, wave(14), atol=1e-6)
-    assert episode.state_names is not None
     assert episode.state_names[6:8] == ("left/joint_7", "right/joint_1")
 
 

@@ -84,9 +84,7 @@ def test_published_layout_comes_through_curation(tmp_path: Path) -> None:
     wave = 0.3 * np.sin(np.arange(LENGTH)[:, None] + np.arange(6)[None])
     assert np.allclose(episode.state[:, [*range(6), *range(7, 13)]], np.hstack([wave, wave + 1]), atol=1e-6)
     assert np.allclose(episode.state[:, [6, 13]], np.linspace(0, 1, LENGTH)[:, None], atol=1e-6)
-    assert episode.state_names is not None
     assert episode.state_names[5:8] == ("left/joint_6", "left/gripper", "right/joint_1")
-    assert episode.T_base_ee is not None
     # The gripper points along the end pose's x, which the quarter turn laid along the world's y.
     assert np.allclose(episode.T_base_ee[:, 0, :3, 3], [[0.02 * n, -0.2 + 0.12, 0.9] for n in range(LENGTH)])
     assert np.allclose(episode.T_base_ee[:, :, :3, 2], [0, 1, 0])

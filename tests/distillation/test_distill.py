@@ -100,7 +100,6 @@ def test_three_steps_give_a_causal_checkpoint(finished: Finished) -> None:
     assert info.metadata["distillation"] == "distribution_matching"
     assert info.contract == read_checkpoint_info(inputs["stage2"]).contract
     assert info.causal == config().spec
-    assert info.causal is not None
     assert info.causal.sigmas == pytest.approx([1, 15 / 16, 5 / 6, 5 / 8, 0])
     assert counts["lpips"] == info.metadata["lpips"] == "off: no LPIPS weights configured"
     assert counts["episodes"] == 2
@@ -150,7 +149,6 @@ def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_
     assert {sigma for _, _, sigma in passes} == {1.0, 0.6, between}
     for folder in (tmp_path / "out" / "teacher_forcing", tmp_path / "out"):
         model, info = load_checkpoint(folder)
-        assert info.causal is not None
         assert info.causal == small.spec
         assert info.causal.recent_blocks == 0
 

@@ -61,7 +61,6 @@ def test_equal_clips_cost_nothing_and_gradients_reach_the_compared_frames(weight
     value = loss(predicted, target)
     value.backward()
     assert value.item() > 0
-    assert predicted.grad is not None
     assert bool(predicted.grad[:, :, :3, 3:].any())
     assert not bool(predicted.grad[:, :, :, :3].any())
     assert all(parameter.grad is None for parameter in loss.network.parameters())
@@ -114,7 +113,6 @@ def test_decoding_in_bfloat16_costs_little_accuracy(weights: Path) -> None:
         with torch.autocast("cpu", torch.bfloat16):
             value = PerceptualLoss(WanTokenizer(vae.to(dtype)), network, latent_frames=1)(leaf, target)
         value.backward()
-        assert leaf.grad is not None
         found += [value.detach(), leaf.grad[:, :, :, -1].flatten()]
     torch.testing.assert_close(found[2], found[0], rtol=0.05, atol=0)
     assert torch.nn.functional.cosine_similarity(found[1], found[3], dim=0) > 0.95

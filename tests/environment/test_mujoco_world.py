@@ -162,8 +162,6 @@ def test_recordings_whose_starts_are_not_known_are_refused(
 def policies_inside(project: Path) -> ModuleType:
     path = project / "benchmarks" / "policies_inside.py"
     spec = importlib.util.spec_from_file_location("policies_inside", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

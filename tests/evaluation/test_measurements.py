@@ -51,7 +51,6 @@ def test_what_has_faded_is_lost_to_the_colour_word_but_not_to_its_own_colour() -
     frames, _, _ = make_film(False, seed=3)
     pale = faded(frames["head"], 0.45)
     own = own_colour(pale, "red")
-    assert own is not None
     assert own.rgb == pytest.approx([220, 20, 20], abs=6)
     assert colour_share(pale, "red")[-1].sum() < 0.3 * colour_share(pale, "red")[0].sum()
     areas = likeness(pale, own).sum(axis=(1, 2))

@@ -144,7 +144,6 @@ def test_memory_does_not_grow_with_the_frames(
     lengths: dict[int, Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     whole = Picture.rgb.fget
-    assert whole is not None
     # Decoded frames lie in FFmpeg's memory, which is not traced; their copies are.
     monkeypatch.setattr(Picture, "rgb", property(lambda picture: np.array(whole(picture))))
     OUTPUTS[name](lengths[SHORT], tmp_path / "first")  # imports, fonts and tables that are read once

@@ -74,7 +74,6 @@ def test_rerun_signals_are_named_and_timed(chunks: dict[str, list], content: Rec
 
 def test_rerun_robot_lies_along_its_capsules(chunks: dict[str, list], content: RecordingContent) -> None:
     tracks = content.tracks
-    assert tracks is not None
     strips = column(chunks["/world/robot"], "LineStrips3D:strips")
     assert len(strips) == COUNT
     assert np.allclose(strips[2][0], tracks.capsules[2, 0])

@@ -102,7 +102,6 @@ def command(verb: str, *settings: str) -> Iterator[str]:
     with subprocess.Popen(
         [sys.executable, "-m", "flows.command_line", verb, *given], stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         try:
             address = process.stdout.readline().strip().rpartition(" at ")[2].removesuffix("/v1")
             deadline = time.monotonic() + 30

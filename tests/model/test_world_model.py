@@ -75,7 +75,6 @@ def test_zero_initialised_action_branch_leaves_the_function_unchanged_bit_for_bi
         assert torch.equal(model(latents, sigma, action_maps=maps).velocity, model(latents, sigma).velocity)
     model(latents, sigma, action_maps=maps).velocity.square().mean().backward()
     gradient = model.action_encoder.proj.weight.grad
-    assert gradient is not None
     assert bool((gradient.abs().sum(dim=1) > 0).all())
 
 
@@ -101,7 +100,6 @@ def test_features_come_from_the_layer_asked_for(build: Build) -> None:
     latents, _, sigma = sample()
     model = build()
     features = model(latents, sigma, features_at=1).features
-    assert features is not None
     assert features.shape == (2, 3, 3, 2, 3, 24)
     last = model(latents, sigma, features_at=2).features
     assert last is not None

@@ -55,7 +55,6 @@ def test_cameras_are_exact(recorder: EpisodeRecorder) -> None:
     layouts = (sample_layout(recorder.scene.robot, "lift", np.random.default_rng(seed)) for seed in range(20))
     layout = next(layout for layout in layouts if layout.target.kind == "block" and not layout.others)
     motion = recorder.move(layout, np.random.default_rng(4), 17)
-    assert motion is not None
     still = ExecutedMotion(motion.state[:1], motion.action[:1], motion.qpos[:1], motion.outcome)
     # With the arms moved out of the way below the floor, nothing hides the block.
     for arm in recorder.scene.arms:

@@ -58,7 +58,6 @@ def test_every_task_succeeds_in_about_half_of_the_draws_and_fails_in_several_way
         random = np.random.default_rng([8, number])
         task = TASKS[number % len(TASKS)]
         motion = recorder.move(layout_of(recorder, task, random), random, 33)
-        assert motion is not None
         assert (motion.outcome == "failure") == bool(motion.failure)
         found[task][motion.failure or motion.outcome] += 1
     for task, counts in found.items():
@@ -87,7 +86,6 @@ def test_outcomes_are_read_from_the_things(recorder: EpisodeRecorder) -> None:
 
     qpos = still(recorder, place)
     assert judged(recorder, place, qpos) == ("failure", "missed")
-    assert place.goal is not None
     address = joint_of(recorder, f"{place.target.kind}_0")
     qpos[-1, address : address + 2] = place.goal.xy
     assert judged(recorder, place, qpos) == ("success", "")

@@ -51,7 +51,6 @@ def test_sizes_are_the_only_change_and_each_is_listed() -> None:
     assert values == before
     assert [source.path for source in after.curate.sources] == [Path("recordings"), Path("recordings_two_views")]
     causal = after.rollouts["causal"].config
-    assert causal is not None
     assert causal.num_frames == 129
     assert after.train_stage2.relational is not None
 

@@ -130,7 +130,6 @@ def test_row_labels_of_an_interval_chart_stay_inside_the_picture() -> None:
     name = "Stage II, shuffled actions (long-trained)"
     svg = interval_chart([Dot(name, 0.5, 0.4, 0.6), Dot("copy", 0.2, 0.1, 0.3)], title="t", value_label="v")
     found = re.search(rf'<text x="([\d.]+)" y="([\d.]+)" class="row">{re.escape(name)}<', svg)
-    assert found is not None
     assert float(found[1]) + 7.4 * len(name) <= WIDTH  # 7.4 is the mean width of a letter
     circles = [(float(x), float(y)) for x, y in re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)"', svg)]
     assert all(0 < x <= WIDTH - VALUE_WIDTH for x, _ in circles)

@@ -215,7 +215,6 @@ def test_a_causal_rollout_begins_anew_at_its_own_picture_every_few_blocks(
 ) -> None:
     """With anchors every two blocks, the third block is the first one of a rollout from the last picture of the second."""
     world = WorldLine.from_pretrained(inputs["checkpoint"], tokenizer=inputs["tokenizer"], bfloat16=False)
-    assert world.causal is not None
     free = list(_causal_pieces(world, mixed, 65))
     world.causal = world.causal.model_copy(update={"anchor_blocks": 2})
     pieces = list(_causal_pieces(world, mixed, 65))

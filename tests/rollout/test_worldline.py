@@ -114,7 +114,6 @@ def test_weights_in_bfloat16_predict_nearly_the_same(observed: Observation, caus
     half = WorldLine.from_pretrained(models / "causal", weights="bfloat16")
     assert half.model.proj_in.weight.dtype == torch.bfloat16
     images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
-    assert causal.causal is not None
     size = (1, len(causal.views), causal.info.config.map_channels, 1 + causal.causal.block_size)
     maps = torch.randn(*size, *causal.contract.grid_size, generator=torch.Generator().manual_seed(0))
     (expected,), (found,) = (line.session(torch.stack(images)[None], [42]).step(maps) for line in (causal, half))
@@ -127,7 +126,6 @@ def test_decoding_one_block_while_the_next_is_sampled_changes_nothing(
     observed: Observation, causal: WorldLine, anchor_blocks: int | None
 ) -> None:
     images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
-    assert causal.causal is not None
     size = (1, len(causal.views), causal.info.config.map_channels, 1 + causal.causal.block_size)
     generator = torch.Generator().manual_seed(0)
     maps = [torch.randn(*size, *causal.contract.grid_size, generator=generator) for _ in range(4)]
@@ -163,7 +161,6 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
         cameras=observed.cameras | {"head": Camera(observed.cameras["head"].K, np.eye(3))},
     )
     head = observed.cameras["head"]
-    assert head.T_base_camera is not None
     for factor in (1000.0, 1e38):
         pose = head.T_base_camera.copy()
         pose[:3, 3] *= factor

@@ -63,8 +63,6 @@ def make_sample() -> Callable[..., tuple]:
     import importlib.util
 
     spec = importlib.util.spec_from_file_location("data_samples", Path(__file__).parents[1] / "data" / "conftest.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.make_sample

@@ -25,8 +25,6 @@ def writers(name: str) -> ModuleType:
     sys.path.insert(0, str(DATA_TESTS))
     try:
         spec = importlib.util.spec_from_file_location(f"remote_{name}", DATA_TESTS / f"{name}.py")
-        assert spec is not None
-        assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
     finally:

@@ -32,7 +32,6 @@ def start(project_root: Path, body: str) -> tuple[subprocess.Popen[str], int]:
         [sys.executable, "-c", WORK % body], cwd=project_root, env={**os.environ, "PYTHONPATH": str(project_root)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    assert process.stdout is not None
     return process, int(process.stdout.readline())
 
 
@@ -95,7 +94,6 @@ def test_the_work_ends_with_a_torchrun_that_is_killed(project_root: Path, tmp_pa
         [sys.executable, "-c", launcher, str(tmp_path / "command.py")], cwd=project_root, stdout=subprocess.PIPE,
         env={**os.environ, "PYTHONPATH": str(project_root)}, text=True,
     ) as torchrun:  # fmt: skip
-        assert torchrun.stdout is not None
         started = [int(torchrun.stdout.readline()) for _ in range(2)]
         torchrun.kill()
     for process in started:
@@ -130,7 +128,6 @@ def test_processes_that_record_end_with_the_one_that_started_them(project_root: 
         [sys.executable, str(tmp_path / "recording.py")], cwd=project_root, stdout=subprocess.PIPE, text=True,
         env={**os.environ, "PYTHONPATH": str(project_root)},
     ) as recording:  # fmt: skip
-        assert recording.stdout is not None
         worker = int(recording.stdout.readline())
         recording.kill()
     wait_until_gone(worker)

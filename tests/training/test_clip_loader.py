@@ -134,7 +134,6 @@ def test_processes_end_with_the_training_process(world: Any, tmp_path: Path) -> 
     folders = (Path(__file__).parent, Path(__file__).parents[2])
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders))}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as training:
-        assert training.stdout is not None
         (number,) = (int(number) for number in training.stdout.readline().split())
         training.kill()
     deadline = time.monotonic() + 20
@@ -183,7 +182,6 @@ def test_a_damaged_clip_is_named_or_skipped_and_counted(
         assert set(batch.names) <= good
         wanted = sampler.clips(index).clips
         assert all(drawn == clip for drawn, clip in zip(batch.clips, wanted, strict=True) if clip.episode_id in good)
-        assert batch.frames is not None
         assert torch.equal(batch.frames[0], source.read(batch.clips[0], VIEWS))
     path = run / "skipped_clips-0.jsonl"
     skipped = read_json_lines(path)

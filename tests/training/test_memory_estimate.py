@@ -65,7 +65,6 @@ def measured(config: WorldModelConfig, frames: int, trainer: TrainerConfig) -> f
     model.checkpointing = trainer.sharding.checkpointing
     batch = SOURCE.batch(config, 1, config.views, frames)
     for tensor in (batch.latents, batch.action_maps):
-        assert tensor is not None
         tensor.normal_()
     with (
         tempfile.TemporaryDirectory() as folder,

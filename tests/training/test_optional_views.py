@@ -129,8 +129,6 @@ def test_a_clip_is_trained_in_a_batch_as_it_would_be_alone(inputs: dict[str, Pat
         for number, clip in enumerate(clips):
             alone = loader.load(ClipBatch((clip,), views))
             assert torch.equal(alone.latents[0], together.latents[number])
-            assert alone.action_maps is not None
-            assert together.action_maps is not None
             assert torch.equal(alone.action_maps[0], together.action_maps[number])
             own = model(alone.latents, torch.full((1,), 0.5), action_maps=alone.action_maps, views=alone.views)
             torch.testing.assert_close(own.velocity[0], velocity.velocity[number], rtol=1e-4, atol=1e-5)
@@ -154,7 +152,6 @@ def test_stage2_trains_on_every_set_of_views(
     assert {batch.views for batch in seen} == {VIEWS, RIGHT, HEAD}
     for batch in seen:
         assert batch.latents.shape[1] == len(batch.views)
-        assert batch.action_maps is not None
         assert batch.action_maps.shape[1] == len(batch.views)
     assert read_checkpoint_info(tmp_path / "out").view_sets == (VIEWS, RIGHT, HEAD)
     again = train_stage2(stage2(input=source), inputs, tmp_path / "again")

@@ -44,7 +44,6 @@ def run_processes(project_root: Path) -> Iterator[Callable[..., list[int | None]
     ) as starting:
         requests, answers = starting.stdin, starting.stdout
         assert requests is not None
-        assert answers is not None
 
         def run(
             folder: Path, runs: list[dict[str, Any]], count: int = 2, *, alone_at_most: float = 200

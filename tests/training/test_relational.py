@@ -42,7 +42,6 @@ def test_gradients_reach_the_student_only() -> None:
     student, teacher = features(0, requires_grad=True), features(1, size=9, requires_grad=True)
     intra, cross = relational_losses(student, matrices(teacher), 0)
     (intra + cross).backward()
-    assert student.grad is not None
     assert student.grad.abs().sum() > 0
     assert teacher.grad is None
 
@@ -52,12 +51,10 @@ def test_views_go_round_robin_and_the_wrist_alternates() -> None:
     for step in range(6):
         student = features(0, requires_grad=True)
         relational_losses(student, matrices(teacher), step)[0].backward()
-        assert student.grad is not None
         touched = [view for view in range(3) if student.grad[:, view].abs().sum() > 0]
         assert touched == [step % 3]
         student = features(0, requires_grad=True)
         relational_losses(student, matrices(teacher), step)[1].backward()
-        assert student.grad is not None
         assert [view for view in range(3) if student.grad[:, view].abs().sum() > 0] == [0, 1 + step % 2]
 
 

@@ -177,7 +177,6 @@ def test_the_latest_states_and_the_best_one_stay(tmp_path: Path) -> None:
     )
     assert saved(tmp_path) == [4, 10, 12]
     facts = newest_state(tmp_path)
-    assert facts is not None
     assert facts["step"] == 12
 
 
