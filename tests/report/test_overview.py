@@ -94,7 +94,6 @@ def test_this_run_s_own_model_stands_beside_the_copy(tmp_path: Path) -> None:
     view = head_view(context_of(tmp_path, own=0.496))
     assert view is not None
     own = video_figures(view)[1]
-    assert own is not None
     assert (own.shown(own.measured["mean"]), own.comparison) == (
         "0.496", "worse than copying the first frame: 0.500, within chance",
     )  # fmt: skip  # two digits show no difference
@@ -104,10 +103,8 @@ def test_a_perfect_score_of_few_cases_is_no_certainty(tmp_path: Path) -> None:
     """A bootstrap of five equal values has no spread: 100 % of five banks was shown without any doubt."""
     certain = {"mean": 1.0, "low": 1.0, "high": 1.0, "count": 5}
     wide = share_interval(certain)
-    assert wide is not None
     assert (round(wide["low"], 3), wide["high"]) == (0.478, 1.0)  # 0.025 ** (1 / 5), Clopper and Pearson
     failed = share_interval({"mean": 0.0, "low": 0.0, "high": 0.0, "count": 10})
-    assert failed is not None
     assert round(failed["high"], 3) == 0.308
     spread = {"mean": 0.8, "low": 0.6, "high": 1.0, "count": 5}
     assert share_interval(spread) is spread
@@ -119,7 +116,6 @@ def test_a_perfect_score_of_few_cases_is_no_certainty(tmp_path: Path) -> None:
     content["direct_execution"]["mean"] = 0.5
     summary.write_text(json.dumps(content))
     figure = planning_figure(context)
-    assert figure is not None
     assert (figure.rests_on, figure.verdict) == ("95\u202f%: 48\u202f% to 100\u202f%, 5 banks", "unclear")
 
 
