@@ -149,6 +149,31 @@ def drag_and_steer(page: Page, begin: np.ndarray) -> None:
     assert page.value("wish().grip") == 0
 
 
+def hold_buttons_of_a_phone(page: Page, begin: np.ndarray) -> None:
+    """A finger on a button moves the arm, all buttons are there without scrolling sideways and large enough for a finger."""
+    page.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)
+    assert page.value("document.documentElement.scrollWidth") <= 390
+    assert page.value("Math.min(...[...document.querySelectorAll('#pad button')].map((x) => x.offsetHeight))") >= 44
+    assert (
+        page.value(
+            "Math.max(...[...document.querySelectorAll('#pad button')].map((x) => x.getBoundingClientRect().right))"
+        )
+        <= 390
+    )
+    page.value("go(0); choose(1); 0")
+    page.until(f"Math.abs(window.play.position[1][2] - {begin[1, 2]}) < 1e-6")
+    page.value("document.querySelector('[data-key=e]').scrollIntoView({block: 'center'})")
+    left, top = page.value(
+        "(({x, y, width, height}) => [x + width / 2, y + height / 2])(document.querySelector('[data-key=e]').getBoundingClientRect())"
+    )
+    finger = {"x": left, "y": top, "button": "left", "buttons": 1, "clickCount": 1}
+    page.call("Input.dispatchMouseEvent", type="mousePressed", **finger)
+    page.until(f"window.play.position[1][2] > {begin[1, 2] + 0.02}")
+    page.call("Input.dispatchMouseEvent", type="mouseReleased", **finger)
+    assert page.value("wish().move") == [0, 0, 0]
+    page.call("Emulation.clearDeviceMetricsOverride")
+
+
 @pytest.mark.slow
 def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, shipped: Path, tmp_path: Path) -> None:
     world = WorldLine.from_pretrained(shipped / "models" / "causal")
@@ -156,8 +181,7 @@ def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, s
         address = f"{url.replace('ws', 'http')}/play?episode={EPISODE}"
         with browser(tmp_path / "profile", address) as page:
             page.until("document.querySelectorAll('#episode option').length > 3")
-            page.value("document.getElementById('start').click()")
-            page.until("window.play.node === 0 && window.play.position !== null")
+            page.until("window.play.node === 0 && window.play.position !== null")  # it starts by itself
             assert page.value("document.querySelectorAll('#views canvas').length") == 3
             begin = np.array(page.value("window.play.position"))
             target = begin[1] + (0.0, 0.0, 0.08)  # the right arm, 8 cm up
@@ -188,6 +212,7 @@ def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, s
                 < 40
             )
             drag_and_steer(page, begin)
+            hold_buttons_of_a_phone(page, begin)
             assert page.messages == []
     episodes = EpisodeSet.open(Path(saved["path"]))
     episode = episodes.episode(0)

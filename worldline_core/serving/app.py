@@ -41,6 +41,11 @@ if TYPE_CHECKING:
 
 TAKE_S = 30.0
 """Seconds within which a client must take a reply, and send the head of a request."""
+KEYS = {
+    "q": "down", "w": "away", "e": "up", "a": "left", "s": "near", "d": "right", "j": "turn left", "i": "tilt up",
+    "l": "turn right", "u": "roll left", "k": "tilt down", "o": "roll right", "z": "close", "x": "open",
+}  # fmt: skip
+"""Keys and buttons of the page, and how each moves the chosen arm while it is held."""
 OPEN_PATHS = ("/healthz", "/play")
 """Paths without a token: they reveal nothing of sessions. The page connects with the token in its own address."""
 
@@ -56,7 +61,7 @@ def make_app(host: SessionHost, token: str | None) -> ASGIApp:
         return JSONResponse(host.metadata())
 
     async def page(_: Request) -> Response:
-        html = render("serving/play.html", title="Play", subtitle="", script="serving/play.js")
+        html = render("serving/play.html", title="Play", subtitle="", script="serving/play.js", keys=KEYS.items())
         # Inside a frame of another site, visitors could be led to click here without knowing.
         return HTMLResponse(html, headers={"X-Frame-Options": "DENY"})
 

@@ -168,8 +168,8 @@ socket.addEventListener("message", ({ data }) => {
     const wanted = new URLSearchParams(location.search).get("episode");
     if (wanted) $("episode").value = wanted;
     $("about").textContent = `${message.episodes.length} recordings to start from · ${message.fps} frames/s · ${message.views.length} views`;
-    say("Choose a recording and press Start.");
     setInterval(frame, 1000 / message.fps);
+    start();
   } else if (message.type === "started") {
     started = message; nodes = new Map(); queue = []; showing = null; ticks = 0; due = []; goal = null; asked = false; behind = false; untaken = 0;
     $("about").textContent = `${message.embodiment} · ${message.instruction}`;
@@ -183,7 +183,7 @@ socket.addEventListener("message", ({ data }) => {
     $("arm").replaceChildren(...message.arms.map((name, index) => new Option(name, index)));
     choose(message.arms.length - 1);
     for (const button of document.querySelectorAll("button:disabled")) button.disabled = false;
-    say("Press Run, or any key of those below.");
+    say("Hold a key or a button beside the pictures, or drag a tool.");
   } else if (message.type === "marks") {
     play.marks = message.views; play.position = message.position; untaken = Math.max(0, untaken - 1);
     if (busy && untaken < hello.fps / 2) { busy = false; say(""); }
@@ -228,21 +228,36 @@ document.addEventListener("keydown", (event) => {
   if (key === "p") run(!running);
   else if (key === "tab") choose(arm + 1);
   else if (key === "backspace") back();
-  else if ("adwseqjlikuoxz".includes(key) && key.length === 1) {
-    keys.add(key);
-    byHand();
-    run(true);
-  } else return;
+  else if (button(key)) press(key);
+  else return;
   event.preventDefault();
 });
-document.addEventListener("keyup", (event) => keys.delete(event.key.toLowerCase()));
-addEventListener("blur", () => keys.clear());
-$("start").addEventListener("click", () => {
+const button = (key) => document.querySelector(`[data-key="${CSS.escape(key)}"]`);
+function press(key) {
+  keys.add(key);
+  button(key).classList.add("held");
+  byHand();
+  run(true);
+}
+function release(key) { keys.delete(key); button(key)?.classList.remove("held"); }
+document.addEventListener("keyup", (event) => release(event.key.toLowerCase()));
+addEventListener("blur", () => [...keys].forEach(release));
+function start() {
   run(false);
   begun = performance.now();
+  say("Starting …");
   tell({ type: "start", episode: $("episode").value, seed: Number($("seed").value) });
-  $("start").blur();
-});
+}
+for (const id of ["episode", "seed"]) $(id).addEventListener("change", () => { start(); $(id).blur(); });
+$("start").addEventListener("click", () => { start(); $("start").blur(); });
+// A button is held like a key: with the finger on it the arm moves.
+for (const button of document.querySelectorAll("[data-key]")) {
+  const { key } = button.dataset;
+  button.addEventListener("pointerdown", (event) => { button.setPointerCapture(event.pointerId); press(key); });
+  for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) button.addEventListener(end, () => release(key));
+  button.addEventListener("contextmenu", (event) => event.preventDefault());
+}
+$("other").addEventListener("click", () => { choose(arm + 1); $("other").blur(); });
 $("run").addEventListener("click", () => { run(!running); $("run").blur(); });
 $("back").addEventListener("click", back);
 $("driver").addEventListener("change", () => { go(play.node); $("driver").blur(); });
