@@ -83,8 +83,8 @@ def test_the_end_of_a_clip_is_compared_as_the_whole_decoded_clip_shows_it(weight
     """Also with an autoencoder whose frames depend on all frames before them."""
     torch.manual_seed(0)
     tokenizer = patch_tokenizer() if kind == "patch" else WanTokenizer(small_wan_autoencoder().requires_grad_(False))
-    side = 8 if kind == "patch" else 4  # 64 pixels
-    predicted, target = torch.randn(2, 1, 2, tokenizer.latent_channels, 5, side, side).unbind(0)
+    side, views, frames = (8, 2, 5) if kind == "patch" else (3, 1, 4)  # 64 and 48 pixels
+    predicted, target = torch.randn(2, 1, views, tokenizer.latent_channels, frames, side, side).unbind(0)
     network = load_lpips(weights)
     predicted.requires_grad_()
 

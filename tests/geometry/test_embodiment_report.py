@@ -10,7 +10,7 @@ import pytest
 
 from flows.command_line import main
 from worldline_core.errors import ConfigError, UnavailableError
-from worldline_core.geometry import kinematics
+from worldline_core.geometry import kinematic_tree
 from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
 from worldline_core.geometry.embodiment_report import check_embodiment
 
@@ -49,14 +49,14 @@ def test_agibot_equals_mujoco(shared_data):
 
 def break_the_reader(monkeypatch: pytest.MonkeyPatch, metres: float) -> None:
     """The reader on our side puts the flange of the Panda somewhere else."""
-    read = kinematics.read_mjcf
+    read = kinematic_tree.read_mjcf
 
     def wrong(text, where):
         tree = read(text, where)
         next(body for body in tree.walk() if body.name == "panda_link8").T_parent_body[0, 3] += metres
         return tree
 
-    monkeypatch.setattr(kinematics, "read_mjcf", wrong)
+    monkeypatch.setattr(kinematic_tree, "read_mjcf", wrong)
 
 
 @has_mujoco

@@ -25,10 +25,10 @@ def test_a_reader_is_another_process_and_is_kept() -> None:
 def test_threads_read_side_by_side() -> None:
     """Each with a reader of its own: the pauses do not add up."""
     with ThreadPoolExecutor(3) as threads:
-        list(threads.map(lambda _: read_limited(LIMITS, time.sleep, 2.0), range(3)))  # all three are started
+        list(threads.map(lambda _: read_limited(LIMITS, time.sleep, 0.2), range(3)))  # all three are started
         started = time.monotonic()
-        list(threads.map(lambda _: read_limited(LIMITS, time.sleep, 2.0), range(3)))
-    assert time.monotonic() - started < 5
+        list(threads.map(lambda _: read_limited(LIMITS, time.sleep, 1.5), range(3)))
+    assert time.monotonic() - started < 4
 
 
 def test_what_a_function_raises_is_raised_here() -> None:
@@ -77,11 +77,11 @@ def test_signs_of_life_put_the_deadline_off() -> None:
     code = """
 import time
 from worldline_core.data.guards.reader_process import still_reading
-for _ in range(15):
-    time.sleep(0.3)
+for _ in range(8):
+    time.sleep(0.35)
     still_reading()
 """
-    read_limited(ReaderLimits(seconds=3), exec, code)
+    read_limited(ReaderLimits(seconds=2), exec, code)
 
 
 def test_a_reader_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> None:

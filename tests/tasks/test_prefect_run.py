@@ -57,28 +57,22 @@ def run(store: Path, chain: Callable[..., None], *arguments: str, page: bool = F
     return some_calls()
 
 
-def test_a_store_that_may_not_be_written_serves_a_finished_run(
+def test_a_call_starts_when_its_inputs_are_finished_and_is_found_where_nothing_may_be_written(
     storage: Path, two_calls: Callable[..., None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> NoReturn:
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    done = run(storage, two_calls)
-    monkeypatch.setattr(run_page, "write_progress_page", refuse)
-    assert run(storage, two_calls, page=True) == done
-    with pytest.raises(DataError, match="cannot work"):
-        run(storage, two_calls, "broken", page=True)
-
-
-def test_a_call_starts_when_its_inputs_are_finished_and_is_found_the_second_time(
-    storage: Path, two_calls: Callable[..., None], caplog: pytest.LogCaptureFixture
 ) -> None:
     done = run(storage, two_calls)
     assert list(done) == ["write_first", "write_next.second"]
     assert (done["write_next.second"].folder / "text").read_text() == "ab"
     made = {path: path.stat().st_mtime_ns for path in storage.rglob("text")}
-    assert run(storage, two_calls) == done
+
+    def refuse(*_: object) -> NoReturn:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(run_page, "write_progress_page", refuse)
+    assert run(storage, two_calls, page=True) == done
     assert {path: path.stat().st_mtime_ns for path in storage.rglob("text")} == made
+    with pytest.raises(DataError, match="cannot work"):
+        run(storage, two_calls, "broken", page=True)
 
 
 def test_equal_calls_are_one(declare: Any) -> None:

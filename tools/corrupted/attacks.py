@@ -211,8 +211,9 @@ def ending(attack: Attack, source: dict[str, Any], folder: Path) -> str:
     shutil.copytree(source["path"], folder)
     attack.change(next(path for path in sorted(folder.rglob(attack.pattern))))
     config = TypeAdapter(SourceConfig).validate_python({**source, "path": str(folder)})
+    limits = LIMITS.model_copy(update={"seconds": 3}) if "out_of_time" in attack.endings else LIMITS
     try:
-        read_limited(LIMITS, read_everything, config, folder)
+        read_limited(limits, read_everything, config, folder)
     except WorldLineError as error:
         return getattr(error, "reason", type(error).__name__)
     finally:
