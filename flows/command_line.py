@@ -66,6 +66,9 @@ def build_parser() -> argparse.ArgumentParser:
     inspect.add_argument("--episode", metavar="ID", help="the episode to show (default: the first one)")
     inspect.add_argument("--video", action="store_true", help="write a video of it: controls drawn over all views")
     inspect.set_defaults(run=_inspect)
+    listing = commands.add_parser("list", help="name the artifacts of a run: what is finished, and where it is")
+    add_config_arguments(listing)
+    listing.set_defaults(run=_list)
     verify = commands.add_parser("verify", help="compare the files of finished artifacts with what was written")
     verify.add_argument(
         "artifact", type=Path, nargs="*", help="only these, shipped ones too (default: all of the store)"
@@ -189,6 +192,12 @@ def _inspect(arguments: argparse.Namespace) -> None:
         video=arguments.video,
     )
     print(found)
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    from tasks.execution.command_line import list_artifacts
+
+    list_artifacts(arguments)
 
 
 def _verify(arguments: argparse.Namespace) -> None:

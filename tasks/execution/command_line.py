@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, TextIO, cast
 from safetensors import SafetensorError
 
 from tasks.execution.artifact_task import ArtifactTask
-from tasks.execution.chain import find_call, load_chain, outline, ready_inputs
+from tasks.execution.chain import find_artifacts, find_call, load_chain, outline, ready_inputs
 from tasks.execution.supervisor import run_supervised
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError, StoppedError, WorldLineError
+from worldline_core.store.artifact_files import read_manifest
 from worldline_core.store.store import Artifact, ArtifactStore
 from worldline_core.untrusted_text import shown, visible, without_credentials
 
@@ -81,12 +82,12 @@ def run_task(task: ArtifactTask, arguments: argparse.Namespace) -> Artifact:
         )
         if task.name == "curate":
             given = {f"source.{n}": path for n, path in source_folders(cast("CurateConfig", config)).items()} | given
-        return task.run(store, config, given, mapper)
+        return store.linked(task.name, task.run(store, config, given, mapper))
     whole = PipelineConfig.load(preset, arguments.config, overrides)
     calls = outline(load_chain(), whole)
     call = find_call(calls, task.name, arguments.name)
     task.check_inputs({**call.inputs, **given})
-    return task.run(store, call.config, ready_inputs(call, calls, store, given), mapper)
+    return store.linked(call.name, task.run(store, call.config, ready_inputs(call, calls, store, given), mapper))
 
 
 def _parse_input(text: str) -> tuple[str, Path]:
@@ -108,8 +109,29 @@ def run_task_command(task: ArtifactTask) -> None:
 
 
 def print_artifact(artifact: Artifact) -> None:
-    """Print where the artifact is, its digest, and whether it was there already."""
+    """Print where the artifact is, its digest, whether it was there already, and the figures of an evaluation."""
     print(f"{artifact.path}  {artifact.digest[:16]}  {'cached' if artifact.cached else 'built'}")
+    if artifact.step.startswith("evaluate_"):
+        from worldline_core.report.comparison import figures_of
+
+        print(figures_of(artifact.step, artifact.path))
+
+
+def list_artifacts(arguments: argparse.Namespace) -> None:
+    """Print the calls of a run by name, and the artifacts of those that are finished."""
+    from worldline_core.pipeline.pipeline_config import PipelineConfig
+    from worldline_core.report.comparison import aligned
+
+    preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "demo"
+    calls = outline(load_chain(), PipelineConfig.load(preset, arguments.config, arguments.overrides))
+    store = ArtifactStore(arguments.artifacts)
+    found = find_artifacts(calls, store)
+    lines = [("name", "artifact", "seconds", "finished")]
+    for name in calls:
+        made = read_manifest(found[name].path) if name in found else {}
+        place = str(arguments.artifacts / found[name].step / found[name].key) if name in found else "not finished"
+        lines.append((name, place, str(made.get("wall_seconds", "")), str(made.get("finished_at", ""))))
+    print(aligned(lines))
 
 
 def exit_with_clear_errors(action: Callable[[], object]) -> None:

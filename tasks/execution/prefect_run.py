@@ -45,7 +45,7 @@ from worldline_core.progress import running_node
 from worldline_core.scale.mapping import RunnerConfig, WorkerDiedError
 from worldline_core.scale.process import end_with_pool, keep_freed_memory
 from worldline_core.store.remote import is_remote
-from worldline_core.store.store import ArtifactStore
+from worldline_core.store.store import Artifact, ArtifactStore
 
 
 class ArtifactReference(StrictModel):
@@ -110,6 +110,8 @@ class PrefectRun(Outline):
                     self._results.get()
                 raise error
             self._wait()
+            for name, made in self.artifacts.items():
+                self._store.linked(name, Artifact(made.step, made.folder, made.digest, cached=True))
 
     def begin(self, call: TaskCall) -> None:
         """Make the call a Prefect task: here and now, or in the pool of processes."""

@@ -95,6 +95,21 @@ def test_the_named_call_is_the_one_that_is_run(tmp_path: Path, capsys: pytest.Ca
     assert "sources[].path" in said
 
 
+def test_artifacts_are_listed_by_the_names_of_calls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sources = (
+        "curate_banks.sources=[{kind: episode_set, path: artifacts/shipped/banks, include: [bank_lift_viperx-000]}]"
+    )
+    given = ["--artifacts", str(tmp_path), "--set", sources]
+    main(["task", "curate", "--name", "curate.banks", *given])
+    capsys.readouterr()
+    main(["list", *given])
+    listed = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()}
+    assert listed["rollout.shipped_stage2"] == ["not", "finished"]
+    place = Path(listed["curate.banks"][0])
+    assert place == tmp_path / "curate" / place.name
+    assert (tmp_path / "latest" / "curate.banks").resolve() == place.resolve()
+
+
 def test_a_reader_that_ends_first_is_no_error(project_root: Path) -> None:
     code = "import sys; from flows.command_line import main; sys.argv[1:] = ['embodiment', 'list']; main()"
     command = [sys.executable, "-c", code]

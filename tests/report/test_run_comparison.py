@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import pytest
 from flows.command_line import main
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.scores import SCORES_FILE, Score, summarise, write_scores
-from worldline_core.report.comparison import as_table, compare_runs, record_night
+from worldline_core.report.comparison import as_table, compare_runs, figures_of, record_night
 
 NUMBER = 24
 
@@ -147,3 +148,21 @@ def test_odd_names_of_methods_stay_names(tmp_path: Path) -> None:
     rows = compare_runs(f"{a}", f"{b}")
     assert {row.method for row in rows} == {"a|b\x1b[2J"}  # not the method "a" and a metric "b/ssim"
     assert "\x1b" not in as_table(rows)
+
+
+@pytest.mark.parametrize(
+    ("step", "expected"),
+    [
+        ("evaluate_video", ["group", "method", "robot_iou_exact@head", "robot_iou@head", "ssim@head", "psnr@head"]),
+        ("evaluate_policy", ["group", "method", "accuracy"]),
+        ("evaluate_planning", ["group", "method", "success"]),
+    ],
+)
+def test_an_evaluation_prints_its_headline_figures(
+    run_artifacts: dict[str, Path], step: str, expected: list[str]
+) -> None:
+    lines = figures_of(step, run_artifacts[step]).splitlines()
+    assert lines[0].split() == expected
+    first = next(line for line in lines if "shipped_" in line or "banks_" in line)
+    assert re.search(r"\d\.\d{3} \[\d\.\d{3}, \d\.\d{3}\] n=\d+", first)
+    assert not any(line.startswith(("lift", "N=2 ", "test/")) for line in lines)  # splits, and the most candidates

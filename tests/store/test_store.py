@@ -53,6 +53,16 @@ def test_second_run_is_cached(tmp_path: Path) -> None:
     assert digest_folder(second.path) == second.digest
 
 
+def test_the_last_artifact_of_a_call_has_a_link_by_name(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    made = [store.linked("count.a", store.run("count", 1, count, CountConfig(upto=n), {})) for n in (1, 2)]
+    assert (tmp_path / "latest" / "count.a").resolve() == made[1].path
+    assert not (tmp_path / "latest" / "count.a").readlink().is_absolute()  # a store may be moved
+    (tmp_path / "latest" / "count.b").mkdir()
+    store.linked("count.b", made[0])  # in the way: the artifact counts, not the link
+    assert sorted(path.name for path in (tmp_path / "latest").iterdir()) == ["count.a", "count.b"]
+
+
 @pytest.mark.parametrize("change", ["config", "version", "step", "input"])
 def test_key_depends_on_everything_that_matters(tmp_path: Path, change: str) -> None:
     store = ArtifactStore(tmp_path)

@@ -40,6 +40,7 @@ from worldline_core.evaluation.scores import SCORES_FILE, Interval
 from worldline_core.pages import charts
 from worldline_core.pages.page import Table, code, interval, render, words
 from worldline_core.pictures import contact_sheet, jpeg_bytes
+from worldline_core.report.context import SPLIT_LABELS
 from worldline_core.report.videos import compared_rows
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import MANIFEST_NAME, digest_value, linked_folder, read_json, verify_artifact
@@ -52,7 +53,7 @@ REFERENCE_NIGHTS = 7
 HISTORY_FILE = "history.jsonl"
 """A `Night` a line, oldest first; its scores by recording are in `scores/`."""
 PICTURES = "pictures"
-HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "accuracy", "success")
+HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "psnr@head", "accuracy", "success")
 MOST_CHARTS, MOST_TICKS, MOST_PICTURES = 8, 8, 4
 
 Verdict = Literal["better", "worse", "same", "new", "missing"]
@@ -156,9 +157,36 @@ def as_table(rows: Sequence[Difference]) -> str:
     for r in rows:
         values = f"{r.first:.3f}", f"{r.second:.3f}", f"{r.difference:+.3f}", f"[{r.low:+.3f}, {r.high:+.3f}]"
         lines.append((r.metric, f"{r.what} {r.group}", r.method, *values, f"{r.recordings}", r.better))
-    lines = [tuple(map(visible, line)) for line in lines]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join("  ".join(text.ljust(w) for text, w in zip(line, widths, strict=True)).rstrip() for line in lines)
+    return aligned(lines)
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> str:
+    """Lines of texts in columns of equal width, without control characters."""
+    shown = [[visible(text) for text in line] for line in lines]
+    widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
+    return "\n".join("  ".join(text.ljust(w) for text, w in zip(line, widths, strict=True)).rstrip() for line in shown)
+
+
+def figures_of(step: str, folder: Path) -> str:
+    """The headline metrics of a finished evaluation with 95 % intervals, a line for each split and method; else nothing."""
+    found: dict[tuple[str, str], dict[str, Interval]] = {}
+    metrics = collect_metrics({step: folder})
+    most = max((int(name.split("/")[1][2:]) for name in metrics if name.startswith("planning/")), default=0)
+    for name, value in metrics.items():
+        _, group, method, metric = name.split("/", 3)
+        if group not in (*SPLIT_LABELS, "all", f"N={most}"):
+            continue
+        found.setdefault((group, method), {})[metric] = value
+    measured = {metric for values in found.values() for metric in values}
+    # A set without a head view has the means over its views alone.
+    columns = [m if m in measured else m.removesuffix("@head") for m in HEADLINES]
+    columns = [metric for metric in columns if metric in measured]
+    lines = [("group", "method", *columns)]
+    for (group, method), values in found.items():
+        cells = [values.get(metric) for metric in columns]
+        shown = ["" if v is None else f"{v.mean:.3f} [{v.low:.3f}, {v.high:.3f}] n={v.count}" for v in cells]
+        lines.append((group, method, *shown))
+    return aligned(lines) if columns else ""
 
 
 # A night and the nights before it

@@ -52,6 +52,8 @@ logger = logging.getLogger(__name__)
 
 _VERSIONED_PACKAGES = ("torch", "numpy", "av", "diffusers", "prefect", "lerobot", "worldline")
 _POLL_SECONDS = 0.1
+LATEST = "latest"
+"""Folder of links by name, one to the last artifact of each call."""
 _WRITERS = ".writers"
 
 StepFunction = Callable[[Any, Mapping[str, Path], Path], dict[str, Any]]
@@ -204,6 +206,20 @@ class ArtifactStore:
         if "digest" not in manifest:
             raise ArtifactError("A manifest has no digest", where=folder, next_step=how_to_rebuild(folder))
         return Artifact(step, folder, str(manifest["digest"]), cached=True)
+
+    def linked(self, name: str, artifact: Artifact) -> Artifact:
+        """Let `latest/<name>` lead to an artifact: keys are no names. Nothing reads these links but people."""
+        link = self.root / LATEST / name
+        temporary = link.with_name(f".{name}.{os.getpid()}")
+        try:
+            link.parent.mkdir(exist_ok=True)
+            temporary.symlink_to(os.path.relpath(artifact.path, link.parent), target_is_directory=True)
+            temporary.replace(link)
+        except OSError as error:  # a file system without links, or one that may not be written
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            logger.info("no link %s: %s", link, error)
+        return artifact
 
     def input_digest(self, path: Path) -> str:
         """Digest of an input: read from the manifest of an artifact, computed for any other folder.
