@@ -34,7 +34,7 @@ from worldline_core.data.episodes.episode_index import (
     write_quarantine,
 )
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWork
-from worldline_core.data.episodes.episode_set_writer import part_name
+from worldline_core.data.episodes.episode_set_writer import EMBODIMENTS_FOLDER, copy_embodiments, part_name
 from worldline_core.filters.calibration import find_calibration_faults, find_lags, find_mistake, find_projection
 from worldline_core.filters.detectors import find_base_motion, find_joint_faults, find_picture_faults, find_static
 from worldline_core.filters.filter_config import FilterConfig
@@ -251,6 +251,7 @@ def filter_episodes(
         next_step = "look at the numbers in the table and at the thresholds in filter"
         raise nothing_kept("No episode passed the filters", output, rejected, next_step)
     write_table_atomic(output / FINDINGS_FILE, pa.Table.from_pylist(findings, schema=row_schema(FindingRow)))
+    copy_embodiments((row.embodiment for row in rows), output / EMBODIMENTS_FOLDER)
     write_quarantine(output, rejected)
     write_index(output, rows)
     fit = Counter(row.stage2_reason for row in rows)

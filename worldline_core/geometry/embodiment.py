@@ -1,6 +1,7 @@
 """Robots as data: arms, joint order, tools, grippers, wrist cameras.
 
-One YAML file per embodiment in `configs/embodiments/`. `observation.state` and `action` hold, for each arm in order, its
+One YAML file per embodiment: the package's, those of `configs/embodiments` in the working folder, those that opened recordings
+carry with them, or any that is named by its path. `observation.state` and `action` hold, for each arm in order, its
 joint positions, then its gripper.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,6 +25,8 @@ MAX_DESCRIPTION_BYTES = 16 << 20
 QUATERNION_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's length from 1 that is taken for rounding and normalised away."""
 EMBODIMENT_ROOT = CONFIG_ROOT / "embodiments"
+OWN_ROOT = Path("configs", "embodiments")
+"""Of the working folder."""
 LIMIT_TOLERANCE_RAD = 0.02
 """Joint positions may pass their limits by this much."""
 
@@ -248,17 +251,69 @@ class Embodiment(StrictModel):
         )
 
 
+_carried: dict[str, Path] = {}
+"""Files of robots that recordings carry or that a configuration names by their paths, by name."""
+
+
+def embodiment_files() -> dict[str, Path]:
+    """Files of all embodiments by name: the package's, the working folder's, and, before those, what opened recordings carry.
+
+    Raises: ConfigError when a robot has the name of one that ships with the project, and is another.
+    """
+    shipped = {path.stem: path for path in EMBODIMENT_ROOT.glob("*.yaml")}
+    own = {path.stem: path for path in OWN_ROOT.glob("*.yaml")} | _carried
+    for name in shipped.keys() & own.keys():
+        _require_same(name, shipped[name], own[name])
+    return own | shipped
+
+
+def _require_same(name: str, one: Path, other: Path) -> None:
+    if one.read_bytes() != other.read_bytes():
+        raise ConfigError(
+            "Two files describe one robot differently", where=f"{one}, {other}", got=name,
+            next_step="rename one (the file and its `name`), or curate its recordings again",
+        )  # fmt: skip
+
+
+def own_embodiment(name_or_path: str) -> Path | None:
+    """File of a robot that does not ship with the project, by name or path; None of those that do, or are not there."""
+    path = Path(name_or_path) if _is_path(name_or_path) else embodiment_files().get(name_or_path)
+    return None if path is None or not path.is_file() or path.parent == EMBODIMENT_ROOT else path
+
+
+def carry_embodiments(paths: Iterable[Path]) -> list[str]:
+    """Let robots be found by their names, whose files lie anywhere; returns the names.
+
+    Raises: ConfigError when a file is no embodiment, or its name stands for another robot already.
+    """
+    names = []
+    for path in paths:
+        name = load_embodiment(path).name
+        known = _carried.get(name, path)
+        if known.is_file():
+            _require_same(name, known, path)
+        _carried[name] = path
+        names.append(name)
+    return names
+
+
+def _is_path(name: str | Path) -> bool:
+    return Path(name).suffix in (".yaml", ".yml")
+
+
 def embodiment_names() -> list[str]:
-    """Names of the embodiments that ship with the project."""
-    return sorted(path.stem for path in EMBODIMENT_ROOT.glob("*.yaml"))
+    """Names of the embodiments that can be found by name."""
+    return sorted(embodiment_files())
 
 
 def check_embodiment_name(name: str) -> None:
-    """Raises: ConfigError when no file in configs/embodiments has this name; the message lists those there are."""
+    """Raises: ConfigError when no embodiment has this name; the message lists those there are."""
     names = embodiment_names()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=1)
-        next_step = f"did you mean {close[0]!r}?" if close else f"add configs/embodiments/{name}.yaml"
+        next_step = f"add configs/embodiments/{name}.yaml to the working folder (docs/embodiments.md)"
+        if close:
+            next_step = f"did you mean {close[0]!r}?"
         if name == "none":
             next_step = (
                 "a robot without a description has no kinematics: describe it (docs/embodiments.md), then curate again"
@@ -275,9 +330,9 @@ def load_embodiment(name_or_path: str | Path, description_path: Path | str | Non
     Raises: ConfigError when there is no embodiment of that name (the message lists the names), or the YAML is not valid.
     """
     path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml"):
+    if not _is_path(name_or_path):
         check_embodiment_name(str(name_or_path))
-        path = EMBODIMENT_ROOT / f"{name_or_path}.yaml"
+        path = embodiment_files()[str(name_or_path)]
     embodiment = validate(Embodiment, {**read_yaml(path), "description_path": path.parent}, where=path)
     chosen = description_path or os.environ.get(description_variable(embodiment.name))
     located = Path(chosen) if chosen else path.parent / embodiment.description.file

@@ -27,6 +27,7 @@ from worldline_core.data.guards.source_paths import parse_location, portable_tex
 from worldline_core.data.sources.episode_files import check_id, unique_identity
 from worldline_core.data.sources.open import open_source
 from worldline_core.errors import CalibrationError, DataError
+from worldline_core.geometry.embodiment import carry_embodiments
 from worldline_core.scale.account import InputRow, check_account, crash_evidence, portable_message, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, ends_the_run, map_episodes
 from worldline_core.store.remote import UnreachableInputError, first_line, is_transient
@@ -62,6 +63,7 @@ def curate(
                 "A source reads a recording of this run, which is not here", where=f"sources[{number}]", got=name,
                 next_step=f"run `worldline task record --name record.{name}` with the same preset first",
             )  # fmt: skip
+    carry_embodiments(config.own_robots().values())
     mapper = mapper or SerialMapper()
     roots = tuple(str(inputs.get(f"source.{n}", source.path)) for n, source in enumerate(config.sources))
     work = CurateWork(output, config, roots)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -14,6 +15,7 @@ from worldline_core.data.guards.reader_process import ReaderLimits
 from worldline_core.data.sources.open import RecordingSourceConfig, SourceConfig
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.geometry.cameras import Fit
+from worldline_core.geometry.embodiment import load_embodiment, own_embodiment
 
 AVAILABLE = "available"
 
@@ -135,6 +137,20 @@ class CurateConfig(StrictModel):
     def recordings(self) -> dict[int, str]:
         """Names of the run's own recordings, by the number of the source that reads each."""
         return {n: s.recording for n, s in enumerate(self.sources) if isinstance(s, RecordingSourceConfig)}
+
+    def own_robots(self) -> dict[str, Path]:
+        """Files of the sources' robots that do not ship with the project, by the keys that name them."""
+        named = {
+            f"sources.{n}.embodiment": getattr(source, "embodiment", None) for n, source in enumerate(self.sources)
+        }
+        found = {key: own_embodiment(name) for key, name in named.items() if name}
+        return {key: path for key, path in found.items() if path is not None}
+
+    def weights_read(self) -> Mapping[str, Path | None]:
+        """Descriptions of robots, whose content counts in the cache key."""
+        robots = self.own_robots()
+        described = {f"{key}.description": load_embodiment(path).description_path for key, path in robots.items()}
+        return {**robots, **described}
 
     def for_source(self, number: int) -> CurateConfig:
         """The configuration as it holds for sources[number]: what the source says of itself goes before what is said for

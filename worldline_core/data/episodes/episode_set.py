@@ -14,7 +14,7 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import ARRAYS, LABELS, Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, read_index, read_quarantine
-from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.episodes.episode_set_writer import EMBODIMENTS_FOLDER, EpisodeSetWriter
 from worldline_core.data.episodes.sidecar import Sidecar
 from worldline_core.data.episodes.view_recording import recorded_size
 from worldline_core.data.guards.plain_files import parse_json
@@ -25,6 +25,7 @@ from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, cache_path, read_thumbnails
 from worldline_core.errors import DataError
+from worldline_core.geometry.embodiment import carry_embodiments
 from worldline_core.scale.account import InputRow
 from worldline_core.scale.mapping import EpisodeWork
 from worldline_core.store.remote import is_remote
@@ -49,8 +50,12 @@ class EpisodeSet:
         Args:
             allow_linked: whether rows may point to datasets in another artifact (by a relative path).
 
-        Raises: DataError when the index is missing or incomplete.
+        Raises:
+            DataError: the index is missing or incomplete.
+            ConfigError: the set carries the description of a robot whose name stands for another one here.
         """
+        if not is_remote(root):
+            carry_embodiments(sorted(root.glob(f"{EMBODIMENTS_FOLDER}/*.yaml")))
         return cls(root, read_index(root), allow_linked=allow_linked)
 
     def __len__(self) -> int:

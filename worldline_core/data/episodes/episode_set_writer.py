@@ -11,7 +11,7 @@ import json
 import shutil
 import uuid
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from hashlib import sha256
@@ -55,10 +55,13 @@ from worldline_core.data.guards.source_paths import safe_name
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.data.video.frames import Frames, packed_images
 from worldline_core.data.video.thumbnails import ViewThumbnails
-from worldline_core.errors import DataError
-from worldline_core.store.atomic import write_json_atomic
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.embodiment import load_embodiment, own_embodiment
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 VIDEOS_FILE = "videos.json"
+EMBODIMENTS_FOLDER = "embodiments"
+"""Robots of the recordings that do not ship with the project."""
 """How many of the set's videos were copied as they were recorded, how many encoded, and in which codecs they are."""
 
 
@@ -319,6 +322,7 @@ class EpisodeSetWriter:
             sizes = {view: video.size for view, video in members[0].videos.items()}
             write_sidecar(dataset, [part.episode for part in members], masks, things, sizes)
             rows += [_row(part, f"datasets/{name}", index) for index, part in enumerate(members)]
+        copy_embodiments((row.embodiment for row in rows), self.root / EMBODIMENTS_FOLDER)
         write_json_atomic(self.root / VIDEOS_FILE, _count_videos(parts))
         write_quarantine(self.root, rejected)
         write_index(self.root, sorted(rows, key=lambda row: row.episode_id))
@@ -397,3 +401,20 @@ def _check_sizes(
                     expected=expected,
                     got=values.shape,
                 )
+
+
+def copy_embodiments(names: Iterable[str], folder: Path) -> None:
+    """Write files of robots that do not ship with the project, and their descriptions, into a folder.
+
+    Raises: ConfigError: a description does not lie beside or below its YAML file.
+    """
+    for name in sorted(set(names)):
+        if (path := own_embodiment(name)) is None:
+            continue
+        embodiment = load_embodiment(name)
+        relative = Path(embodiment.description.file)
+        if relative.is_absolute() or ".." in relative.parts:
+            raise ConfigError("A description lies elsewhere than its robot's file", where=path, got=str(relative))
+        write_bytes_atomic(folder / f"{name}.yaml", path.read_bytes())
+        if embodiment.description_path.is_file():
+            write_bytes_atomic(folder / relative, embodiment.description_path.read_bytes())

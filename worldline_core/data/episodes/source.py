@@ -20,7 +20,7 @@ from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import CalibrationError, ConfigError
 from worldline_core.geometry.cameras import Fit
-from worldline_core.geometry.embodiment import check_embodiment_name
+from worldline_core.geometry.embodiment import check_embodiment_name, load_embodiment
 from worldline_core.geometry.lens import Distortion, DistortionModel
 from worldline_core.untrusted_text import printable
 
@@ -165,7 +165,10 @@ class SourceConfigBase(StrictModel):
 def _described(name: str) -> str:
     if name != NO_EMBODIMENT:
         try:
-            check_embodiment_name(name)
+            if name.endswith((".yaml", ".yml")):
+                load_embodiment(name)
+            else:
+                check_embodiment_name(name)
         except ConfigError as error:
             next_step = f"{error.next_step}; or embodiment: {NO_EMBODIMENT}, which takes the recordings for Stage I"
             raise ValueError(f"nobody describes the robot {name} ({error.expected}); {next_step}") from error
@@ -173,7 +176,7 @@ def _described(name: str) -> str:
 
 
 EmbodimentName = Annotated[str, AfterValidator(_described)]
-"""Field type of a configuration: a robot of configs/embodiments, or `none` where nobody describes it."""
+"""Field type of a configuration: a robot by its name or by the path of its file, or `none` where nobody describes it."""
 
 
 class ForeignSourceConfig(SourceConfigBase):

@@ -39,6 +39,7 @@ from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFol
 from worldline_core.data.video.clip import video_size
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import DataError
+from worldline_core.geometry.embodiment import carry_embodiments, own_embodiment
 
 
 class EpisodeSetSourceConfig(SourceConfigBase):
@@ -136,6 +137,8 @@ def open_source(config: SourceConfig, root: AnyPath) -> EpisodeSource:
     """
     if not exists(root):
         raise DataError("Source folder is missing", where=str(root), next_step="check curate.sources[].path")
+    if robot := own_embodiment(getattr(config, "embodiment", None) or ""):
+        config = config.model_copy(update={"embodiment": carry_embodiments([robot])[0]})
     return _RepairedSource(_READERS[type(config)](config, root), config, root)
 
 
