@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
@@ -35,18 +33,6 @@ def test_sigma_of_the_paper_on_its_grid_and_on_each_axis_by_itself():
     assert grid_sigma((384, 256)) == pytest.approx((10.0, 5.0))
 
 
-def test_point_on_a_cell_centre_has_value_one_there():
-    tracks = batch(b=1, t=1, v=1, a=1)
-    # Cell (y=7, x=11) of a 30 x 40 grid over 480 x 640: its centre is pixel (11.5 * 16 - 0.5, 7.5 * 16 - 0.5).
-    tracks.uv[:] = torch.tensor([11.5 * 16 - 0.5, 7.5 * 16 - 0.5])
-    tracks.valid[:] = True
-    maps = render_action_maps(tracks, (480, 640), (30, 40))[0, 0, :, 0]
-    assert float(maps[0, 7, 11]) == pytest.approx(1.0, abs=1e-7)
-    assert int(maps[0].argmax()) == 7 * 40 + 11
-    expected = torch.cat([torch.ones(1), tracks.depth.flatten(), tracks.rot6d.flatten(), tracks.gripper.flatten()])
-    torch.testing.assert_close(maps[:, 7, 11], expected)
-
-
 @pytest.mark.parametrize("mask", [(True, False), (True, True)])
 def test_gradcheck(mask):
     """In uv, depth, Rot6D and opening; the gradient of a masked sample is zero."""
@@ -60,15 +46,6 @@ def test_gradcheck(mask):
         )
 
     assert torch.autograd.gradcheck(render, inputs)
-
-
-def test_point_on_the_border_keeps_the_inner_half_of_its_gaussian():
-    tracks = batch(b=1, t=1, v=1, a=1)
-    tracks.valid[:] = True
-    tracks.uv[:] = torch.tensor([-0.5, 14.5 * 16 - 0.5])
-    maps = render_action_maps(tracks, (480, 640), (30, 40))[0, 0, 0, 0]
-    # The border lies half a cell before the centre of column 0.
-    assert float(maps[:, 0].max()) == pytest.approx(math.exp(-0.5 * (0.5 / 0.78125) ** 2), abs=1e-4)
 
 
 def test_controls_of_a_whole_interval_begin_with_those_of_the_latent_frame_itself():

@@ -129,17 +129,6 @@ def test_stored_pixels_are_float64(kinematics, scene):
         np.testing.assert_allclose(tracks.gripper[n, v, a], values[8], atol=1e-7, rtol=0)
 
 
-def test_a_batch_is_its_clips(kinematics, scene):
-    episode, *_ = scene
-    tracks, _ = compute_tracks(episode, kinematics)
-    clips = [tracks.clip(range(start, start + 5)) for start in (0, 2, 4)]
-    together = render_action_maps(collate_tracks(clips), LARGE, (30, 40))
-    for clip, maps in zip(clips, together, strict=True):
-        torch.testing.assert_close(
-            maps, render_action_maps(collate_tracks([clip]), LARGE, (30, 40))[0], atol=1e-7, rtol=0
-        )
-
-
 def test_gradcheck_from_joint_angles_to_the_map(kinematics, episode):
     """Through forward kinematics (tools and wrist cameras), projection and rendering, by finite differences."""
     K = torch.from_numpy(np.stack([episode.cameras[view].K for view in VIEWS]))
@@ -161,18 +150,3 @@ def test_gradcheck_from_joint_angles_to_the_map(kinematics, episode):
         return (maps * weights).sum((-1, -2))
 
     assert torch.autograd.gradcheck(render, (state.requires_grad_(),))
-
-
-def test_gradcheck_of_the_projection(scene):
-    """In tools, openings, intrinsics and cameras; rigid matrices are perturbed within the tolerance of rigidity."""
-    _, tools, openings, K, poses = scene
-    inputs = [
-        torch.from_numpy(x).requires_grad_()
-        for x in (tools[2:4], np.clip(openings[2:4], 0.1, 0.9), K, poses[2:4].copy())
-    ]
-
-    def project(tools, openings, K, poses):
-        seen = project_tools(tools, openings, K, poses, LARGE)
-        return seen.uv, seen.depth, seen.rot6d, seen.gripper
-
-    assert torch.autograd.gradcheck(project, inputs, eps=1e-7, atol=1e-4)

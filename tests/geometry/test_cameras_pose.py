@@ -5,11 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.cameras import CameraPose, project_points
+from worldline_core.geometry.tensor_transforms import is_rigid
 from worldline_core.geometry.transforms import (
     MAX_ROTATION_DEVIATION,
     mean_pose,
@@ -94,6 +96,7 @@ def test_what_is_beyond_repair_is_refused(kind: str) -> None:
         recorded[2, 0, 3] = np.inf
     else:
         recorded[2, 3, 0] = 0.1
+    assert not bool(is_rigid(torch.from_numpy(recorded[2])))
     with pytest.raises(CalibrationError, match=r"Not a rigid transform[\s\S]*episode 4, frame 2[\s\S]*1 of 5"):
         CameraPose.of(recorded, extrinsics="camera_to_base", axes="opencv", where="episode 4")
 

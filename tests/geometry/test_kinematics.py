@@ -197,13 +197,10 @@ def test_poses_are_differentiable_in_the_joints(tmp_path):
     assert torch.autograd.gradcheck(kinematics.tool_poses, state)
 
 
-def test_unknown_link_lists_the_links(tmp_path):
+def test_unknown_links_and_joints_list_the_known_ones(tmp_path):
     arm = {**TOY_YAML["arms"][0], "end_effector_link": "paw"}  # type: ignore[index]
     with pytest.raises(ConfigError, match=r"no link of this name[\s\S]*elbow[\s\S]*paw"):
         toy(tmp_path, arms=[arm])
-
-
-def test_unknown_joint_lists_the_joints(tmp_path):
     with pytest.raises(ConfigError, match=r"no joint of this name[\s\S]*tilt[\s\S]*waist"):
         toy(tmp_path, posture={"waist": 0.1})
 

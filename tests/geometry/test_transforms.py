@@ -15,7 +15,6 @@ from worldline_core.geometry.tensor_transforms import is_rigid, rot6d_from_rotat
 from worldline_core.geometry.transforms import (
     lengths,
     pose_from_quaternion_wxyz,
-    repair_rotations,
     rotation_angle,
     rotation_from_quaternion_wxyz,
     rotation_from_rot6d,
@@ -51,22 +50,6 @@ def test_every_pose_is_rigid_and_its_scaled_copy_is_not(quaternion, translation)
 def test_rotation_angle_is_accurate_at_both_ends(angle):
     q = np.array([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0])
     assert float(rotation_angle(rotation_from_quaternion_wxyz(q))) == pytest.approx(angle, abs=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["mirrored", "nan", "last_row", "sheared"])
-def test_what_is_no_rigid_transform_is_named(kind):
-    T = torch.eye(4, dtype=torch.float64)
-    if kind == "mirrored":
-        T[0, 0] = -1
-    elif kind == "nan":
-        T[1, 3] = math.nan
-    elif kind == "last_row":
-        T[3, 0] = 0.2
-    else:
-        T[0, 1] = 0.05
-    with pytest.raises(CalibrationError, match=r"Not a rigid transform[\s\S]*view head"):
-        repair_rotations(T[None].numpy(), "view head")
-    assert not bool(is_rigid(T))
 
 
 @pytest.mark.parametrize("bad", [0.0, 1e-9, math.nan, math.inf])

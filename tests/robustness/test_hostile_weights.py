@@ -23,7 +23,7 @@ from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_inf
 from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.store.artifact_files import read_json, read_json_lines, read_manifest
+from worldline_core.store.artifact_files import read_json_lines, read_manifest
 from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.video_teacher import load_teacher
 
@@ -83,33 +83,26 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("content", FILES.values(), ids=FILES)
-def test_weights_that_lie_are_refused(content: bytes, folder: Path) -> None:
-    (folder / "model.safetensors").write_bytes(content)
-    sign(folder)
-    with pytest.raises(CheckpointError, match=r"weights file is damaged|do not fit"):
-        load_checkpoint(folder)
+NO_NUMBERS = {
+    **{
+        str(value): lambda old, value=value: old.clone().fill_(value)
+        for value in (float("nan"), float("inf"), -float("inf"))
+    },
+    **{str(dtype): lambda old, dtype=dtype: old.to(dtype) for dtype in (torch.int64, torch.bool, torch.complex64)},
+}
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_weights_that_are_no_numbers_are_refused(value: float, folder: Path) -> None:
+@pytest.mark.parametrize("change", NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_weights_that_are_no_real_numbers_are_refused(
+    change: Callable[[torch.Tensor], torch.Tensor], folder: Path
+) -> None:
     tensors = load_file(folder / "model.safetensors")
     name = sorted(tensors)[-1]
-    tensors[name].view(-1)[-1] = value
-    save_file(tensors, folder / "model.safetensors")
+    save_file(tensors | {name: change(tensors[name])}, folder / "model.safetensors")
     sign(folder)
-    with pytest.raises(CheckpointError, match="not finite") as caught:
-        load_checkpoint(folder)
-    assert name in str(caught.value)
-
-
-@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.complex64])
-def test_weights_of_another_kind_are_not_read_as_real_numbers(dtype: torch.dtype, folder: Path) -> None:
-    tensors = load_file(folder / "model.safetensors")
-    name = sorted(tensors)[0]
-    save_file(tensors | {name: tensors[name].to(dtype)}, folder / "model.safetensors")
-    sign(folder)
-    with pytest.raises(CheckpointError, match="floating-point"):
+    with pytest.raises(
+        CheckpointError, match=rf"(?s)(not finite|floating-point).*{name}|{name}.*(not finite|floating-point)"
+    ):
         load_checkpoint(folder)
 
 
@@ -120,30 +113,10 @@ def test_a_description_of_terabytes_takes_no_memory(size: dict[str, int], folder
         load_checkpoint(folder)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100_000, '{"a": ' + "9" * 5000 + "}", "\xff"])
-def test_descriptions_that_are_no_json_are_named(text: str, folder: Path) -> None:
-    path = folder / "checkpoint.json"
-    path.write_bytes(text.encode("latin-1"))
-    with pytest.raises(CheckpointError, match="not JSON"):
-        read_checkpoint_info(folder)
-    with pytest.raises(ArtifactError, match="damaged"):
-        read_json(path)
-    path.write_bytes(text.encode("latin-1") + b"\n{}\n")
-    with pytest.raises(ArtifactError, match="not JSON"):
-        read_json_lines(path)
-
-
 @pytest.fixture
 def segmenter(tmp_path: Path) -> Path:
     save_segmenter(tmp_path / "s", (8, 16), UNet((8, 16)).state_dict(), {"threshold": 0.5})
     return tmp_path / "s"
-
-
-@pytest.mark.parametrize("content", FILES.values(), ids=FILES)
-def test_a_segmenters_weights_that_lie_are_refused(content: bytes, segmenter: Path) -> None:
-    (segmenter / "model.safetensors").write_bytes(content)
-    with pytest.raises(ArtifactError, match="segmenter cannot be read"):
-        LearnedSegmenter.load(segmenter)
 
 
 @pytest.mark.parametrize(
@@ -186,13 +159,6 @@ def trajectories(tmp_path: Path) -> Path:
     write_shard(tmp_path / "shard-00000.safetensors")
     assert len(TrajectoryStore.open(tmp_path)) == 1
     return tmp_path
-
-
-@pytest.mark.parametrize("content", FILES.values(), ids=FILES)
-def test_shards_of_trajectories_that_lie_are_refused(content: bytes, trajectories: Path) -> None:
-    (trajectories / "shard-00000.safetensors").write_bytes(content)
-    with pytest.raises(ArtifactError, match="shard of trajectories cannot be read"):
-        TrajectoryStore.open(trajectories)
 
 
 @pytest.mark.parametrize(
@@ -240,11 +206,26 @@ def test_an_index_of_trajectories_that_is_none_is_refused(index: str, trajectori
         TrajectoryStore.open(trajectories)
 
 
+@pytest.mark.parametrize("content", FILES.values(), ids=FILES)
+def test_weights_that_lie_are_refused(content: bytes, folder: Path, segmenter: Path, trajectories: Path) -> None:
+    (folder / "model.safetensors").write_bytes(content)
+    sign(folder)
+    with pytest.raises(CheckpointError, match=r"weights file is damaged|do not fit"):
+        load_checkpoint(folder)
+    (segmenter / "model.safetensors").write_bytes(content)
+    with pytest.raises(ArtifactError, match="segmenter cannot be read"):
+        LearnedSegmenter.load(segmenter)
+    (trajectories / "shard-00000.safetensors").write_bytes(content)
+    with pytest.raises(ArtifactError, match="shard of trajectories cannot be read"):
+        TrajectoryStore.open(trajectories)
+
+
 DAMAGED = {
     "nothing": b"",
     "a brace": b"{",
     "deep": b"[" * 100_000,
-    "5,000 digits": b"9" * 5000,
+    "deep objects": b'{"a": ' * 100_000,
+    "5,000 digits": b'{"a": ' + b"9" * 5000 + b"}",
     "a list": b"[]",
     "no text": b"\xff\xfe",
 }
@@ -252,10 +233,14 @@ DAMAGED = {
 
 @pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
 def test_small_descriptions_that_are_none_are_named(tmp_path: Path, content: bytes) -> None:
-    for name in ("config.json", "manifest.json", "store.json"):
+    for name in ("config.json", "manifest.json", "store.json", "checkpoint.json", "teacher.json"):
         (tmp_path / name).write_bytes(content)
     pq.write_table(pa.table({"episode_id": ["a"]}), tmp_path / "index.parquet")
-    for read in (load_teacher, LatentStore.open, load_tokenizer, read_manifest):
+    for read in (load_teacher, LatentStore.open, load_tokenizer, read_manifest, read_checkpoint_info):
         with pytest.raises(ArtifactError) as caught:
             read(tmp_path)
         assert str(tmp_path) in str(caught.value)
+    (tmp_path / "store.json").write_bytes(content + b"\n{}\n")
+    if content not in (b"", b"[]"):
+        with pytest.raises(ArtifactError, match="not JSON"):
+            read_json_lines(tmp_path / "store.json")

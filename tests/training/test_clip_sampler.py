@@ -54,13 +54,6 @@ def test_clips_fit_their_episodes_share_a_length_and_cover_all_starts(store: Lat
     assert {start for length, start in starts if length == 17} == {0}
 
 
-def test_ranks_share_the_global_batch(store: LatentStore) -> None:
-    whole = make(store, batch_size=4)
-    parts = [make(store, batch_size=2, plan=BatchPlan(2, 2, rank, 2)) for rank in range(2)]
-    for index in range(10):
-        assert whole.clips(index).clips == parts[0].clips(index).clips + parts[1].clips(index).clips
-
-
 @pytest.mark.parametrize(("together", "world_size"), [(2, 1), (1, 2), (4, 2), (2, 4)])
 def test_another_number_of_processes_goes_on_with_the_same_clips(
     store: LatentStore, together: int, world_size: int
