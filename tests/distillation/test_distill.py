@@ -296,14 +296,19 @@ def test_controls_of_whole_intervals_reach_every_step(
     assert (info.contract, model.config.map_channels) == (contract, 36)
 
 
-def test_clips_must_be_whole_blocks() -> None:
-    with pytest.raises(ValidationError, match=r"lengths \[17\]: clips are one observed frame and whole blocks, 1 \+ k"):
-        DistillConfig.model_validate({"clips": {"lengths": [17]}, "block_size": 3})
-
-
-def test_single_views_are_for_teacher_forcing_alone() -> None:
-    with pytest.raises(ValidationError, match="hold all views"):
-        DistillConfig.model_validate({"clips": {"view_weights": {"head": 1.0}}})
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (
+            {"clips": {"lengths": [17]}, "block_size": 3},
+            r"lengths \[17\]: clips are one observed frame and whole blocks",
+        ),
+        ({"clips": {"view_weights": {"head": 1.0}}}, "hold all views"),
+    ],
+)
+def test_clips_are_whole_blocks_of_all_views(values: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        DistillConfig.model_validate(values)
 
 
 def test_only_a_stage2_checkpoint_of_the_same_latents_is_distilled(inputs: dict[str, Path], tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.model.test_tokenizers import scenes, views  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import CheckpointError, ConfigError, DataError
 from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig
 from worldline_core.model.tokenizers import (
@@ -18,30 +19,12 @@ from worldline_core.model.tokenizers import (
     fit_patch_tokenizer,
 )
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
-from worldline_core.training.clip_source import LoadedView
 from worldline_core.training.train_tokenizer import train_small_decoder
 from worldline_core.training.training_config import TokenizerConfig
 
 CONFIG = TokenizerConfig(
     steps=3, batch_size=1, clip_frames=9, warmup_steps=1, bfloat16=False, average_decay=0.8, checkpoint_every=1
 )
-
-
-def scenes(count: int = 6, frames: int = 9, seed: int = 0) -> torch.Tensor:
-    """Smooth backgrounds with a bright square that moves to the right, ``(b 3 t 32 48)`` in [-1, 1]."""
-    generator = torch.Generator().manual_seed(seed)
-    background = torch.rand(count, 3, 5, 7, generator=generator)
-    background = torch.nn.functional.interpolate(background, (32, 48), mode="bilinear")
-    video = background[:, :, None].repeat(1, 1, frames, 1, 1)
-    for item, start in enumerate(torch.randint(0, 20, (count,), generator=generator).tolist()):
-        for frame in range(frames):
-            video[item, :, frame, start : start + 8, start + frame : start + frame + 8] = 0.9
-    return video * 2 - 1
-
-
-def views(seeds: int, count: int = 6) -> list[LoadedView]:
-    videos = [((v + 1) * 127.5).round().to(torch.uint8) for s in range(seeds) for v in scenes(count, seed=s)]
-    return [LoadedView(f"scene-{number}/head", video) for number, video in enumerate(videos)]
 
 
 def of(tokenizer: VideoTokenizer, width: int = 4, *, trained: bool = True) -> SmallDecoder:

@@ -43,14 +43,20 @@ def count(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict
     return {"written": written}
 
 
-def test_second_run_is_cached(tmp_path: Path) -> None:
+def test_a_finished_artifact_is_found_again_until_its_manifest_is_gone_or_damaged(tmp_path: Path) -> None:
     store = ArtifactStore(tmp_path)
-    first = store.run("count", 1, count, CountConfig(), {})
-    second = store.run("count", 1, count, CountConfig(), {})
-    assert not first.cached
-    assert second.cached
+    first, second = (store.run("count", 1, count, CountConfig(), {}) for _ in range(2))
+    assert (first.cached, second.cached) == (False, True)
     assert (second.path, second.digest) == (first.path, first.digest)
     assert digest_folder(second.path) == second.digest
+    (first.path / "manifest.json").unlink()
+    again = store.run("count", 1, count, CountConfig(), {})
+    assert (again.cached, again.digest) == (False, first.digest)
+    (again.path / "manifest.json").write_text("{")
+    with pytest.raises(ArtifactError, match=r"JSON file is damaged[\s\S]*manifest.json"):
+        store.find("count", again.key)
+    with pytest.raises(ArtifactError, match="does not exist"):
+        store.run("count", 1, count, CountConfig(), {"episodes": tmp_path / "none"})
 
 
 def test_the_last_artifact_of_a_call_has_a_link_by_name(tmp_path: Path) -> None:
@@ -196,28 +202,6 @@ def test_killed_run_continues_to_the_same_digest(tmp_path: Path) -> None:
     assert not list((tmp_path / "killed" / "slow").glob("*.partial"))
 
 
-def test_deleting_an_artifact_rebuilds_it(tmp_path: Path) -> None:
-    store = ArtifactStore(tmp_path)
-    first = store.run("count", 1, count, CountConfig(), {})
-    (first.path / "manifest.json").unlink()
-    again = store.run("count", 1, count, CountConfig(), {})
-    assert not again.cached
-    assert again.digest == first.digest
-
-
-def test_damaged_manifest_is_named(tmp_path: Path) -> None:
-    store = ArtifactStore(tmp_path)
-    artifact = store.run("count", 1, count, CountConfig(), {})
-    (artifact.path / "manifest.json").write_text("{")
-    with pytest.raises(ArtifactError, match=r"JSON file is damaged[\s\S]*manifest.json"):
-        store.find("count", artifact.key)
-
-
-def test_missing_input_names_the_folder(tmp_path: Path) -> None:
-    with pytest.raises(ArtifactError, match="does not exist"):
-        ArtifactStore(tmp_path).run("count", 1, count, CountConfig(), {"episodes": tmp_path / "none"})
-
-
 def test_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
@@ -279,47 +263,31 @@ def test_two_commands_do_not_write_into_one_folder(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["run"]
 
 
-def make_lock_a_folder(step: Path, key: str) -> None:
-    (step / f".{key}.lock").mkdir(parents=True)
-
-
-def make_partial_a_file(step: Path, key: str) -> None:
-    step.mkdir(parents=True)
-    (step / f"{key}.partial").write_text("")
-
-
-def make_step_a_file(step: Path, key: str) -> None:
-    step.parent.mkdir()
-    step.write_text(key)
-
-
-def make_artifact_a_file(step: Path, key: str) -> None:
-    step.mkdir(parents=True)
-    (step / key).write_text("")
-
-
-def make_step_a_link(step: Path, key: str) -> None:
+def linked(step: Path, key: str) -> None:
     (step.parent.parent / key).mkdir()
     step.parent.mkdir()
     step.symlink_to(step.parent.parent / key, target_is_directory=True)
 
 
-def make_step_a_circle(step: Path, key: str) -> None:
-    step.mkdir(parents=True)
-    (step / key).symlink_to(step / key)
+def in_step(make: Callable[[Path, str], object]) -> Callable[[Path, str], None]:
+    def change(step: Path, key: str) -> None:
+        step.mkdir(parents=True)
+        make(step, key)
+
+    return change
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        make_lock_a_folder,
-        make_partial_a_file,
-        make_step_a_file,
-        make_artifact_a_file,
-        make_step_a_link,
-        make_step_a_circle,
-    ],
-)
+ODD = {
+    "a lock that is a folder": in_step(lambda step, key: (step / f".{key}.lock").mkdir()),
+    "unfinished work that is a file": in_step(lambda step, key: (step / f"{key}.partial").write_text("")),
+    "an artifact that is a file": in_step(lambda step, key: (step / key).write_text("")),
+    "a link to itself": in_step(lambda step, key: (step / key).symlink_to(step / key)),
+    "a step that is a file": lambda step, key: (step.parent.mkdir(), step.write_text(key)),
+    "a step that is a link": linked,
+}
+
+
+@pytest.mark.parametrize("make", ODD.values(), ids=ODD)
 def test_an_odd_store_ends_in_one_message(tmp_path: Path, make: Callable[[Path, str], None]) -> None:
     store = ArtifactStore(tmp_path / "store")
     make(store.root / "count", store.key("count", 1, CountConfig(), {}))

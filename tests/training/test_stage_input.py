@@ -107,48 +107,49 @@ def stage2(**changes: Any) -> Stage2Config:
     return Stage2Config.model_validate(values | changes)
 
 
+@pytest.fixture(scope="module")
+def teacher(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("teacher")
+    shape = {"image_size": [32, 32], "patch": 8, "hidden_size": 16, "num_layers": 4, "num_heads": 2}
+    config = {"shape": shape, "trainer": {**TRAINER, "steps": 2}, "clip_frames": 9, "held_out_episodes": 1}
+    train_teacher(TeacherConfig.model_validate(config), {"episodes": world.episodes}, folder)
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("forked_loaders")
 def test_stage2_goes_on_with_the_same_bytes(
-    world: Any, tokenizer: Path, first_stage: Path, tmp_path: Path, killed_after: Callable[[int], Any]
+    world: Any, tokenizer: Path, first_stage: Path, teacher: Path, tmp_path: Path, killed_after: Callable[[int], Any]
 ) -> None:
-    """Undisturbed in this process; killed and continued with a loader process: one checkpoint, to the byte."""
+    """Undisturbed in this process; killed twice and continued with a loader process: one checkpoint, to the byte."""
     inputs = {
-        "episodes": world.episodes,
-        "tokenizer": tokenizer,
-        "tracks": world.tracks,
-        "stage1": first_stage,
-    }
-    train_stage2(stage2(input=FRAMES), inputs, tmp_path / "whole")
-    ahead = stage2(input={**FRAMES, "workers": 1})
-    with killed_after(2):
-        train_stage2(ahead, inputs, tmp_path / "parts")
+        "episodes": world.episodes, "tokenizer": tokenizer, "tracks": world.tracks, "stage1": first_stage,
+        "teacher": teacher,
+    }  # fmt: skip
+    trainer = {**TRAINER, "steps": 14, "log_every": 3, "save_every_steps": 4}
+    config = stage2(input=FRAMES, trainer=trainer, relational={"ramp_steps": 5})
+    train_stage2(config, inputs, tmp_path / "whole")
+    ahead = config.model_copy(update={"input": config.input.model_copy(update={"workers": 1})})
+    for steps in (7, 6):  # the second part begins at the state of step 4: it repeats three steps and their log lines
+        with killed_after(steps):
+            train_stage2(ahead, inputs, tmp_path / "parts")
+    torch.rand(5)
     train_stage2(ahead, inputs, tmp_path / "parts")
     whole, parts = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "parts"))
     assert whole.keys() == parts.keys()
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
-    assert losses(tmp_path / "whole") == losses(tmp_path / "parts")
-    _, info = load_checkpoint(tmp_path / "parts", expect_kind="stage2")
-    assert "skipped_clips" not in info.metadata
-
-
-def test_resident_latents_train_the_same_bytes(world: Any, latents: Path, first_stage: Path, tmp_path: Path) -> None:
-    inputs = {"episodes": world.episodes, "latents": latents, "tracks": world.tracks, "stage1": first_stage}
-    for name, resident in (("read", False), ("resident", True)):
-        train_stage2(stage2(input={"kind": "latents", "resident": resident}), inputs, tmp_path / name)
-    read, resident = (load_file(tmp_path / name / "model.safetensors") for name in ("read", "resident"))
-    assert all(torch.equal(read[name], resident[name]) for name in read)
-    with pytest.raises(ValidationError, match="resident"):
-        stage2(input={"kind": "latents", "resident": True, "workers": 1})
+    logs = [(tmp_path / name / "metrics.jsonl").read_bytes() for name in ("whole", "parts")]
+    assert logs[0] == logs[1]
+    rows = [row for row in read_json_lines(tmp_path / "parts" / "metrics.jsonl") if "loss" in row]
+    assert [row["step"] for row in rows] == [3, 6, 9, 12, 14]
+    assert all(row["relational_intra"] > 0 for row in rows)
+    assert "skipped_clips" not in load_checkpoint(tmp_path / "parts", expect_kind="stage2")[1].metadata
 
 
 def test_the_teacher_is_shown_the_frames_that_were_read(
-    world: Any, tokenizer: Path, latents: Path, first_stage: Path, tmp_path: Path
+    world: Any, tokenizer: Path, latents: Path, first_stage: Path, teacher: Path, tmp_path: Path
 ) -> None:
-    shape = {"image_size": [32, 32], "patch": 8, "hidden_size": 16, "num_layers": 4, "num_heads": 2}
-    config = {"shape": shape, "trainer": {**TRAINER, "steps": 2}, "clip_frames": 9, "held_out_episodes": 1}
-    train_teacher(TeacherConfig.model_validate(config), {"episodes": world.episodes}, tmp_path / "teacher")
-    given = {"episodes": world.episodes, "tracks": world.tracks, "stage1": first_stage, "teacher": tmp_path / "teacher"}
+    given = {"episodes": world.episodes, "tracks": world.tracks, "stage1": first_stage, "teacher": teacher}
     found = []
     for name, values, source in (
         ("cached", {}, {"latents": latents}),
@@ -159,6 +160,16 @@ def test_the_teacher_is_shown_the_frames_that_were_read(
         found.append([(row["relational_intra"], row["relational_cross"]) for row in rows])
     for cached, online in zip(*found, strict=True):
         assert online == pytest.approx(cached, rel=5e-3)
+
+
+def test_resident_latents_train_the_same_bytes(world: Any, latents: Path, first_stage: Path, tmp_path: Path) -> None:
+    inputs = {"episodes": world.episodes, "latents": latents, "tracks": world.tracks, "stage1": first_stage}
+    for name, resident in (("read", False), ("resident", True)):
+        train_stage2(stage2(input={"kind": "latents", "resident": resident}), inputs, tmp_path / name)
+    read, resident = (load_file(tmp_path / name / "model.safetensors") for name in ("read", "resident"))
+    assert all(torch.equal(read[name], resident[name]) for name in read)
+    with pytest.raises(ValidationError, match="resident"):
+        stage2(input={"kind": "latents", "resident": True, "workers": 1})
 
 
 def test_a_damaged_recording_stops_the_run_or_is_counted_in_the_checkpoint(

@@ -84,25 +84,6 @@ def digested(folder: Path) -> dict[str, bytes]:
     }
 
 
-@pytest.mark.slow
-def test_a_killed_run_ends_with_the_same_bytes(
-    world: Any, stage1_folder: Path, teacher: Path, tmp_path: Path, killed_after: Callable[[int], Any]
-) -> None:
-    config = stage2(14, relational={"ramp_steps": 5})
-    inputs = {**world.inputs, "stage1": stage1_folder, "teacher": teacher}
-    train_stage2(config, inputs, tmp_path / "whole")
-    for steps in (7, 6):
-        with killed_after(steps):
-            train_stage2(config, inputs, tmp_path / "parts")
-    # The second part began at the state saved after step 4: it repeated three steps and their log lines.
-    torch.rand(5)
-    train_stage2(config, inputs, tmp_path / "parts")
-    assert digested(tmp_path / "parts") == digested(tmp_path / "whole")
-    rows = [row for row in read_json_lines(tmp_path / "parts" / "metrics.jsonl") if "loss" in row]
-    assert [row["step"] for row in rows] == [3, 6, 9, 12, 14]
-    assert all(row["relational_intra"] > 0 for row in rows)
-
-
 def test_a_state_of_another_run_or_other_episodes_is_refused(
     world: Any, stage1_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
