@@ -205,10 +205,34 @@ def write_policy_scores(folder: Path) -> None:
                 "method": method, "episode_id": f"e{number}", "seed": 42, "split": "test", "task_family": "lift", "outcome": outcome,
                 "predicted": outcome if number < right else wrong, "answers": 2, "malformed_answers": 0,
             })  # fmt: skip
-    write_json_atomic(
-        folder / "summary.json",
-        summarise_decisions(rows, resamples=200, seed=0) | {"judge": "measured", "shorter_than_recording": {}},
-    )
+    agreement = {
+        name: {"value": 0.91, "over_starts_and_policies": [0.7, 0.97]} for name in ("pearson", "spearman", "mmrv")
+    }
+    rates = {
+        "slow": {"attempts": 3, "recorded": 0.25, "predicted": None},
+        "quick": {"attempts": 3, "recorded": 0.75, "predicted": 0.5},
+    }
+    ranked = {**agreement, "rate_error": {"value": None, "over_starts_and_policies": None}, "policies": rates}
+    keys = "auroc", "calibration_error", "error", "error_of_marked", "error_of_others"
+    figures = {key: {"value": 0.61, "low": 0.5, "high": 0.72} for key in keys}
+    trusted = {
+        "available": True,
+        "verdicts": 10,
+        "marked": 2,
+        **figures,
+        "error_of_marked": {"value": None, "low": None, "high": None},
+    }
+    trust = {
+        "training_recordings": 55, "settings": {"novelty_level": 0.05, "least_trust": 0.6},
+        "methods": {"shipped_stage2": trusted, "stage2": {"available": False, "reason": "too few wrong verdicts"}},
+    }  # fmt: skip
+    more = {
+        "judge": "measured",
+        "shorter_than_recording": {},
+        "policies": {"shipped_stage2": {"all": ranked}},
+        "trust": trust,
+    }
+    write_json_atomic(folder / "summary.json", summarise_decisions(rows, resamples=200, seed=0) | more)
 
 
 def write_planning_scores(folder: Path) -> None:

@@ -50,11 +50,12 @@ def curated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("card")
     bad, frames = recorded(5, "bad", 1)
     bad.state[3, 2] = np.nan
+    moved = recorded(8, "", 0)[0].state
     sources = {
         "kitchen": [recorded(n, f"k{n}", n % 2, outcome=("success", "failure")[n % 2]) for n in range(4)],
         "lab": [
             recorded(1, "copy", 1), (bad, frames), recorded(7, "hostile", 7, instruction=HOSTILE),
-            recorded(0, "tested", 0, split="test", scene="hall", state=recorded(8, "", 0)[0].state),
+            recorded(0, "tested", 0, split="test", scene="hall", state=moved, action=moved),
         ],
     }  # fmt: skip
     listed = []

@@ -173,6 +173,14 @@ def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
     assert ", colour</th>" in found["quality"]  # by a second segmenter
     assert "recorded videos (ceiling)" in found["decisions"]
     assert re.search(r"0\.95</span>.*?0\.50.*?</td><td[^>]*>0\.95</td>", found["decisions"])
+    for cells in (
+        r"<th[^>]*>quick</th><td[^>]*>3</td><td[^>]*>0\.75</td>\s*<td[^>]*>0\.50</td>",  # a policy's rates, the best first
+        r"0\.91</span><span[^>]*>\[0\.70, 0\.97\]",
+        r"<td[^>]*>10</td><td[^>]*>2</td>\s*<td[^>]*><span[^>]*>0\.61</span><span[^>]*>\[0\.50, 0\.72\]",
+        "Not available for videos of Stage II \\(this run\\): too few wrong verdicts",
+        "farther from the training recordings than 95",
+    ):
+        assert re.search(cells, found["decisions"]), cells
     for points in re.findall(r'<polyline points="([^"]*)"', found["decisions"]):
         x = [float(point.partition(",")[0]) for point in points.split()]
         assert x == sorted(x)  # from few candidates to many

@@ -18,12 +18,7 @@ VALUE_WIDTH, ROW_HEIGHT = 70, 46
 
 @dataclass(frozen=True)
 class Series:
-    """One line: points, optionally an interval around each, and a colour class (`c0` .. `c7`).
-
-    Attributes:
-        faint: a raw curve behind its smoothed one: thin, pale, without an entry in the legend.
-        scatter: points alone, without a line; ``names`` say what each is.
-    """
+    """One line: points, optionally an interval around each, and a colour class (`c0` .. `c7`)."""
 
     label: str
     x: Sequence[float]
@@ -33,9 +28,6 @@ class Series:
     colour: str = "c0"
     dashed: bool = False
     markers: bool = False
-    faint: bool = False
-    scatter: bool = False
-    names: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -127,10 +119,9 @@ def line_chart(
     y_axis = Axis(*(y_range or _value_range(series, log_y)), HEIGHT - BOTTOM, TOP, log_y)
     rows = [(y_axis.at(v), percent(v) if in_percent else tick_label(v)) for v in y_axis.ticks()]
     columns = [(x_axis.at(v), tick_label(v)) for v in (x_axis.ticks(6) if x_ticks is None else x_ticks)]
-    legend = [item for item in series if not item.faint]
     return render_macro(
         "pages/charts.html", "lines", title=title, x_label=x_label, y_label=y_label, rows=rows, columns=columns,
-        lines=[_line(item, x_axis, y_axis) for item in series], legend=legend if len(legend) > 1 else [],
+        lines=[_line(item, x_axis, y_axis) for item in series], legend=series if len(series) > 1 else [],
         width=WIDTH, height=HEIGHT, left=LEFT, right=WIDTH - RIGHT, bottom=HEIGHT - BOTTOM,
     )  # fmt: skip
 
@@ -150,14 +141,10 @@ def _line(item: Series, x_axis: Axis, y_axis: Axis) -> dict[str, object]:
     if item.low is not None and item.high is not None and len(usable) > 1:
         band = " ".join(points(item.low) + points(item.high)[::-1])
     dots = [
-        (
-            x_axis.at(item.x[i]),
-            y_axis.at(item.y[i]),
-            f"{', '.join([item.label, *item.names[i : i + 1]])}: {tick_label(item.x[i])}, {item.y[i]:.4g}",
-        )
-        for i in (usable if item.markers or item.scatter or len(usable) == 1 else ())
+        (x_axis.at(item.x[i]), y_axis.at(item.y[i]), f"{item.label}: {tick_label(item.x[i])}, {item.y[i]:.4g}")
+        for i in (usable if item.markers or len(usable) == 1 else ())
     ]
-    line = " ".join(points(item.y)) if len(usable) > 1 and not item.scatter else ""
+    line = " ".join(points(item.y)) if len(usable) > 1 else ""
     return {"style": item, "line": line, "band": band, "dots": dots}
 
 

@@ -218,7 +218,7 @@ class _Subject:
             self.notes.append(f"no controls are shown: {error.what} ({error.where})")
             return
         sigma = SIGMA_PX_REFERENCE if recorded is None else recorded.sigma_px_ref
-        title = f"{episode_id}  ·  {title}  ·  {tracks.controls_label}"
+        title = f"{episode_id}  ·  {title}  ·  drawn: {tracks.controls_label}"
         self.picture(f"{stem}_controls", episode_overlay(self.episodes, position, tracks, sigma, title))
         if video:
             frames = {view: VideoFrames(self.episodes.clip(position, view)) for view in row.views}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from statistics import median
 
 from markupsafe import Markup
@@ -10,10 +9,9 @@ from markupsafe import Markup
 from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, metric_of
 from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.pages.charts import Dot, Series, interval_chart, line_chart
-from worldline_core.pages.page import Table, interval, number, percent, words
+from worldline_core.pages.page import Table, interval, render, words
 from worldline_core.report.context import (
     SPLIT_LABELS,
-    Method,
     ReportContext,
     Section,
     VideoScores,
@@ -33,21 +31,6 @@ QUALITY = (
     " exact: a segmenter's mask of the prediction against the recording's exact mask. Robot IoU, segmenter: the same segmenter"
     " masks the true and the predicted video independently of each other."
 )
-
-
-def method_table(
-    heading: str,
-    methods: list[Method],
-    columns: dict[str, Callable[[Method], object]],
-    caption: str = "",
-) -> Table:
-    """Methods in rows, a value of each in every column; ``{"mean", "low", "high"}`` is shown as a value with its interval."""
-
-    def shown(value: object) -> object:
-        return interval(value) if isinstance(value, dict) else number(value) if isinstance(value, float) else value
-
-    rows = [[m.long_label, *(shown(value_of(m)) for value_of in columns.values())] for m in methods]
-    return Table([heading, *columns], rows, range(1, len(columns) + 1), caption, dense=True)
 
 
 def quality_section(context: ReportContext) -> Section:
@@ -146,23 +129,11 @@ def block_costs(content: JsonObject) -> tuple[float, float] | None:
 
 def cost(context: ReportContext) -> Markup | None:
     """Time per frame and per block; a slot, because times differ from run to run."""
-    rows, devices = list[list[object]](), set[str]()
-    for name, path in context.variants("rollout").items():
-        content = read_json(path / "run" / "speed.json")
-        if content.get("seconds_per_frame") is None:
-            continue
-        blocks = block_costs(content)
-        times = (None, None) if blocks is None else (number(1000 * blocks[0], 0), number(blocks[1], 2))
-        label = method(name).long_label + (", candidate banks" if name.startswith("banks_") else "")
-        settings = [content.get(key) for key in ("steps", "dtype", "batch_size")]
-        rows.append([label, *settings, number(1000 * float(content["seconds_per_frame"]), 1), *times])
-        devices.add(str(content.get("device_name") or "unknown device"))
-    headings = "Method", "Steps", "Precision", "Batch", "ms per frame", "ms per block", "Last to first block"
-    caption = (
-        f"Wall time of predicting and decoding on {'; '.join(sorted(devices))}. A frame is one instant in all views. Steps: of a whole"
-        f" clip, or of a block for causal models. Last to first block: medians of {EDGE_BLOCKS} blocks each, sampling alone."
-    )
-    table = Table(headings, rows, range(1, len(headings)), caption).__html__()
+    timed = {name: read_json(path / "run" / "speed.json") for name, path in context.variants("rollout").items()}
+    timed = {name: content for name, content in timed.items() if content.get("seconds_per_frame") is not None}
+    rows = [(method(name), name.startswith("banks_"), content, block_costs(content)) for name, content in timed.items()]
+    devices = sorted({str(content.get("device_name") or "unknown device") for content in timed.values()})
+    table = render("report/cost.html", rows=rows, devices=devices, edge=EDGE_BLOCKS)
     return context.slot("cost", table, "Recorded when the report was made; see run/run.js.") if rows else None
 
 
@@ -181,164 +152,89 @@ def decisions_section(context: ReportContext) -> Section:
 
 def policy_evaluation(summary: JsonObject) -> dict[str, object]:
     """Values of one policy evaluation for the template."""
-    results = summary["methods"]
+    results, methods = summary["methods"], in_order(summary["methods"])
+    accuracy = {
+        m.name: {
+            group: share_interval(found["accuracy"]) for group, found in results[m.name].items() if "/" not in group
+        }
+        for m in methods
+    }
+    found_groups = {group for own in accuracy.values() for group in own}
+    groups = sorted(found_groups, key=lambda g: (g != ALL, g not in SPLIT_LABELS, g))
     dots = [
         Dot(m.long_label, found["mean"], found["low"], found["high"], m.colour)
-        for m in in_order(results)
-        if (found := share_interval(results[m.name].get(ALL, {}).get("accuracy")))
-    ]
+        for m in methods if (found := accuracy[m.name].get(ALL))
+    ]  # fmt: skip
     title = f"Accuracy over {summary.get('trajectories', '?')} trajectories (judge: {summary.get('judge', 'unknown')})"
     value_label = "agreement with the recorded outcome, 95 % interval"
+    trust = summary.get("trust")
     return {
+        "methods": methods,
+        "results": results,
+        "accuracy": accuracy,
+        "groups": groups,
+        "labels": [words(SPLIT_LABELS.get(group, group)).capitalize() for group in groups],
         "chart": interval_chart(dots, digits=2, value_label=value_label, title=title) if dots else None,
         "short": sorted((summary.get("shorter_than_recording") or {}).items()),
-        "groups": accuracy_table(results) if dots else None,
         "ranking": policy_ranking(summary["policies"]) if summary.get("policies") else None,
-        "trust": trust_view(summary["trust"]) if summary.get("trust") else None,
+        "trust": trust
+        and {**trust, "known": [m for m in predicting(trust["methods"]) if trust["methods"][m.name]["available"]]},
+        "unjudged": [m for m in predicting(trust["methods"]) if not trust["methods"][m.name]["available"]]
+        if trust
+        else [],
     }
-
-
-def accuracy_table(results: JsonObject) -> Table:
-    """Accuracy by split and by task family, the confusion of outcomes, and unreadable answers of the judge."""
-    found_groups = {group for values in results.values() for group in values if "/" not in group}
-    groups = sorted(found_groups, key=lambda g: (g != ALL, g not in SPLIT_LABELS, g))
-
-    def judged(right: str, wrong: str) -> Callable[[Method], str | None]:
-        def counted(m: Method) -> str | None:
-            counts = results[m.name].get(ALL, {}).get("confusion")
-            return f"{counts[right]} of {counts[right] + counts[wrong]}" if counts else None
-
-        return counted
-
-    columns: dict[str, Callable[[Method], object]] = {
-        words(SPLIT_LABELS.get(g, g)).capitalize(): lambda m, g=g: share_interval(
-            results[m.name].get(g, {}).get("accuracy")
-        )
-        for g in groups
-    }
-    columns["Successes judged a success"] = judged("true_success", "false_failure")
-    columns["Failures judged a failure"] = judged("true_failure", "false_success")
-    columns["Unreadable answers"] = lambda m: results[m.name].get(ALL, {}).get("malformed_answers", 0)
-    return method_table("Videos of", in_order(results), columns, "Accuracy by split and by task family, 95 % interval")
 
 
 def policy_ranking(policies: JsonObject) -> dict[str, object]:
-    """Recorded against predicted success rates of policies: the figure, their agreement, and every policy's rates."""
+    """Agreement of recorded and predicted success rates of policies, and every policy's rates."""
     methods = in_order(policies)
     rates = {m.name: policies[m.name][ALL]["policies"] for m in methods}
-    points = [
-        Series(
-            m.long_label, [p["recorded"] for p in rates[m.name].values()],
-            [p["predicted"] for p in rates[m.name].values()], colour=m.colour, scatter=True, names=list(rates[m.name]),
-        )
-        for m in methods if m.kind in MODELS
-    ]  # fmt: skip
-    chart = line_chart(
-        [*points, Series("equal", [0.0, 1.0], [0.0, 1.0], colour="c5", dashed=True)],
-        title="Success rate of every policy", x_label="as recorded", y_label="as predicted", y_range=(0.0, 1.02),
-        x_ticks=[0.0, 0.25, 0.5, 0.75, 1.0],
-    )  # fmt: skip
-
-    def agreement(key: str) -> Callable[[Method], object]:
-        def measured(m: Method) -> object:
-            found = policies[m.name][ALL][key]
-            bounds = found["over_starts_and_policies"]
-            return found["value"] if not bounds else {"mean": found["value"], "low": bounds[0], "high": bounds[1]}
-
-        return measured
-
-    measures = {"Pearson r": "pearson", "Spearman rho": "spearman", "MMRV": "mmrv", "Error of rates": "rate_error"}
-    caption = "Agreement over policies, 95 % interval over starts and policies"
-    recorded = rates[methods[0].name]
-
-    def predicted(policy: str) -> list[float | None]:
-        return [rates[m.name].get(policy, {}).get("predicted") for m in methods]
-
-    listed = [
-        [name, recorded[name]["attempts"]]
-        + [None if rate is None else number(float(rate)) for rate in (recorded[name]["recorded"], *predicted(name))]
-        for name in sorted(recorded, key=lambda name: -recorded[name]["recorded"])
-    ]
-    headings = ["Policy", "Attempts", "Recorded", *[m.long_label for m in methods]]
+    names = sorted(rates[methods[0].name], key=lambda name: -rates[methods[0].name][name]["recorded"])
     return {
-        "chart": chart,
-        "agreement": method_table("Videos of", methods, {name: agreement(k) for name, k in measures.items()}, caption),
-        "table": Table(headings, listed, range(1, len(headings)), "Success rates by policy", dense=True),
-    }
-
-
-def trust_view(trust: JsonObject) -> dict[str, object]:
-    """Detection of wrong verdicts by trust and by the marks."""
-    methods = trust["methods"]
-    known = [m for m in predicting(methods) if methods[m.name]["available"]]
-
-    def measured(key: str) -> Callable[[Method], object]:
-        def value_of(m: Method) -> object:
-            found = methods[m.name][key]
-            return found["value"] if found["low"] is None else {**found, "mean": found["value"]}
-
-        return value_of
-
-    figures = {
-        "AUROC": "auroc", "Calibration error": "calibration_error", "Wrong": "error",
-        "Wrong among marked": "error_of_marked", "Wrong among others": "error_of_others",
-    }  # fmt: skip
-    columns: dict[str, Callable[[Method], object]] = {
-        "Verdicts": lambda m: methods[m.name]["verdicts"],
-        "Marked": lambda m: methods[m.name]["marked"],
-        **{heading: measured(key) for heading, key in figures.items()},
-    }
-    caption = "Detection of wrong verdicts by trust (AUROC, 0.5 is chance) and by the marks, 95 % interval over starts"
-    return {
-        "recordings": trust["training_recordings"],
-        "within": percent(1.0 - trust["settings"]["novelty_level"]),
-        "least": percent(trust["settings"]["least_trust"]),
-        "unavailable": [(m.long_label, methods[m.name]["reason"]) for m in predicting(methods) if m not in known],
-        "table": method_table("Verdicts on videos of", known, columns, caption) if known else None,
+        "methods": methods,
+        "rates": rates,
+        "names": names,
+        "agreement": {m.name: policies[m.name][ALL] for m in methods},
     }
 
 
 def planning_evaluation(summary: JsonObject) -> dict[str, object]:
     """Values of one planning evaluation for the template."""
-    methods = summary["methods"]
+    methods, order = summary["methods"], in_order(summary["methods"])
     budgets = sorted({int(n) for values in methods.values() for n in values["budgets"]})
-    families = sorted({bank["task_family"] for bank in summary["banks"].values()})
-    x = [float(n) for n in budgets]
-
-    def success(m: Method, n: int) -> JsonObject | None:
-        found = methods[m.name]["budgets"].get(str(n))
-        return found and share_interval({"count": len(summary["banks"]), **found["success"]})
-
+    cases, x = {"count": len(summary["banks"])}, [float(n) for n in budgets]
+    success = {
+        m.name: {
+            n: share_interval({**cases, **methods[m.name]["budgets"][str(n)]["success"]})
+            for n in budgets if str(n) in methods[m.name]["budgets"]
+        }
+        for m in order
+    }  # fmt: skip
     series = [Series("direct execution", x, [summary["direct_execution"]["mean"]] * len(x), colour="c5", dashed=True)]
-    for m in in_order(methods):
-        found = {n: value for n in budgets if (value := success(m, n))}
+    for m in order:
         bounds = ("mean", "low", "high") if m.kind in MODELS else ("mean",)
-        values = [[value[key] for value in found.values()] for key in bounds]
-        series.append(Series(m.long_label, [*found], *values, colour=m.colour, dashed=m.group == "run", markers=True))
+        values = [[(value or {})[key] for value in success[m.name].values()] for key in bounds]
+        style = {"colour": m.colour, "dashed": m.group == "run", "markers": True}
+        series.append(Series(m.long_label, [*success[m.name]], *values, **style))
     chart = line_chart(
         series, title="Success of the chosen candidate, 95 % interval over banks", x_label="candidates N", y_label="success",
         log_x=True, x_ticks=x, in_percent=True, y_range=(0.0, 1.02),
     )  # fmt: skip
-
-    def by_family(m: Method, family: str) -> float | None:
-        values = methods[m.name]["by_family"].get(family)
-        return float(values[max(values, key=int)]["success"]) if values else None
-
+    families = sorted({bank["task_family"] for bank in summary["banks"].values()})
     most = f"N = {budgets[-1]}"
-    columns: dict[str, Callable[[Method], object]] = {
-        **{f"N = {n}": lambda m, n=n: (success(m, n) or {}).get("mean") for n in budgets[:-1]},
-        most: lambda m: success(m, budgets[-1]),
-        f"Gain at {most}": lambda m: interval(most_candidates(methods[m.name])["gain"], signed=True),
-        **{f"{words(family)}, {most}": lambda m, family=family: by_family(m, family) for family in families},
-    }
-    caption = f"Success of the choice over {len(summary['banks'])} banks by number of candidates and by task, and gain over direct execution"
+    headings = [f"N = {n}" for n in budgets] + [f"Gain at {most}"] + [f"{words(family)}, {most}" for family in families]
     return {
-        "banks": len(summary["banks"]),
-        "selector": summary.get("selector", "unknown"),
-        "direct": summary["direct_execution"],
-        "oracle": summary.get("oracle"),
+        "summary": summary,
+        "methods": order,
+        "success": success,
+        "gain": {m.name: most_candidates(methods[m.name])["gain"] for m in order},
+        "families": families,
+        "by_family": {
+            m.name: {f: v[max(v, key=int)] for f, v in methods[m.name]["by_family"].items() if v} for m in order
+        },
+        "budgets": budgets,
+        "headings": headings,
         "chart": chart,
-        "table": method_table("Chosen by videos of", in_order(methods), columns, caption),
     }
 
 

@@ -14,7 +14,7 @@ from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.evaluation.paired import EVALUATIONS
 from worldline_core.model.model_card import DESCRIPTIONS, model_card, model_facts
 from worldline_core.pages.charts import Series, line_chart
-from worldline_core.pages.page import Table, code, number, render, words
+from worldline_core.pages.page import Table, code, render, words
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.model_figures import measurements
 from worldline_core.store.artifact_files import JsonObject, read_json, read_json_lines
@@ -46,10 +46,9 @@ Curve = tuple[list[float], list[float]]
 
 
 def training_section(context: ReportContext) -> Section:
-    """Charts of every stage's losses and held-out errors, and a table of its first and last."""
+    """Charts of every stage's losses and held-out errors."""
     charts: list[Markup] = []
     missing: list[str] = []
-    rows: list[list[object]] = []
     for step, title in STAGES.items():
         variants = context.variants(step)
         if not variants and step != "train_tokenizer":
@@ -57,9 +56,7 @@ def training_section(context: ReportContext) -> Section:
         for variant, folder in variants.items():
             for phase, logged in read_phases(folder).items():
                 name = ", ".join(part for part in (title, variant, words(phase)) if part)
-                curves = read_curves(logged)
-                charts += stage_charts(name, curves)
-                rows.append(stage_row(name, curves))
+                charts += stage_charts(name, read_curves(logged))
     if not charts:
         return Section(
             "training", "Training", missing="no training stage was given (inputs train_stage1, train_stage2, ...)."
@@ -68,8 +65,7 @@ def training_section(context: ReportContext) -> Section:
         "This run's own training, from the base model on. Training loss: a running mean. Held-out losses always use"
         " the same clips, noise and noise levels, with the averaged weights."
     )
-    table = Table(("Stage", "Steps", "First loss", "Last loss", "Last held-out loss"), rows, range(1, 5))
-    return context.section("training", "Training", lead, missing=missing, table=table, charts=charts)
+    return context.section("training", "Training", lead, missing=missing, charts=charts)
 
 
 def read_phases(folder: Path) -> dict[str, list[JsonObject]]:
@@ -115,14 +111,6 @@ def smooth(steps: Sequence[float], values: Sequence[float]) -> Curve:
     return list(steps[::-every][::-1]), means[::-every][::-1].tolist()
 
 
-def stage_row(title: str, curves: Mapping[str, Curve]) -> list[object]:
-    """Name, number of steps, first and last smoothed loss, last held-out loss."""
-    steps, means = smooth(*curves["loss"]) if "loss" in curves else ([], [])
-    held_out = curves.get("validation/loss", ([], []))[1]
-    values = (next(iter(found), None) for found in (means, means[::-1], held_out[::-1]))
-    return [title, int(max(steps)) if steps else None, *(None if v is None else number(v, 4) for v in values)]
-
-
 def provenance_section(context: ReportContext) -> Section:
     """The models with their cards, and the origin of each artifact; times and versions are filled in when the page opens."""
     if not context.inputs:
@@ -143,7 +131,7 @@ def provenance_section(context: ReportContext) -> Section:
         "The same configuration on the same inputs gives the same digests.",
         models=Table(["Model", *map(str.capitalize, headings)], listed) if listed else None,
         artifacts=Table(("Artifact", "Digest", "Version", "Seeds"), rows, caption="Artifacts that this report shows"),
-        machine=context.slot("machine", render("report/machine.html", **machine_facts(manifests)), "See run/run.js."),
+        machine=context.slot("machine", render("report/machine.html", manifests=manifests), "See run/run.js."),
         configs={
             name: escape(json.dumps(manifest["config"], indent=2, sort_keys=True, ensure_ascii=False))  # uncut
             for name, manifest in manifests.items()
@@ -170,24 +158,3 @@ def written_card(context: ReportContext, name: str, folder: Path) -> str:
     text = model_card(folder, measurements(folder, evaluations))
     write_bytes_atomic(context.output / "cards" / f"{safe_stem(name)}.md", text.encode())
     return text.partition("\n---\n")[2]
-
-
-def machine_facts(manifests: Mapping[str, JsonObject]) -> dict[str, object]:
-    """Machines, packages, and wall time and commit by artifact."""
-    machines: set[str] = set()
-    packages: set[str] = set()
-    rows: list[list[object]] = []
-    for name, manifest in manifests.items():
-        environment = manifest.get("environment") or {}
-        packages |= {f"{package} {version}" for package, version in (environment.get("packages") or {}).items()}
-        machines |= {
-            ", ".join(f"{key} {environment[key]}" for key in ("platform", "cpu_count", "python") if key in environment)
-        }
-        seconds, commit = manifest.get("wall_seconds"), environment.get("git_commit")
-        shown = None if seconds is None else number(float(seconds), 1)
-        rows.append([name, shown, manifest.get("finished_at"), code(commit) if commit else None])
-    return {
-        "machines": "; ".join(sorted(machines - {""})),
-        "packages": ", ".join(sorted(packages)),
-        "times": Table(("Artifact", "Seconds", "Finished", "Commit"), rows, [1]),
-    }
