@@ -24,6 +24,7 @@ import numpy as np
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment_report import bare_mjcf, bare_urdf
 from worldline_core.geometry.kinematic_tree import parse_xml
+from worldline_core.geometry.link_surfaces import spread
 from worldline_core.store.atomic import write_bytes_atomic
 
 ROUND_TRIP_TOLERANCE = 1e-9
@@ -149,7 +150,7 @@ def _known(model: Any, name: str) -> bool:
 
 
 def kinematics_text(model: mujoco.MjModel, name: str, keep: set[str]) -> str:
-    """MJCF text of the kept bodies and sites of a compiled model.
+    """MJCF text of the kept bodies and sites of a compiled model, with some spheres on their surfaces.
 
     Raises:
         DataError: the model has no body or site of a name to keep.
@@ -168,7 +169,8 @@ def kinematics_text(model: mujoco.MjModel, name: str, keep: set[str]) -> str:
             kept.add(body)
             body = int(model.body_parentid[body])
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "hinge", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
-    lines = [f'<mujoco model="{name}">', '  <compiler angle="radian" autolimits="true"/>', "  <worldbody>"]
+    lines = [f'<mujoco model="{name}">', '  <compiler angle="radian" autolimits="true"/>']
+    lines += ['  <default><geom type="sphere" contype="0" conaffinity="0"/></default>', "  <worldbody>"]
 
     def emit(body: int, depth: int) -> None:
         """Joints and sites of a body, then its children."""
@@ -180,6 +182,11 @@ def kinematics_text(model: mujoco.MjModel, name: str, keep: set[str]) -> str:
                 limits = f' range="{_numbers(model.jnt_range[joint])}"' if model.jnt_limited[joint] else ""
                 axis = _numbers(model.jnt_axis[joint])
                 lines.append(f'{pad}<joint name="{model.joint(joint).name}" type="{kind}"{pos} axis="{axis}"{limits}/>')
+        for points, radii in _surface(model, body):
+            lines.extend(
+                f'{pad}<geom pos="{_numbers(np.round(point, 4))}" size="{radius:.3g}"/>'
+                for point, radius in zip(points, radii, strict=True)
+            )
         lines.extend(
             f'{pad}<site name="{site}" pos="{_numbers(model.site_pos[s])}" quat="{_numbers(model.site_quat[s])}"/>'
             for site, s in sites.items()
@@ -196,6 +203,19 @@ def kinematics_text(model: mujoco.MjModel, name: str, keep: set[str]) -> str:
 
     emit(0, 2)
     return "\n".join([*lines, "  </worldbody>", "</mujoco>", ""])
+
+
+def _surface(model: mujoco.MjModel, body: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Spheres on the surface of a body's meshes, in the body's frame: where they are large, they are far apart."""
+    parts = []
+    for geom in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
+        mesh = model.geom_dataid[geom]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+            start, turn = model.mesh_vertadr[mesh], np.zeros(9)
+            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+            vertices = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].astype(np.float64)
+            parts.append(vertices @ turn.reshape(3, 3).T + model.geom_pos[geom])
+    return [spread(np.concatenate(parts))] if parts else []
 
 
 def _numbers(values: Any) -> str:

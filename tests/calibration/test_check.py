@@ -243,7 +243,7 @@ def test_the_repaired_side_draws_each_image_with_its_own_tools(
     conventions = RecordedConventions(camera_lag_frames=lags[0], image_lag_frames=lags[1])
     # Image i of the healthy episode has the grey value 10 i.
     numbered = np.repeat(10 * np.arange(24, dtype=np.uint8), 60 * 80 * 3).reshape(24, 60, 80, 3)
-    late = numbered[corrupted_image_frames(episode.num_frames, conventions)]
+    late = numbered[corrupted_image_frames(episode.num_frames, conventions, "right_wrist")]
     drawn: list[tuple[int, np.ndarray]] = []
 
     def shown(tracks: EpisodeTracks, n: int) -> np.ndarray:

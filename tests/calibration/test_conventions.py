@@ -179,13 +179,13 @@ def test_lags_keep_states_cameras_and_images_together(
     healthy = replace(healthy, state=state, cameras=cameras, video_frames=video_frames)
     images = marks[: healthy.num_video_frames]
     spoiled = corrupt(healthy, conventions)
-    spoiled_images = images[corrupted_image_frames(COUNT, conventions)]
+    spoiled_images = images[corrupted_image_frames(COUNT, conventions, "head")]
     both = min(len(spoiled_images), spoiled.num_frames)
     offset = spoiled.state[:, 0] - spoiled.cameras["left_wrist"].T_base_camera[:, 0, 3]
     assert (offset == camera_lag).all()
     assert (spoiled.state[:both, 0] - spoiled_images[:both] == image_lag).all()
     repaired = apply_conventions(spoiled, conventions)
-    kept = spoiled_images[image_frames(spoiled.num_frames, conventions)]
+    kept = spoiled_images[image_frames(spoiled.num_frames, conventions, "head")]
     assert repaired.num_video_frames == len(kept)
     assert np.array_equal(repaired.state[:, 0], repaired.cameras["left_wrist"].T_base_camera[:, 0, 3])
     assert np.array_equal(repaired.state[: len(kept), 0], kept)

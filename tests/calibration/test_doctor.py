@@ -132,7 +132,7 @@ def test_poses_without_pictures_still_show_what_poses_can_show(healthy: list) ->
     spoiled = corrupt(item.poses, RecordedConventions(quaternion="wxyz"))
     diagnosis = diagnose(spoiled, {}, None)
     assert diagnosis.best.mistake == "quaternion"
-    assert any("too few to compare motion" in note for note in diagnosis.notes)
+    assert all("too few to compare motion" in why for why in diagnosis.not_judged.values())
 
 
 def test_images_of_a_wrong_kind_are_refused(healthy: list) -> None:

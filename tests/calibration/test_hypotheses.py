@@ -15,7 +15,7 @@ from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.calibration import calibration_doctor
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.check import ListedEpisode, check_command, repairing_lines
-from worldline_core.calibration.check_report import table_text
+from worldline_core.calibration.check_report import table_text, verdict_text
 from worldline_core.calibration.diagnosis import Diagnosis, diagnose_source
 from worldline_core.data.episodes.conventions import RecordedConventions, along_tool_z
 from worldline_core.data.episodes.episode import Episode
@@ -49,6 +49,11 @@ def agibot(shared_data: Path, layout: str) -> list[LoadedEpisode]:
     root = shared_data / layout
     source = AgibotGesimSource(AgibotGesimSourceConfig(path=root, fps=30), root)
     return [source.load(name) for name in source.episode_ids()]
+
+
+def pictures_of(item, conventions: RecordedConventions) -> dict[str, np.ndarray]:
+    count = item.joints.num_frames
+    return {v: gray[corrupted_image_frames(count, conventions, v)] for v, gray in item.gray.items()}
 
 
 def pictures(loaded: LoadedEpisode) -> dict[str, np.ndarray]:
@@ -123,8 +128,7 @@ def test_inverse_and_late(healthy: list, late: str) -> None:
     item = of_robot(healthy, "xarm7")
     lags = {"cameras": (3, 0), "images": (0, 3), "states": (-3, -3)}[late]
     conventions = INVERSE.model_copy(update={"camera_lag_frames": lags[0], "image_lag_frames": lags[1]})
-    images = corrupted_image_frames(item.joints.num_frames, conventions)
-    gray = {view: values[images] for view, values in item.gray.items()}
+    gray = pictures_of(item, conventions)
     diagnosis = diagnose(corrupt(item.joints, conventions), gray, item.kinematics)
     assert (diagnosis.verdict, diagnosis.best.conventions) == ("explained", conventions)
     together = diagnose_source("source", [diagnosis] * 2)
@@ -172,3 +176,53 @@ def test_two_errors_at_once_are_judged(healthy: list, first: dict, second: Recor
     spoiled = corrupt(item.joints, RecordedConventions(**first))
     spoiled = with_exchanged_extrinsics(spoiled) if second is None else corrupt(spoiled, second)
     assert diagnose(spoiled, item.gray, item.kinematics, quick=True).verdict != "consistent"
+
+
+def lively(item, kind: str) -> str:
+    """The head, or the wrist view that changes most."""
+    views = [view for view in item.gray if view.endswith(kind)]
+    return max(views, key=lambda view: np.abs(np.diff(item.gray[view].astype(float), axis=0)).sum())
+
+
+@pytest.mark.parametrize(("robot", "frames"), [("ur5e", 2), ("xarm7", -2), ("viperx", 3)])
+def test_the_delay_of_one_camera_is_its_own(healthy: list, robot: str, frames: int) -> None:
+    item = of_robot(healthy, robot)
+    lag = RecordedConventions(image_lag_frames=frames, views=("head",))
+    diagnosis = diagnose(corrupt(item.joints, lag), pictures_of(item, lag), item.kinematics)
+    assert (diagnosis.verdict, diagnosis.best.conventions) == ("explained", lag)
+    assert (
+        diagnose(corrupt(item.joints, lag), pictures_of(item, lag), item.kinematics, quick=True).best == diagnosis.best
+    )
+
+
+def test_a_lag_at_the_edge_of_the_search_explains_nothing(healthy: list) -> None:
+    item = of_robot(healthy, "ur5e")
+    lag = RecordedConventions(image_lag_frames=6)
+    diagnosis = diagnose(corrupt(item.joints, lag), pictures_of(item, lag), item.kinematics)
+    assert diagnosis.verdict == "unexplained"
+    assert diagnose_source("source", [diagnosis] * 3).verdict == "unexplained"
+    assert any("at the edge of what is tried" in note for note in diagnosis.notes)
+
+
+@pytest.mark.parametrize("kind", ["head", "wrist"])
+@pytest.mark.parametrize("begins", [0, 10])
+@pytest.mark.parametrize("quick", [True, False])
+def test_a_frozen_video_is_no_consistent_one(healthy: list, kind: str, begins: int, quick: bool) -> None:
+    item = of_robot(healthy, "ur5e")
+    view = lively(item, kind)
+    frozen = item.gray[view].copy()
+    frozen[begins:] = frozen[begins]
+    diagnosis = diagnose(item.joints, {**item.gray, view: frozen}, item.kinematics, quick=quick)
+    assert diagnosis.verdict == "unexplained"
+    assert f"{view}: its pictures stay the same while its arm moves" in diagnosis.notes
+    together = diagnose_source("source", [diagnosis] * 3)
+    assert (together.verdict, together.not_judged) == ("unexplained", diagnosis.not_judged)
+    assert (view in together.not_judged) == (begins == 0)
+
+
+def test_what_no_picture_judges_is_printed_as_such(healthy: list) -> None:
+    item = of_robot(healthy, "ur5e")
+    few = {**item.gray, "head": item.gray["head"][:1]}
+    diagnosis = diagnose(item.joints, few, item.kinematics)
+    assert diagnosis.not_judged == {"head": "1 pictures are too few to compare motion with"}
+    assert verdict_text(diagnosis).endswith("; not judged: head")

@@ -36,8 +36,10 @@ def written(folder: Path, shipped: EpisodeSet, conventions: RecordedConventions)
         for name in IDS:
             position = shipped.position(name)
             healthy = shipped.episode(position)
-            images = corrupted_image_frames(healthy.num_frames, conventions)
-            frames = {view: shipped.frames(position, view)[images] for view in shipped.rows[position].views}
+            frames = {
+                view: shipped.frames(position, view)[corrupted_image_frames(healthy.num_frames, conventions, view)]
+                for view in shipped.rows[position].views
+            }
             writer.add(corrupt(healthy, conventions), frames)
 
 

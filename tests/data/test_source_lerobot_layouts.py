@@ -27,6 +27,8 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
 
 K = [[60.0, 0.0, 63.5], [0.0, 62.0, 35.5], [0.0, 0.0, 1.0]]
 POSE = [[1.0, 0.0, 0.0, 0.1], [0.0, 0.0, 1.0, -0.4], [0.0, -1.0, 0.0, 1.3], [0.0, 0.0, 0.0, 1.0]]
@@ -195,6 +197,28 @@ def test_a_calibration_file_beside_the_dataset_is_used(tmp_path: Path, preset: A
     assert np.allclose(cameras["left_wrist"].T_base_camera, moving)
     assert np.allclose(cameras["right_wrist"].T_base_camera, np.asarray(POSE)[None])
     assert curated.rows[0].stage2_ok
+
+
+@pytest.mark.parametrize(("robot", "reason"), [("ur5e_silver", None), ("piper_pair", "missing_calibration")])
+def test_a_wrist_camera_may_be_where_the_robot_mounts_it(
+    tmp_path: Path, preset: Any, robot: str, reason: str | None
+) -> None:
+    write_robocoin(tmp_path / "raw")
+    mounted = {key: value for key, value in calibration().items() if key not in ("T", "maps", "axes")}
+    mounted["mount"] = "embodiment"
+    views = {"head": calibration(), "left_wrist": mounted, "right_wrist": mounted}
+    write_calibration(tmp_path / "raw", views, "calibration.yaml")
+    source = preset(
+        "robocoin", tmp_path / "raw", collection=False, calibration="meta/calibration.yaml", embodiment=robot
+    )
+    if reason is not None:
+        with pytest.raises(DataError, match=reason):
+            run(tmp_path, source)
+        return
+    episode = run(tmp_path, source)[1].episode(0)
+    poses = ArmKinematics(load_embodiment(robot)).wrist_camera_poses(episode.state.astype(np.float64))
+    for view in ("left_wrist", "right_wrist"):
+        assert np.allclose(episode.cameras[view].T_base_camera, poses[view], atol=1e-6)
 
 
 def test_calibration_may_be_a_file_an_episode_and_name_a_lens(tmp_path: Path, preset: Any) -> None:

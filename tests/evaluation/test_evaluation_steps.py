@@ -3,6 +3,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEvaluationConfig, VideoEvaluationConfig
@@ -17,6 +19,7 @@ from worldline_core.evaluation.planning import evaluate_planning as outcomes
 from worldline_core.evaluation.planning.evaluate_planning import CHOICES_FILE, SEALED_FILE, evaluate_planning
 from worldline_core.evaluation.policy.evaluate_policy import choose_trajectories, evaluate_policy
 from worldline_core.evaluation.policy.evidence import SCHEMAS, MotionEvidence, Reconciliation
+from worldline_core.evaluation.video import evaluate_video as evaluate_video_module
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
 from worldline_core.evaluation.vlm import Part, Text
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
@@ -40,6 +43,25 @@ def evaluated(recordings, tmp_path_factory):
     folder = tmp_path_factory.mktemp("evaluated")
     assert evaluate_video(VIDEO, recordings.inputs, folder)["methods"] == ["copy", "good"]
     return folder
+
+
+@pytest.mark.parametrize(
+    ("floor", "camera", "reason"),
+    [(-1.0, "static", None), (0.7, "static", r"box_arm: its masks .* by 0\.\d\d \(of"), (-1.0, "absent", "unchecked")],
+)
+def test_a_segmenter_without_exact_masks_is_measured_first(
+    recordings, tmp_path, monkeypatch, floor: float, camera: str, reason: str | None
+) -> None:
+    monkeypatch.setattr(EpisodeSet, "robot_masks", lambda *_: None)
+    monkeypatch.setattr(evaluate_video_module, "MIN_SEGMENTER_IOU", floor)
+    tracks = ActionTracks.tracks
+    monkeypatch.setattr(ActionTracks, "tracks", lambda self, i: replace(tracks(self, i), camera_motion=(camera,) * 3))
+    evaluate_video(VIDEO, recordings.inputs, tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    frames = set(pq.read_table(tmp_path / "by_frame.parquet")["metric"].to_pylist())
+    assert ("robot_iou_kinematic" in frames) == (camera == "static")
+    assert ("robot_iou" in frames) == ("robot_iou" in summary["metrics"]["test"]["good"]) == (reason is None)
+    assert reason is None or re.search(reason, summary["unavailable"]["robot_iou"])
 
 
 def test_video_metrics_prefer_the_right_videos(evaluated):

@@ -64,10 +64,10 @@ def corrupt(episode: Episode, conventions: RecordedConventions) -> Episode:
     return shift(episode, _backwards(conventions))
 
 
-def corrupted_image_frames(num_frames: int, conventions: RecordedConventions) -> slice:
-    """Which images of a healthy episode belong to the frames of `corrupt(episode, conventions)`, in order."""
+def corrupted_image_frames(num_frames: int, conventions: RecordedConventions, view: str) -> slice:
+    """Which images of a healthy episode's view belong to the frames of `corrupt(episode, conventions)`, in order."""
     first, last = frames_with_all(num_frames, _backwards(conventions))
-    return slice(first - conventions.image_lag_frames, last - conventions.image_lag_frames)
+    return slice(first - conventions.image_lag(view), last - conventions.image_lag(view))
 
 
 def _backwards(conventions: RecordedConventions) -> RecordedConventions:

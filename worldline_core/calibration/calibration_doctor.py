@@ -15,6 +15,7 @@ import numpy as np
 from worldline_core.calibration.camera_errors import estimate_camera_errors
 from worldline_core.calibration.diagnosis import (
     COMPLEXITY,
+    MAX_LAG_FRAMES,
     MIN_MARGIN,
     SUSPICION,
     TERM_LIMITS,
@@ -26,7 +27,9 @@ from worldline_core.calibration.diagnosis import (
 )
 from worldline_core.calibration.evidence import (
     MIN_IMAGE_PAIRS,
+    WORST_TERM,
     finger_flow,
+    frozen_views,
     gripper_terms,
     hand_eye_log_likelihood,
     image_terms,
@@ -46,7 +49,6 @@ from worldline_core.geometry.transforms import rigid_inverse
 
 PAIRED_MISTAKES = 4
 """Number of the best single mistakes that are also tried in pairs."""
-MAX_LAG_FRAMES = 6
 MIN_TRAVEL_M = 0.02
 """A tool that moves less over the episode leaves no trace of a mistake."""
 EXCHANGED_DOUBT = 3.0
@@ -94,8 +96,11 @@ def diagnose(
         notes = (f"The recording has no {missing}: nothing can be compared",)
         return Diagnosis(verdict="too_little_evidence", notes=notes, episode_id=name)
     search = _Search(observation, recorded)
+    silent = not_judged(observation)
     if quick and (unsuspicious := search.unsuspicious()) is not None:
-        diagnosis = Diagnosis(verdict="consistent", best=unsuspicious, ranked=(unsuspicious,), episode_id=name)
+        diagnosis = Diagnosis(
+            verdict="consistent", best=unsuspicious, ranked=(unsuspicious,), episode_id=name, not_judged=silent
+        )
         return diagnosis.with_camera_errors(estimate_camera_errors(observation, recorded))
     as_recorded = search.as_recorded
     notes = notes_on(observation, recorded)
@@ -107,6 +112,9 @@ def diagnose(
         if bad_terms(ranked[0], as_recorded):
             ranked = sorted([*ranked, *search.other_robots()], key=lambda e: -e.score)
     verdict, best, rivals = decide(as_recorded, ranked)
+    if ranked[0].lag_at_edge and verdict == "unexplained":
+        notes = (*notes, f"{ranked[0].text}: at the edge of what is tried; the lag may be larger")
+    notes = (*notes, *(f"{view}: its pictures stay the same while its arm moves" for view in search.frozen))
     if rivals:
         notes = (*notes, f"These explain it equally well, nothing recorded tells which: {'; '.join(rivals)}")
     if best.other is not None:
@@ -119,7 +127,13 @@ def diagnose(
         notes = (*notes, "No tool moves and no picture changes: a mistake would leave no trace")
     nearest = nearest_texts(ranked, as_recorded) if verdict == "unexplained" else ()
     diagnosis = Diagnosis(
-        verdict=verdict, best=best, ranked=tuple(ranked), notes=notes, nearest=nearest, episode_id=name
+        verdict=verdict,
+        best=best,
+        ranked=tuple(ranked),
+        notes=notes,
+        nearest=nearest,
+        episode_id=name,
+        not_judged=silent,
     )
     reading = search.read(best.conventions) if best.other is None else None
     return diagnosis if reading is None else diagnosis.with_camera_errors(estimate_camera_errors(observation, reading))
@@ -130,6 +144,7 @@ class _Search:
 
     def __init__(self, observation: Observation, recorded: Reading) -> None:
         self.observation, self.recorded = observation, recorded
+        self.frozen = frozen_views(observation, recorded)
         self.recorded_poses = pose_terms(observation, recorded)
 
     def terms(self, reading: Reading, poses: Mapping[str, float] | None = None) -> dict[str, float]:
@@ -138,6 +153,7 @@ class _Search:
             **(pose_terms(self.observation, reading) if poses is None else poses),
             **image_terms(self.observation, reading),
             **gripper_terms(self.observation, reading),
+            **dict.fromkeys((f"frozen {view}" for view in self.frozen), WORST_TERM),
         }
 
     def explain(self, reading: Reading, terms: dict[str, float], other: tuple[str, str] | None = None) -> Explanation:
@@ -153,6 +169,8 @@ class _Search:
     def unsuspicious(self) -> Explanation | None:
         """The recording as written if no cheap evidence speaks against it, else None."""
         observation = self.observation
+        if self.frozen:
+            return None
         images = image_terms(observation, self.recorded, wrist_flow=False)
         found = self.explain(self.recorded, {**self.recorded_poses, **images})
         if min(self.recorded_poses.values(), default=0.0) < SUSPICION or bad_terms(found):
@@ -162,10 +180,10 @@ class _Search:
             as_written, other = (gripper_terms(observation, reading) for reading in (self.recorded, inverted))
             if sum(other.values()) > sum(as_written.values()):
                 return None
-        score = sum(images.values())
         for lag in image_lags(observation):
             other = image_terms(observation, self.recorded.with_image_lag(lag), wrist_flow=False)
-            if sum(other.values()) > score:
+            gains = [_of_view(other, view) - _of_view(images, view) for view in self.recorded.cameras]
+            if sum(other.values()) > sum(images.values()) or max(gains) > MIN_MARGIN:
                 return None
         return None if self.fits_exchanged_wrists(images) else found
 
@@ -193,8 +211,23 @@ class _Search:
         tried = map(self.read, conventions_to_try(self.observation, self.recorded))
         found = [self.in_views_that_improve(reading) for reading in tried if reading is not None]
         lagging = [self.recorded.with_image_lag(lag) for lag in image_lags(self.observation)]
-        found += [self.explain(late, self.terms(late, self.recorded_poses)) for late in lagging]
+        found += [each for late in lagging for each in self.lags_by_view(late)]
         return [*found, *self.exchanged_wrist_cameras()]
+
+    def lags_by_view(self, late: Reading) -> Iterator[Explanation]:
+        """A lag of all pictures, and of those views alone whose own pictures fit better with it."""
+        terms, written = self.terms(late, self.recorded_poses), self.as_recorded.evidence
+        yield self.explain(late, terms)
+        views = [view for view in late.cameras if view in self.observation.gray]
+        better = [view for view in views if _of_view(terms, view) > _of_view(written, view)]
+        clearly = [view for view in better if _of_view(terms, view) > _of_view(written, view) + 1.0]
+        for chosen in dict.fromkeys([*((view,) for view in better), tuple(clearly)]):
+            if not chosen or len(chosen) == len(views):
+                continue
+            own = tuple(f" {view}" for view in chosen)
+            merged = {name: terms[name] if name.endswith(own) else value for name, value in written.items()}
+            conventions = late.conventions.model_copy(update={"views": chosen})
+            yield self.explain(replace(late, conventions=conventions), merged)
 
     def exchanged_wrist_cameras(self) -> Iterator[Explanation]:
         """Two wrist cameras with each other's poses, or each other's videos."""
@@ -215,9 +248,15 @@ class _Search:
             yield from self.as_written(observation, (name, "exchanged"))
 
     def as_written(self, observation: Observation, other: tuple[str, str]) -> Iterator[Explanation]:
-        """The reading of another observation as written; none where no tool poses are known."""
+        """The reading of another observation as written; none where no tool poses are known.
+
+        That no video is frozen in it is no gain: the picture of an arm that rests stays the same.
+        """
         if (reading := read(observation, RecordedConventions())) is not None:
-            yield self.explain(reading, _Search(observation, reading).terms(reading), other)
+            search = _Search(observation, reading)
+            found = self.explain(reading, search.terms(reading), other)
+            thawed = max(0, len(self.frozen) - len(search.frozen))
+            yield replace(found, score=found.score + WORST_TERM * thawed)
 
     def other_robots(self) -> Iterator[Explanation]:
         """The recording as written, with the other robots that have the same arms, if it has joints.
@@ -243,12 +282,8 @@ class _Search:
         terms, written = self.terms(reading), self.as_recorded.evidence
         if reading.conventions.departures[0] not in _CAMERA_FIELDS:
             return self.explain(reading, terms)
-
-        def of_view(evidence: Mapping[str, float], view: str) -> float:
-            return sum(value for name, value in evidence.items() if name.endswith(f" {view}"))
-
         views = list(reading.cameras)
-        better = tuple(view for view in views if of_view(terms, view) > of_view(written, view) + 1.0)
+        better = tuple(view for view in views if _of_view(terms, view) > _of_view(written, view) + 1.0)
         if not better or len(better) == len(views):
             return self.explain(reading, terms)
         others = tuple(f" {view}" for view in views if view not in better)
@@ -298,6 +333,11 @@ class _Search:
             yield RecordedConventions(image_lag_frames=late)
         if offset := tool_offset(self.observation, undone):
             yield RecordedConventions(tool_offset_z_m=round(offset, 4))
+
+
+def _of_view(evidence: Mapping[str, float], view: str) -> float:
+    """Sum of the terms of a view."""
+    return sum(value for name, value in evidence.items() if name.endswith(f" {view}"))
 
 
 def _together(one: RecordedConventions, two: RecordedConventions) -> RecordedConventions | None:
@@ -435,6 +475,22 @@ def tool_offset(observation: Observation, recorded: Reading) -> float | None:
     return offset if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None
 
 
+def not_judged(observation: Observation) -> dict[str, str]:
+    """By calibrated view, why its pictures say nothing about its camera."""
+    found = {}
+    for view, camera in observation.episode.cameras.items():
+        count = len(observation.gray.get(view, ()))
+        if count <= MIN_IMAGE_PAIRS:
+            found[view] = f"{count} pictures are too few to compare motion with"
+        elif view in observation.wrists and not camera.moving:
+            found[view] = "its camera has one pose, though its hand moves"
+        elif view not in observation.wrists and not observation.stands_still(view):
+            found[view] = "its camera moves, and no hand carries it"
+        elif not observation.motion(view).moves:
+            found[view] = "its pictures do not change"
+    return found
+
+
 def notes_on(observation: Observation, recorded: Reading) -> tuple[str, ...]:
     """Limits of the evidence, and other facts for a person."""
     notes = []
@@ -449,10 +505,6 @@ def notes_on(observation: Observation, recorded: Reading) -> tuple[str, ...]:
                 f"{view}: the camera poses follow the commands ({1e3 * commands_m:.1f} mm), "
                 f"not the states ({1e3 * states_m:.1f} mm)"
             )
-    for view in recorded.cameras:
-        count = len(observation.gray.get(view, ()))
-        if count <= MIN_IMAGE_PAIRS:
-            notes.append(f"{view}: {count} pictures, too few to compare motion with; judged by poses alone")
     if recorded.gripper is None:
         notes.append("gripper: the state names no gripper columns, polarity is not judged")
     for i, arm in enumerate(observation.arms if recorded.gripper is not None else ()):

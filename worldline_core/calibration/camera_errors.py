@@ -1,9 +1,8 @@
-"""Errors of each camera (rotation, place, focal length, principal point, lag), estimated with their uncertainty.
+"""Errors of each camera (rotation, place, focal length, lag), estimated together with their uncertainty.
 
 In a fixed view the arms' projected motion is laid over the measured motion; in a wrist view the flow of the scene that the
-camera's own motion predicts, at free depths, is compared with the measured one. Both give normal equations of the
-PARAMETERS. Each kind of error is estimated as if it were the only one, because several look alike in pictures; the kind
-that explains most is named.
+camera's own motion predicts, at free depths, is compared with the measured one. Both give normal equations of all
+PARAMETERS at once, because several kinds of error look alike in pictures: what nothing tells apart, the bounds show.
 
 Axis legend: n steps, r c rows and columns of cells, m cells in one row, p points on the robot, k parameters.
 """
@@ -12,19 +11,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 
-from worldline_core.calibration.evidence import MIN_CHANGE, MIN_TEXTURE, observable_views
-from worldline_core.calibration.observation import CELL_PX, Motion, Observation, Reading, cell_centres, cell_means
+from worldline_core.calibration.evidence import MIN_CHANGE, MIN_IMAGE_PAIRS, MIN_TEXTURE, observable_views
+from worldline_core.calibration.observation import (
+    CELL_PX,
+    Motion,
+    Observation,
+    Reading,
+    cell_centres,
+    cell_means,
+    measured_motion,
+)
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import project_points
 from worldline_core.geometry.transforms import lengths, rigid_inverse
 
-PARAMETERS = 10
-"""Rotation and translation of the camera in its own frame [rad, m] (3 + 3), relative focal length (1), principal point in
-shares of the image's sides (2), frames by which the pictures trail (1)."""
+PARAMETERS = 8
+"""Rotation and translation of the camera in its own frame [rad, m] (3 + 3), relative focal length (1), frames by which the
+pictures trail (1)."""
+LAG = PARAMETERS - 1
 NUISANCE_PRIOR = np.array([0.3, 0.5, 0.5])
 """Standard deviations of the nuisance parameters: thickness of the links, factors on the predicted flow and change."""
 EDGE_CELLS = 0.35
@@ -37,54 +46,50 @@ DEPTH_START_PER_M, MOST_PER_M, DEPTH_PRIOR = 4.0, 15.0, np.array([4.0, 20.0, 20.
 """Inverse depth of the scene before a wrist camera: a plane, its value in the middle and its slopes (priors)."""
 FLOW_ERROR_PX, FLOW_ERROR_SHARE, FAINT_EDGE = 0.5, 0.1, 20.0
 HAND_MARGIN_CELLS = 2.0
+MOST_CELLS_A_STEP = 10.0
+"""Cells of one step share its errors (of depth, of a fast motion's flow): more of them say no more."""
 LEAST_INFORMATION = 1e-20
 """A parameter that a resting camera cannot show is bounded by its prior alone."""
-_STEPS = np.array([0.01] * 3 + [0.0] * 3 + [0.02, 0.02, 0.02, 0.25])
+_STEPS = np.array([0.01] * 3 + [0.0] * 3 + [0.02, 0.25])
+"""Differences by which a wrist view's slopes are measured; its camera's place on the hand hardly shows."""
 HAND_REACH_M = 0.2
-COARSE_CELLS, FINE_CELLS = 1.5, 0.7
-"""Blur of the maps, in cells."""
-SHAPE_UNKNOWN = 12.0
-"""Factor on the uncertainty of the robot's shape without joints: the arm behind the hand is unknown."""
-DEVIATIONS_ALONE, DEVIATIONS_TOGETHER = 5.0, 3.0
+BLURS_FAR, BLURS = (2.5, 2.5, 1.2, 1.2, 0.7, 0.7), (0.7, 0.7)
+"""Blur of the maps in cells, one solution after another: from far away, and near."""
+FAR = 12.0
+"""Square of the first step, in variances, from which the search begins on coarse maps."""
+ESTIMATED_AT_HZ = 8.0
+"""Faster recordings are thinned: from frame to frame an arm moves less than flow can measure."""
+SCALE = np.array([180 / np.pi] * 3 + [1e3] * 3 + [1e2, 1.0])
+PRIOR_DEVIATION = np.array([0.35] * 3 + [0.3] * 3 + [0.2, 2.0])
+LARGEST_STEP = np.array([0.12] * 3 + [0.15] * 3 + [0.1, 1.0])
+SHARED_MESHES, SHARED_CAPSULES, SHARED_HAND, SHARED_WRIST = 0.4, 8.0, 24.0, 0.5
+"""Variance that more episodes do not reduce, in variances of one episode: with the robot's surface, with capsules along its
+links, with tools alone, and of a wrist view (flow of a close scene). From healthy recordings of other worlds, docs/calibration.md."""
+DEVIATIONS_ALONE, DEVIATIONS_TOGETHER = 6.0, 3.5
 """Standard deviations from zero of a significant error, of one episode and of a source."""
-SIMILAR_GAIN = 0.5
-"""Kinds of error with at least this share of the best gain are indistinguishable."""
+ALIKE = 25.0
+"""Kinds of error whose remaining squares are this near explain the pictures as well."""
+LEFT_OVER = 20.0
+"""Squares that one kind of error may leave; above, several kinds are off at once."""
 OUTLIER_DEVIATIONS = 3.0
-"""An episode this many standard deviations from the others has half its weight."""
+"""An episode this many standard deviations from the others has half its weight; at twice that it contradicts them."""
+KINDS = {"rotation": (slice(0, 3), "deg"), "translation": (slice(3, 6), "mm"),
+         "focal length": (slice(6, 7), "%"), "lag": (slice(7, 8), "frames")}  # fmt: skip
+"""Parameters and unit of each kind."""
+_PRIOR = np.diag((PRIOR_DEVIATION * SCALE) ** -2.0)
 
 
 @dataclass(frozen=True, eq=False)
-class CameraError:
-    """One kind of error of one camera, estimated as the only one: the change that makes its pictures fit best.
+class KindOfError:
+    """One kind of a camera's error, whatever the other kinds are: estimate (k,) in `unit` and its covariance (k, k)."""
 
-    Attributes:
-        kind: one of ERROR_KINDS; rotation and translation in the camera's own frame.
-        estimate: (k,) in `unit` (% of the focal length, or of the image's sides).
-        information: (k, k) of the estimate.
-        gain: log-likelihood of the pictures with it, less that of the recording as written.
-        prior, shared: standard deviations before any evidence, and of the error that more episodes do not reduce.
-    """
-
-    view: str
     kind: str
     unit: str
     estimate: np.ndarray
-    information: np.ndarray
-    gain: float
-    prior: float
-    shared: float
+    covariance: np.ndarray
 
     def __str__(self) -> str:
-        return f"{self.view} {self.kind} {self.size:.1f} ± {self.half_interval:.1f} {self.unit}"
-
-    @property
-    def posterior(self) -> np.ndarray:
-        """(k, k) information with that of the prior."""
-        return self.information + np.eye(len(self.estimate)) / self.prior**2
-
-    @property
-    def covariance(self) -> np.ndarray:
-        return np.linalg.inv(self.posterior) + self.shared**2 * np.eye(len(self.estimate))
+        return f"{self.kind} {self.size:.1f} ± {self.half_interval:.1f} {self.unit}"
 
     @property
     def size(self) -> float:
@@ -92,22 +97,92 @@ class CameraError:
 
     @property
     def half_interval(self) -> float:
-        """Half of the 95 % interval of the size."""
-        along = self.estimate / max(self.size, 1e-12)
-        return 1.96 * float(np.sqrt(along @ self.covariance @ along))
+        """Half of the 95 % interval of the size; of a vector, of its end in any direction."""
+        return self._deviations_95 * float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
 
     @property
     def bound(self) -> float:
-        """Upper bound (95 %) of an error in any direction that can have gone unseen."""
-        return self.size + 1.96 * float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+        """Upper bound (95 %) of an error that can have gone unseen."""
+        return self.size + self.half_interval
+
+    @property
+    def _deviations_95(self) -> float:
+        return {1: 1.96, 2: 2.45, 3: 2.80}[len(self.estimate)]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraError:
+    """The error of one camera, all kinds at once: the change that makes its pictures fit best.
+
+    Attributes:
+        solved: (8,) in the units of KINDS, rotation and translation in the camera's own frame: the best with `information`.
+        information: (8, 8) of the pictures, summed over `episodes`.
+        shared: variance that more episodes do not reduce, in variances of one episode.
+        shown: (2, 8) displacement of the robot in the picture by each parameter [% of the width]; None in a wrist view.
+        contradicting: number of episodes whose own estimates are beyond their bounds from the common one.
+    """
+
+    view: str
+    solved: np.ndarray
+    information: np.ndarray
+    shared: float
+    shown: np.ndarray | None = None
+    episodes: int = 1
+    contradicting: int = 0
+
+    @cached_property
+    def posterior(self) -> np.ndarray:
+        """(8, 8) information with that of the prior, where the shared variance is part of every measurement's."""
+        return self.information / (1 + self.episodes * self.shared) + _PRIOR
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        return np.linalg.inv(self.posterior)
+
+    @cached_property
+    def estimate(self) -> np.ndarray:
+        """(8,) in the units of KINDS: `solved`, drawn to zero where little is known."""
+        pull = (self.information + _PRIOR) @ self.solved / (1 + self.episodes * self.shared)
+        return np.linalg.solve(self.posterior, pull)
+
+    @cached_property
+    def kinds(self) -> tuple[KindOfError, ...]:
+        """Each kind whatever the others are; beside them where it moves the robot in the picture, if that is known."""
+        parts = [(name, unit, np.eye(PARAMETERS)[part]) for name, (part, unit) in KINDS.items()]
+        if self.shown is not None:
+            parts.append(("in the picture", "% of the width", self.shown))
+        return tuple(KindOfError(n, u, A @ self.estimate, A @ self.covariance @ A.T) for n, u, A in parts)
+
+    @property
+    def squares(self) -> float:
+        """Squared distance from no error, in standard deviations."""
+        return float(self.estimate @ self.posterior @ self.estimate)
 
     @property
     def deviations(self) -> float:
         """Number of standard deviations of a normal variable that is as unlikely as this estimate without an error."""
-        distance = self.estimate @ np.linalg.solve(self.covariance, self.estimate)
         from scipy.special import chdtrc, ndtri  # scipy.stats takes a second to import, this a third
 
-        return 0.0 - float(ndtri(max(float(chdtrc(len(self.estimate), distance)), 1e-300) / 2))
+        return 0.0 - float(ndtri(max(float(chdtrc(PARAMETERS, self.squares)), 1e-300) / 2))
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The kinds of which each alone explains the estimate about as well; all that differ from zero if none does."""
+        weight = self.posterior
+        pull, left = weight @ self.estimate, {}
+        for name, (part, _) in KINDS.items():
+            left[name] = self.squares - float(pull[part] @ np.linalg.solve(weight[part, part], pull[part]))
+        best = min(left.values())
+        if best <= LEFT_OVER:
+            return tuple(name for name in left if left[name] <= best + ALIKE)
+        return tuple(each.kind for each in self.kinds if each.kind in KINDS and each.size > each.half_interval)
+
+    def __str__(self) -> str:
+        named = [str(each) for each in self.kinds if each.kind in self.named]
+        seen = [
+            f"{each.size:.1f} ± {each.half_interval:.1f} {each.unit}" for each in self.kinds if each.kind not in KINDS
+        ]
+        return f"{self.view} {' or '.join(named) or 'in several ways'}{''.join(f' ({each})' for each in seen)}"
 
 
 @dataclass(frozen=True)
@@ -126,7 +201,6 @@ def moved_camera(camera: CameraTrack, theta: np.ndarray) -> CameraTrack:
     change[:3, 3] = theta[3:6]
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= 1 + theta[6]
-    K[:2, 2] += theta[7:9] * (camera.width, camera.height)
     return replace(camera, K=K, T_base_camera=camera.T_base_camera @ change)
 
 
@@ -139,21 +213,20 @@ class StillView:
         change = np.log1p(np.maximum(motion.change - NOISE_CHANGE, 0.0))
         self.measured = np.concatenate([motion.flow, change[..., None]], axis=-1).astype(np.float32)
         self._by_blur: dict[float, np.ndarray] = {}
-        self._maps: dict[tuple[bytes, int, int], tuple[np.ndarray, ...]] = {}
+        self._maps: dict[bytes, tuple[np.ndarray, ...]] = {}
 
-    def equations(self, theta: np.ndarray, blur: float, wanted: slice = slice(PARAMETERS)) -> Equations:
-        """Normal equations of the `wanted` parameters, zero for the others."""
-        parameters, size = np.arange(PARAMETERS)[wanted], PARAMETERS + 1
-        key = theta.tobytes(), wanted.start, wanted.stop
+    def equations(self, theta: np.ndarray, blur: float) -> Equations:
+        """Normal equations at `theta`, on maps with this blur [cells]."""
+        size, key = PARAMETERS + 1, theta.tobytes()
         if key not in self._maps:  # the start is evaluated with more than one blur
-            self._maps[key] = self._predicted(theta, parameters)
+            self._maps[key] = self._predicted(theta)
         value, shift, growth, cover = self._maps[key]
         if blur not in self._by_blur:
             self._by_blur[blur] = _blurred(self.measured, blur)
         measured, value = self._by_blur[blur], _blurred(value, blur)
         active = (cover > 0.1) | (np.abs(measured).max(axis=-1) > 0.3)
         down, across = np.gradient(value, axis=(1, 2))
-        columns = np.append(parameters, PARAMETERS)
+        columns = np.arange(size)
         information, gradient, likelihood = np.zeros((size + 2, size + 2)), np.zeros(size + 2), 0.0
         for gain_index, channels in ((size, (0, 1)), (size + 1, (2,))):
             predicted, seen = value[..., channels], measured[..., channels]
@@ -181,22 +254,26 @@ class StillView:
         samples = SAMPLE_CELLS_STILL
         return _without_nuisance(Equations(information / samples, gradient / samples, likelihood / samples))
 
-    def _predicted(
-        self, theta: np.ndarray, wanted: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Maps in cells: motion (n, r, c, 3), shift by each of k wanted parameters and the links' thickness
+    def shown(self, theta: np.ndarray) -> np.ndarray:
+        """(2, k) mean displacement of the robot in the picture by each parameter [% of the width]; none by the lag."""
+        _, _, ahead, slope = _projected(self.points, moved_camera(self.camera, theta))
+        mean = slope[ahead].mean(axis=0) if ahead.any() else np.zeros((2, LAG))
+        return 100 / self.camera.width * np.c_[mean, np.zeros(2)]
+
+    def _predicted(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Maps in cells: motion (n, r, c, 3), shift by each of k parameters and the links' thickness
         (n, r, c, 2, k + 1) [cells], growth of the step by each parameter (n, r, c, 2, k) [px], cover (n, r, c)."""
         camera = moved_camera(self.camera, theta)
         uv, depth, ahead, slope = _projected(self.points, camera)
-        uv = _delayed(uv, float(theta[9]))
+        uv = _delayed(uv, float(theta[LAG]))
         step = np.diff(uv, axis=0)
         length = lengths(step)
         alive = ahead[1:] & ahead[:-1] & (length > STILL_STEP_PX)
         kept = (length * alive).max(axis=0) > MIN_STEP_PX
         count, (rows, columns) = len(step), self.measured.shape[1:3]
         value, cover = np.zeros((count, rows, columns, 3), np.float32), np.zeros((count, rows, columns), np.float32)
-        shift = np.zeros((count, rows, columns, 2, len(wanted) + 1), np.float32)
-        growth = np.zeros((count, rows, columns, 2, len(wanted)), np.float32)
+        shift = np.zeros((count, rows, columns, 2, PARAMETERS + 1), np.float32)
+        growth = np.zeros((count, rows, columns, 2, PARAMETERS), np.float32)
         if not kept.any():  # nothing of the robot moves before such a camera
             return value, shift, growth, cover
         step, length, alive = step[:, kept].astype(np.float32), length[:, kept].astype(np.float32), alive[:, kept]
@@ -204,8 +281,8 @@ class StillView:
         reach = (camera.K[0, 0] * self.radii[kept] / depth[:-1, kept] / CELL_PX).astype(np.float32)
         faster = np.gradient(step, axis=0) if len(step) > 1 else 0 * step
         slope = slope[:, kept]
-        moves = np.concatenate([(slope[:-1] + slope[1:]) / 2, -step[..., None]], axis=-1)[..., wanted]
-        grows = np.concatenate([np.diff(slope, axis=0), -faster[..., None]], axis=-1)[..., wanted]
+        moves = np.concatenate([(slope[:-1] + slope[1:]) / 2, -step[..., None]], axis=-1)
+        grows = np.concatenate([np.diff(slope, axis=0), -faster[..., None]], axis=-1)
         # A cell takes from the points near it their step, and how the parameters move the step's start and change the step.
         # Where several points meet, the fastest one counts most.
         weight = (length + 0.1) ** 2
@@ -240,7 +317,7 @@ class StillView:
             cover[i] = covered
             value[i, ..., :2] = covered[..., None] * motion
             value[i, ..., 2] = covered * np.log1p(np.minimum(lengths(motion), LONGEST_STEP_PX))
-            shift[i, ..., :-1], growth[i] = found[..., 1 : 1 + len(wanted)], found[..., 1 + len(wanted) :]
+            shift[i, ..., :-1], growth[i] = found[..., 1 : 1 + PARAMETERS], found[..., 1 + PARAMETERS :]
         return value, shift, growth, cover
 
 
@@ -251,10 +328,10 @@ def _projected(points: np.ndarray, camera: CameraTrack) -> tuple[np.ndarray, np.
     ahead = seen[..., 2] > NEAR_M
     depth = np.where(ahead, seen[..., 2], 1.0)
     x, y = seen[..., 0] / depth, seen[..., 1] / depth
-    f, g, none, one = K[0, 0], K[1, 1], np.zeros_like(x), np.ones_like(x)
+    f, g, none = K[0, 0], K[1, 1], np.zeros_like(x)
     uv = np.stack([f * x + K[0, 2], g * y + K[1, 2]], axis=-1)
-    u = [f * x * y, -f * (1 + x * x), f * y, -f / depth, none, f * x / depth, f * x, camera.width * one, none]
-    v = [g * (1 + y * y), -g * x * y, -g * x, none, -g / depth, g * y / depth, g * y, none, camera.height * one]
+    u = [f * x * y, -f * (1 + x * x), f * y, -f / depth, none, f * x / depth, f * x]
+    v = [g * (1 + y * y), -g * x * y, -g * x, none, -g / depth, g * y / depth, g * y]
     return uv, depth, ahead, np.stack([np.stack(u, axis=-1), np.stack(v, axis=-1)], axis=-2)
 
 
@@ -303,7 +380,8 @@ class WristView:
         shows &= ~_covered(camera, hand, radii, shows.shape)
         step, row, column = np.nonzero(shows)
         self.step, self.flow = step, motion.flow[step, row, column].astype(np.float64)
-        _, self._first, self._of = np.unique(step, return_index=True, return_inverse=True)
+        _, self._first, self._of, count = np.unique(step, return_index=True, return_inverse=True, return_counts=True)
+        self.share = np.minimum(1.0, MOST_CELLS_A_STEP / count)[self._of]
         self.uv = cell_centres(camera.height, camera.width)[row, column]
         across = (self.uv - ((camera.width - 1) / 2, (camera.height - 1) / 2)) / camera.width
         self.plane = np.c_[np.ones(len(step)), across]
@@ -314,9 +392,10 @@ class WristView:
         error_px = FLOW_ERROR_PX + FLOW_ERROR_SHARE * lengths(self.flow)
         self.certainty = sharp.astype(np.float64) / error_px[:, None, None] ** 2
 
-    def equations(self, theta: np.ndarray, blur: float, wanted: slice = slice(PARAMETERS)) -> Equations:
-        """Normal equations of the `wanted` parameters, zero for the others; flow is not blurred."""
-        columns = np.arange(PARAMETERS)[wanted]
+    def equations(self, theta: np.ndarray, blur: float) -> Equations:
+        """Normal equations at `theta`; flow is not blurred."""
+        del blur
+        columns = np.flatnonzero(_STEPS)
         information, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
         if len(self.step) < MIN_CELLS:
             return Equations(information, gradient, 0.0)
@@ -327,7 +406,6 @@ class WristView:
             fitted = self._per_step(by_depth, weight, error[..., None])[1]
             depth = np.clip(depth + (self.plane * fitted[self._of, :, 0]).sum(-1), 0.0, MOST_PER_M)
         error, by_depth, weight, distance = self._errors(seen, depth)
-        columns = columns[_STEPS[columns] > 0]
         both = np.empty((*self.flow.shape, len(columns) + 1))
         both[..., -1] = error
         now = self._flow(seen, depth)
@@ -341,7 +419,7 @@ class WristView:
         found /= SAMPLE_CELLS_WRIST
         information[np.ix_(columns, columns)] = found[:-1, :-1] + LEAST_INFORMATION * np.eye(len(columns))
         gradient[columns] = found[:-1, -1]
-        return Equations(information, gradient, -float(np.log1p(distance).sum()) / SAMPLE_CELLS_WRIST)
+        return Equations(information, gradient, -float(self.share @ np.log1p(distance)) / SAMPLE_CELLS_WRIST)
 
     def _errors(
         self, seen: tuple[np.ndarray, np.ndarray], depth: np.ndarray
@@ -351,7 +429,7 @@ class WristView:
         slope = (self._flow(seen, depth + 0.5) - now) / 0.5
         error = self.flow - now
         distance = (error * (self.certainty @ error[..., None])[..., 0]).sum(-1)
-        return error, slope, self.certainty / (1 + distance)[:, None, None], distance
+        return error, slope, self.certainty * (self.share / (1 + distance))[:, None, None], distance
 
     def _per_step(self, by_depth: np.ndarray, weight: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Projections (s, 3, l) of values (m, 2, l) on each step's plane of inverse depths, and the fitted planes."""
@@ -364,9 +442,9 @@ class WristView:
     def _seen(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Homogeneous pixels (m, 3) of the cells' rays after the step, and their motion by a unit of inverse depth (m, 3)."""
         camera = moved_camera(self.camera, theta)
-        moves = theta[[0, 1, 2, 3, 4, 5, 9]].tobytes()  # the others change K alone
+        moves = theta[[0, 1, 2, 3, 4, 5, LAG]].tobytes()  # the other changes K alone
         if moves not in self._steps:
-            self._steps[moves] = _steps_between(camera.T_base_camera, float(theta[9]))
+            self._steps[moves] = _steps_between(camera.T_base_camera, float(theta[LAG]))
         turns, places = self._steps[moves]
         turned = camera.K @ turns @ np.linalg.inv(camera.K)
         pixels = np.c_[self.uv, np.ones(len(self.uv))]
@@ -401,143 +479,85 @@ def _covered(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: 
     return hidden[1:] | hidden[:-1]
 
 
-@dataclass(frozen=True)
-class ErrorKind:
-    """One kind of error.
-
-    Attributes:
-        unit, scale: unit of all that follows, and its factor from radians, metres or shares.
-        prior: standard deviation of each parameter before any evidence.
-        usual: typical error of a camera that was bumped or badly calibrated.
-        linear, near: beyond `linear` the equations are solved again at the estimate, beyond `near` on coarse maps first.
-        shared_still, shared_wrist: standard deviation of the error common to all episodes of a source, because the robot's
-            shape is simplified and flow is measured too short.
-        off_alone, off_together: smallest size to be reported, of one episode and of all episodes of a source.
-    """
-
-    parameters: slice
-    unit: str
-    scale: float
-    prior: float
-    usual: float
-    linear: float
-    near: float
-    shared_still: float
-    shared_wrist: float
-    off_alone: float
-    off_together: float
-
-    def solved(self, equations: Equations, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Information (k, k) on these parameters, and the step (k,) to their best values."""
-        prior = (self.scale / self.prior) ** 2
-        information = equations.information[self.parameters, self.parameters]
-        gradient = equations.gradient[self.parameters] - prior * theta[self.parameters]
-        return information, np.linalg.solve(information + prior * np.eye(len(gradient)), gradient)
-
-
-ERROR_KINDS = {
-    "rotation": ErrorKind(slice(0, 3), "deg", 180 / np.pi, 15.0, 3.0, 1.2, 1.5, 0.35, 1.5, 3.5, 1.25),
-    "translation": ErrorKind(slice(3, 6), "mm", 1e3, 300.0, 30.0, 25.0, 30.0, 10.0, 50.0, 80.0, 25.0),
-    "focal length": ErrorKind(slice(6, 7), "%", 1e2, 30.0, 5.0, 0.7, 4.0, 0.5, 4.0, 9.0, 2.2),
-    "principal point": ErrorKind(slice(7, 9), "%", 1e2, 20.0, 2.0, 2.0, 2.5, 0.7, 3.0, 7.0, 2.0),
-    "lag": ErrorKind(slice(9, 10), "frames", 1.0, 3.0, 1.0, 0.3, 0.3, 0.08, 0.2, 0.6, 0.3),
-}
-
-
 def estimate_camera_errors(observation: Observation, reading: Reading) -> tuple[CameraError, ...]:
-    """The estimated error of each kind for every view whose pictures show it, under one reading of the conventions."""
-    states, images = reading.steps(observation.num_images)
-    frames, pictures = slice(states.start, states.stop + 1), slice(images.start, images.stop + 1)
+    """The estimated error of every view whose pictures show it, under one reading of the conventions."""
+    shared = {"surfaces": SHARED_MESHES, "capsules": SHARED_CAPSULES, "hands": SHARED_HAND}[reading.shape]
+    every = max(1, round(observation.episode.fps / ESTIMATED_AT_HZ))
     found: list[CameraError] = []
     for view in observable_views(observation):
-        camera, motion = reading.cameras[view], observation.motion(view)
-        motion = Motion(motion.flow[images], motion.change[images], motion.texture[images])
+        states, images = reading.steps(observation.num_images, view)
+        frames = slice(states.start, states.stop + 1, every)
+        gray, camera = observation.gray[view][images.start : images.stop + 1 : every], reading.cameras[view]
+        if len(gray) <= MIN_IMAGE_PAIRS:
+            continue
+        if every == 1:
+            motion = observation.motion(view)
+            motion = Motion(motion.flow[images], motion.change[images], motion.texture[images])
+        else:
+            motion = measured_motion(gray)
         points = reading.points[frames]
         if view not in observation.wrists:
-            shape = 1.0 if reading.whole_arms else SHAPE_UNKNOWN
-            found += _estimate(view, StillView(camera, points, reading.radii, motion), shape)
+            found.append(_estimate(view, StillView(camera, points, reading.radii, motion), shared, every))
         elif camera.moving:
             tool = reading.tools[frames, None, observation.wrists[view], :3, 3]
             near = np.median(np.linalg.norm(points - tool, axis=-1), axis=0) < HAND_REACH_M
             camera = replace(camera, T_base_camera=camera.T_base_camera[frames])
-            hand, radii = points[:, near], reading.radii[near]
-            found += _estimate(view, WristView(camera, observation.gray[view][pictures], motion, hand, radii))
+            evidence = WristView(camera, gray, motion, points[:, near], reading.radii[near])
+            found.append(_estimate(view, evidence, SHARED_WRIST, every))
     return tuple(found)
 
 
-def _estimate(view: str, evidence: StillView | WristView, shape: float = 1.0) -> list[CameraError]:
-    """The errors of one view; `shape` is a factor on the uncertainty of the robot's shape in a fixed view.
-
-    Where an error is large, the equations are solved again at the corrected camera.
-    """
-    start = np.zeros(PARAMETERS)
-    fine, coarse, found = evidence.equations(start, FINE_CELLS), None, []
-    for name, kind in ERROR_KINDS.items():
-        information, change = kind.solved(fine, start)
-        if not information.any():
-            continue
-        theta, last = start.copy(), fine
-        blurs = (FINE_CELLS, FINE_CELLS)
-        if np.linalg.norm(change) * kind.scale > kind.near:
-            coarse = coarse or evidence.equations(start, COARSE_CELLS)
-            _, change = kind.solved(coarse, start)
-            blurs = (COARSE_CELLS, *blurs)
-        for blur in blurs:
-            size = max(float(np.linalg.norm(change)) * kind.scale, 1e-9)
-            if size < kind.linear:
-                break
-            theta[kind.parameters] += change * min(1.0, 2 * kind.prior / size)
-            last = evidence.equations(theta, blur, kind.parameters)
-            information, change = kind.solved(last, theta)
-        estimate = (theta[kind.parameters] + change) * kind.scale
-        shared = kind.shared_wrist if isinstance(evidence, WristView) else kind.shared_still * shape
-        gain = last.likelihood - fine.likelihood + float(change @ information @ change) / 2
-        information = information / kind.scale**2
-        found.append(CameraError(view, name, kind.unit, estimate, information, gain, kind.prior, shared))
-    return found
+def _estimate(view: str, evidence: StillView | WristView, shared: float, every: int) -> CameraError:
+    """The error of one view whose pictures are `every` frames apart."""
+    prior = np.diag(PRIOR_DEVIATION**-2.0)
+    theta = np.zeros(PARAMETERS)
+    start = equations = evidence.equations(theta, BLURS[-1])
+    change = np.linalg.solve(equations.information + prior, equations.gradient)
+    far = float(change @ equations.gradient) > FAR
+    for blur in BLURS_FAR if far else BLURS:
+        equations = evidence.equations(theta, blur)
+        change = np.linalg.solve(equations.information + prior, equations.gradient - prior @ theta)
+        theta = theta + change / max(1.0, float(np.abs(change / LARGEST_STEP).max()))
+    last = evidence.equations(theta, BLURS[-1])
+    if last.likelihood < start.likelihood:  # the search lost its way: the linear answer at the start is kept
+        last, theta = start, np.linalg.solve(start.information + prior, start.gradient)
+    scale = np.append(SCALE[:-1], every)
+    shown = evidence.shown(theta) / scale if isinstance(evidence, StillView) else None
+    return CameraError(view, theta * scale, last.information / np.outer(scale, scale), shared, shown)
 
 
 def combine(episodes: Sequence[Sequence[CameraError]]) -> tuple[CameraError, ...]:
     """Errors of a source's cameras from those of its episodes; outliers count less, and scatter widens the interval."""
-    groups: dict[tuple[str, str], list[CameraError]] = {}
+    groups: dict[str, list[CameraError]] = {}
     for error in (error for errors in episodes for error in errors):
-        groups.setdefault((error.view, error.kind), []).append(error)
+        groups.setdefault(error.view, []).append(error)
     found = []
-    for members in groups.values():
-        estimates, weights = np.stack([m.estimate for m in members]), np.stack([m.posterior for m in members])
-        total, mean = weights.sum(axis=0), np.median(estimates, axis=0)
-        apart, trust = np.zeros(len(members)), np.ones(len(members))
+    for view, members in groups.items():
+        estimates, weights = np.stack([m.estimate for m in members]), np.stack([m.information for m in members])
+        bounds = np.stack([m.posterior for m in members])
+        pulls = np.einsum("eij,ej->ei", weights + _PRIOR, np.stack([m.solved for m in members]))
+        mean, trust, apart = np.median(estimates, axis=0), np.ones(len(members)), np.zeros(len(members))
+        total = weights.sum(axis=0)
         for _ in range(3):
-            apart = np.einsum("ei,eij,ej->e", estimates - mean, weights, estimates - mean) / len(mean)
+            apart = np.einsum("ei,eij,ej->e", estimates - mean, bounds, estimates - mean) / PARAMETERS
             trust = 1 / (1 + apart / OUTLIER_DEVIATIONS**2)
             total = np.einsum("e,eij->ij", trust, weights)
-            mean = np.linalg.solve(total, np.einsum("e,eij,ej->i", trust, weights, estimates))
+            mean = np.linalg.solve(total + _PRIOR, trust @ pulls)
         scatter = max(1.0, float((trust * apart).sum() / max(trust.sum() - 1, 1.0)))
-        together = replace(members[0], estimate=mean, information=total / scatter)
-        found.append(replace(together, gain=together.deviations**2 / 2))
+        mean = np.linalg.solve(total / scatter + _PRIOR, trust @ pulls / scatter)
+        shown = None if members[0].shown is None else np.mean([m.shown for m in members if m.shown is not None], axis=0)
+        contradicting = int((apart * PARAMETERS > (2 * OUTLIER_DEVIATIONS) ** 2).sum())
+        shared = max(m.shared for m in members)
+        found.append(CameraError(view, mean, total / scatter, shared, shown, len(members), contradicting))
     return tuple(found)
 
 
 def significant(errors: Sequence[CameraError], *, together: bool = False) -> tuple[CameraError, ...]:
-    """At most one certain and large error for each view: among the kinds that explain its pictures about equally well, the
-    smallest against its usual size. `together`: the errors are those of a source, not of one episode."""
-    found: dict[str, list[CameraError]] = {}
-    deviations = DEVIATIONS_TOGETHER if together else DEVIATIONS_ALONE
-    for error in errors:
-        kind = ERROR_KINDS[error.kind]
-        large = error.size > (kind.off_together if together else kind.off_alone) and error.gain > 0
-        if large and error.deviations > deviations:
-            found.setdefault(error.view, []).append(error)
-    off = []
-    for kinds in found.values():
-        best = max(error.gain for error in kinds)
-        alike = [error for error in kinds if error.gain >= SIMILAR_GAIN * best]
-        off.append(min(alike, key=lambda error: error.size / ERROR_KINDS[error.kind].usual))
-    return tuple(off)
+    """The cameras that are certainly off; `together`: the errors are those of a source, not of one episode."""
+    limit = DEVIATIONS_TOGETHER if together else DEVIATIONS_ALONE
+    return tuple(error for error in errors if error.deviations > limit)
 
 
 def corrected_camera(camera: CameraTrack, error: CameraError) -> CameraTrack:
     """The camera without the estimated error."""
-    kind, theta = ERROR_KINDS[error.kind], np.zeros(PARAMETERS)
-    theta[kind.parameters] = error.estimate / kind.scale
-    return moved_camera(camera, theta)
+    return moved_camera(camera, error.estimate / SCALE)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import textwrap
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -26,7 +26,7 @@ from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_s
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
 from worldline_core.calibration.camera_errors import corrected_camera
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, SourceDiagnosis
-from worldline_core.data.episodes.conventions import along_tool_z, apply_conventions, image_frames
+from worldline_core.data.episodes.conventions import along_tool_z, apply_conventions, frames_with_all
 from worldline_core.errors import DataError
 from worldline_core.pages.page import Table, render, words
 from worldline_core.pictures import INK, MUTED, Picture, SheetRow, contact_sheet, draw_tag, evenly_spaced, text_strip
@@ -40,13 +40,14 @@ MEANINGS = {
     "unexplained": "the recording disagrees with its calibration, and under no usual mistake it agrees",
     "explained": "one usual mistake explains what is wrong; the line repairs it",
     "off": "a camera is off: which one, in what and by how much is said beside it",
-    "unreadable": "the episode cannot be read or judged",
+    "unreadable": "the episode cannot be read",
+    "not_judged": "judging it failed",
     "too_little_evidence": "too little moves, or too little is calibrated, to judge",
     "consistent": "the recording agrees with its calibration, within what is said beside it",
 }
 """By verdict, the worst first."""
 TONES = {
-    **dict.fromkeys(("unexplained", "explained", "off", "unreadable"), "bad"),
+    **dict.fromkeys(("unexplained", "explained", "off", "unreadable", "not_judged"), "bad"),
     "too_little_evidence": "",
     "consistent": "good",
 }
@@ -74,7 +75,9 @@ class EpisodeCheck:
 
     @property
     def verdict(self) -> str:
-        return "unreadable" if self.diagnosis is None else self.diagnosis.verdict
+        if self.diagnosis is not None:
+            return self.diagnosis.verdict
+        return "not_judged" if self.reason == "crashed" else "unreadable"
 
     @property
     def row(self) -> tuple[str, ...]:
@@ -98,8 +101,9 @@ class CalibrationCheck:
     def consistent(self) -> bool:
         """True if some episode is consistent, and nothing is wrong with any other."""
         verdicts = {episode.verdict for episode in self.episodes}
-        sound = not verdicts & {"off", "explained", "unexplained", "unreadable"}
-        return sound and "consistent" in verdicts and all(s.verdict not in ("off", "explained") for s in self.sources)
+        sound = not verdicts & {"off", "explained", "unexplained", "unreadable", "not_judged"}
+        together = all(s.verdict not in ("off", "explained", "mixed") for s in self.sources)
+        return sound and "consistent" in verdicts and together
 
     @property
     def counted(self) -> dict[str, int]:
@@ -109,13 +113,22 @@ class CalibrationCheck:
 
 
 def verdict_text(found: Conclusion) -> str:
-    """The verdict, with the cameras that are off, or the largest turn of a camera that could have gone unseen."""
+    """The verdict, with the cameras that are off or what could have gone unseen, and the views that nothing judges."""
+    said = words(found.verdict)
     if found.verdict == "off":
-        return f"off: {', '.join(map(str, found.off))}"
-    if found.verdict != "consistent":
-        return words(found.verdict)
-    turns = [error.bound for error in found.camera_errors if error.kind == "rotation"]
-    return f"consistent within {max(turns):.1f} deg" if turns else "consistent, but no picture says within what"
+        said = f"off: {', '.join(map(str, found.off))}"
+    elif found.verdict == "consistent" and found.camera_errors:
+        said += f" within {', '.join(f'{bound} ({view})' for view, bound in _bounds(found))}"
+    elif found.verdict == "consistent":
+        said += " by its poses, but no picture says within what"
+    return f"{said}; not judged: {', '.join(found.not_judged)}" if found.not_judged else said
+
+
+def _bounds(found: Conclusion) -> Iterator[tuple[str, str]]:
+    """By view, how far the robot may be from its place in the picture; of a wrist camera, by how much it may be turned."""
+    for error in found.camera_errors:
+        shown = error.kinds[-1] if error.shown is not None else error.kinds[0]
+        yield error.view, f"{shown.bound:.1f} {shown.unit}"
 
 
 def table_text(check: CalibrationCheck) -> str:
@@ -139,9 +152,12 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
     lines = [f"{len(check.episodes)} episodes: {', '.join(parts)}"]
     for found in check.sources:
         lines += ["", source_headline(found), f"  single episodes say: {votes_text(found)}"]
-        for view in dict.fromkeys(error.view for error in found.camera_errors):
-            bounds = [f"{e.kind} {e.bound:.1f} {e.unit}" for e in found.camera_errors if e.view == view]
-            lines.append(f"  {view} within: {', '.join(bounds)}")
+        for error in found.camera_errors:
+            bounds = [f"{each.kind} {each.bound:.1f} {each.unit}" for each in error.kinds]
+            lines.append(f"  {error.view} within: {', '.join(bounds)}")
+            if error.contradicting:
+                lines.append(f"  {error.view}: {error.contradicting} of {error.episodes} episodes say otherwise")
+        lines += [f"  {view} not judged: {why}" for view, why in found.not_judged.items()]
         own = [note for episode in check.episodes if episode.source == found.source for note in episode.notes]
         lines += [f"  note: {note}" for note in dict.fromkeys((*found.notes, *own))]
         lines += [f"  near: {near}" for near in found.nearest]
@@ -203,7 +219,7 @@ def as_json(check: CalibrationCheck) -> dict[str, Any]:
 
 
 def _conclusion_json(found: Conclusion) -> dict[str, Any]:
-    names = ("view", "kind", "unit", "estimate", "size", "half_interval", "bound")
+    names = ("kind", "unit", "estimate", "size", "half_interval", "bound")
     return {
         "verdict": found.verdict,
         "mistake": found.best.mistake,
@@ -215,8 +231,11 @@ def _conclusion_json(found: Conclusion) -> dict[str, Any]:
         "notes": found.notes,
         "nearest": found.nearest,
         "camera_errors": [
-            {name: getattr(e, name) for name in names} | {"off": e in found.off} for e in found.camera_errors
+            {"view": e.view, "off": e in found.off} | {name: getattr(each, name) for name in names}
+            for e in found.camera_errors
+            for each in e.kinds
         ],
+        "not_judged": found.not_judged,
     }
 
 
@@ -247,12 +266,13 @@ def _page_row(episode: EpisodeCheck) -> list[object]:
 
 
 def _camera_errors(found: Conclusion) -> Table:
-    """Each camera's estimated errors, each as if it were the only one."""
+    """Each camera's estimated error, each kind whatever the others are."""
     rows = []
-    for e in found.camera_errors:
-        values = ", ".join(f"{value:+.1f}" for value in e.estimate)
-        size = f"{e.size:.1f} +- {e.half_interval:.1f}"
-        rows.append([e.view, e.kind, f"{values} {e.unit}", size, f"{e.bound:.1f}", "off" if e in found.off else ""])
+    for e, each in [(error, each) for error in found.camera_errors for each in error.kinds]:
+        values = ", ".join(f"{value:+.1f}" for value in each.estimate)
+        size = f"{each.size:.1f} +- {each.half_interval:.1f}"
+        off = "off" if e in found.off else ""
+        rows.append([e.view, each.kind, f"{values} {each.unit}", size, f"{each.bound:.1f}", off])
     return Table(("View", "Error", "Estimate", "Size", "Unseen up to", ""), rows, numeric=range(3, 5))
 
 
@@ -273,16 +293,16 @@ def diagnosis_picture(
     Raises: DataError when nothing can be drawn in any view.
     """
     conventions = diagnosis.best.conventions
-    repaired, offset, lag = None, 0.0, 0
+    repaired, offset, first = None, 0.0, 0
     if conventions.departures:
         if recorded.T_base_ee is None:
             # Tools come from kinematics: apply_conventions has no recorded poses to move.
             offset = conventions.tool_offset_z_m
             conventions = conventions.model_copy(update={"tool_offset_z_m": 0.0})
         repaired = apply_conventions(recorded, conventions)
-        lag = image_frames(recorded.num_frames, conventions).start
+        first = frames_with_all(recorded.num_frames, conventions)[0]
     elif diagnosis.verdict == "off":
-        cameras = {e.view: corrected_camera(recorded.cameras[e.view], e) for e in diagnosis.off if e.kind != "lag"}
+        cameras = {e.view: corrected_camera(recorded.cameras[e.view], e) for e in diagnosis.off}
         repaired = replace(recorded, cameras={**recorded.cameras, **cameras})
     left: list[SheetRow] = []
     right: list[SheetRow] = []
@@ -292,7 +312,7 @@ def diagnosis_picture(
             continue
         before = recorded_tracks(recorded, view, kinematics)
         after = before if repaired is None else recorded_tracks(repaired, view, kinematics, offset)
-        count = min(len(frames[view]), before.num_frames)
+        count, lag = min(len(frames[view]), before.num_frames), first + conventions.image_lag(view)
         if repaired is None:
             chosen = evenly_spaced(count, 2 * moments)
         else:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -30,8 +30,8 @@ MIN_TERM = -9.0
 SUSPICION = -4.0
 """A term below this starts the search."""
 TERM_LIMITS = {
-    "flow": correlation_log_likelihood(0.6, ARM_FLOW),
-    "turn": turn_log_likelihood(25.0),
+    "flow": correlation_log_likelihood(0.5, ARM_FLOW),
+    "turn": turn_log_likelihood(35.0),
     "hand-eye": hand_eye_log_likelihood(0.012, 0.0),
     **dict.fromkeys(("change", "wrist", "energy", "fingers", "finger"), -np.inf),
 }
@@ -49,6 +49,8 @@ FEWEST_TOGETHER = 5
 ESTIMATED = {"intrinsics_size", "tool_offset_z_m", "embodiment"}
 """Tried only where an episode suggests them: one that fits as written and does not is evidence against them."""
 NEAREST_SHOWN, TERMS_SHOWN = 3, 3
+MAX_LAG_FRAMES = 6
+"""Lags are tried up to this one, which explains nothing: the true one may be larger."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +87,17 @@ class Explanation:
         return ", ".join(lines + ([": ".join(self.other)] if self.other is not None else [])) or "as recorded"
 
     @property
+    def lag_at_edge(self) -> bool:
+        """True for a lag at the edge of the search."""
+        lags = self.conventions.camera_lag_frames, self.conventions.image_lag_frames
+        return max(map(abs, lags)) >= MAX_LAG_FRAMES
+
+    @property
     def key(self) -> frozenset[tuple[str, str]]:
         """Identity of the reading over episodes, with any tool offset that each of them estimates."""
         items = {(name, str(getattr(self.conventions, name))) for name in self.conventions.departures}
+        if self.conventions.image_lag_frames and self.conventions.views is not None:
+            items.add(("views", str(self.conventions.views)))
         items = {("tool_offset_z_m", "") if name == "tool_offset_z_m" else (name, value) for name, value in items}
         return frozenset(items if self.other is None else items | {self.other})
 
@@ -107,8 +117,8 @@ class Conclusion:
         ranked: all readings that were tried, best score first.
         notes: limits of the evidence, and other facts for a person.
         nearest: without an explanation, the best readings and what is still wrong under each.
-        camera_errors: the error of each camera under `best`, in each way that the pictures show; `off`: the significant
-            ones.
+        camera_errors: the error of each camera under `best` whose pictures show it; `off`: the significant ones.
+        not_judged: by view, why its pictures say nothing.
     """
 
     verdict: VerdictName
@@ -118,15 +128,19 @@ class Conclusion:
     nearest: tuple[str, ...] = ()
     camera_errors: tuple[CameraError, ...] = ()
     off: tuple[CameraError, ...] = ()
+    not_judged: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def as_recorded(self) -> Explanation:
         return next(explanation for explanation in self.ranked if explanation.mistake == "none")
 
     def with_camera_errors[C: Conclusion](self: C, errors: tuple[CameraError, ...], *, together: bool = False) -> C:
-        """With the cameras' errors; consistent becomes `off` where one is significant (`together`: over a source)."""
+        """With the cameras' errors; consistent becomes `off` where one is significant (`together`: over a source), and
+        `mixed` where the episodes of a source contradict each other."""
         off = significant(errors, together=together)
         verdict = "off" if off and self.verdict == "consistent" else self.verdict
+        if self.verdict == "consistent" and any(e.contradicting > tolerated_episodes(e.episodes) for e in errors):
+            verdict = "mixed"
         return replace(self, verdict=verdict, camera_errors=errors, off=off)
 
 
@@ -198,10 +212,15 @@ def decide(as_recorded: Explanation, ranked: Sequence[Explanation]) -> tuple[Ver
             and (len(best.departures) > 1 or not bad_terms(other, as_recorded))
         ]
         if not rivals:
-            return "explained", best, []
+            return ("unexplained", as_recorded, []) if best.lag_at_edge else ("explained", best, [])
         if bad:
             return "unexplained", as_recorded, [best.text, *rivals]
     return "unexplained" if bad else "consistent", as_recorded, []
+
+
+def tolerated_episodes(count: int) -> float:
+    """Number of episodes of a source that may differ from the others: a tenth, and one of five."""
+    return max(CONTRADICTING_SHARE * count, 1.0 if count >= FEWEST_TOGETHER else 0.0)
 
 
 def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagnosis:
@@ -225,11 +244,11 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
     rivals = [r for r in sound[1:] if r.fits_like(sound[0], sound)]
     verdict: VerdictName = "mixed"
     best = as_recorded
-    if sound and not rivals:
+    if sound and not rivals and not sound[0].tried[0].lag_at_edge:
         verdict, best = "explained", sound[0].summed(as_recorded.score)
-    elif rivals or votes["unexplained"] > count / 2:
+    elif sound or votes["unexplained"] > count / 2:
         verdict = "unexplained"
-    elif count - votes["consistent"] - votes["off"] <= CONTRADICTING_SHARE * count:
+    elif count - votes["consistent"] - votes["off"] <= tolerated_episodes(count):
         verdict = "consistent"
     found = SourceDiagnosis(
         verdict=verdict,
@@ -240,11 +259,19 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
         source=source,
         num_episodes=count,
         votes=dict(votes),
+        not_judged=_judged_in_none(listed),
     )
     if best.other is not None:
         return found
     alike = {d.episode_id: d.camera_errors for d in listed if d.best.conventions == best.conventions}
     return found.with_camera_errors(combine(list(alike.values())), together=len(alike) >= FEWEST_TOGETHER)
+
+
+def _judged_in_none(diagnoses: Sequence[Diagnosis]) -> dict[str, str]:
+    """The views that no episode's pictures judge, and why."""
+    views = dict.fromkeys(view for diagnosis in diagnoses for view in diagnosis.not_judged)
+    reasons = {view: [d.not_judged.get(view) for d in diagnoses] for view in views}
+    return {view: why[0] for view, why in reasons.items() if why[0] is not None and None not in why}
 
 
 _Key = frozenset[tuple[str, str]]

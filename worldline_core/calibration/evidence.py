@@ -68,6 +68,8 @@ INVERSE_DEPTHS_PER_M = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
 MIN_TEXTURE, MIN_CHANGE = 4.0, 5.0
 """Grey levels: where flow can be measured, and where there is any."""
 LARGEST_FLOW_ERROR_PX = 8.0
+FROZEN_CHANGE, FROZEN_TRAVEL_M, FROZEN_WRIST_TRAVEL_M = 0.5, 0.1, 0.15
+"""Grey levels in any cell, and travel of the arm meanwhile [m]: a video that shows the same picture on and on."""
 # Grippers.
 MIN_OPENING_RANGE = 0.12
 """Over the episode: a smaller one moves no finger visibly, and noise stays below."""
@@ -215,7 +217,7 @@ def image_terms(observation: Observation, reading: Reading, *, wrist_flow: bool 
         elif view not in observation.wrists:
             flow, change, turn_deg = still_view_agreement(observation, reading, view)
             terms[f"turn {view}"] = turn_log_likelihood(turn_deg)
-            typical = (ARM_FLOW, ARM_CHANGE) if reading.whole_arms else (TOOL_FLOW, TOOL_CHANGE)
+            typical = (ARM_FLOW, ARM_CHANGE) if reading.shape != "hands" else (TOOL_FLOW, TOOL_CHANGE)
             terms[f"flow {view}"] = correlation_log_likelihood(flow, typical[0])
             terms[f"change {view}"] = correlation_log_likelihood(change, typical[1])
         energy = energy_correlation(observation, reading, view)
@@ -232,6 +234,25 @@ def observable_views(observation: Observation) -> list[str]:
         and (view in observation.wrists or observation.stands_still(view))
         and observation.motion(view).moves
     ]
+
+
+def frozen_views(observation: Observation, reading: Reading) -> list[str]:
+    """Views whose pictures stay the same through several steps in which what they show travels far."""
+    found = []
+    for view in observation.episode.cameras:
+        if len(observation.gray.get(view, ())) <= MIN_IMAGE_PAIRS:
+            continue
+        states, images = reading.steps(observation.num_images, view)
+        same = observation.motion(view).change[images].max(axis=(1, 2)) < FROZEN_CHANGE
+        own = observation.wrists.get(view)
+        speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
+        travel = longest = 0.0
+        for still, step in zip(same, speed, strict=True):
+            travel = travel + step if still else 0.0
+            longest = max(longest, travel)
+        if longest > (FROZEN_TRAVEL_M if own is None else FROZEN_WRIST_TRAVEL_M):
+            found.append(view)
+    return found
 
 
 def correlation_log_likelihood(correlation: float, typical: Typical) -> float:
@@ -251,7 +272,7 @@ def still_view_agreement(observation: Observation, reading: Reading, view: str) 
     Returns: correlations of predicted with measured flow and change; angle [deg] by which the flow is turned as a whole, 0
         where it does not follow at all.
     """
-    states, images = reading.steps(observation.num_images)
+    states, images = reading.steps(observation.num_images, view)
     motion, vector = observation.motion(view), reading.predicted(view)[states]
     step = lengths(vector)
     flow, change = motion.flow[images], motion.change[images]
@@ -282,7 +303,7 @@ def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) 
     camera, motion = reading.cameras[view], observation.motion(view)
     if not camera.moving:
         return 0.0
-    states, images = reading.steps(observation.num_images)
+    states, images = reading.steps(observation.num_images, view)
     key = b"".join((camera.T_base_camera.tobytes(), camera.K.tobytes(), repr((states, images)).encode()))
     if key not in motion.agreements:
         motion.agreements[key] = _wrist_flow_agreement(camera, motion, states, images)
@@ -314,7 +335,7 @@ def _wrist_flow_agreement(camera: CameraTrack, motion: Motion, states: slice, im
 
 def energy_correlation(observation: Observation, reading: Reading, view: str) -> float:
     """Correlation over time of the speed of what moves a view (its own arm, or the fastest) with its mean change."""
-    states, images = reading.steps(observation.num_images)
+    states, images = reading.steps(observation.num_images, view)
     own = observation.wrists.get(view)
     speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
     change = observation.motion(view).mean_change[images]
@@ -350,14 +371,14 @@ def finger_agreement(observation: Observation, reading: Reading, arm: int) -> fl
     view, kinematics = observation.arms[arm].wrist_view, observation.kinematics
     if kinematics is None or not kinematics.embodiment.arms[arm].gripper.finger_joints:
         return None
-    if not reading.whole_arms or not _moves(observation, reading, arm):
+    if reading.shape == "hands" or not _moves(observation, reading, arm):
         return None
     camera, tool = reading.cameras[view], reading.tools[:, arm, :3, 3]
     near = np.median(lengths(reading.points - tool[:, None]), axis=0) < FINGER_LENGTH_M
     T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
     points = reading.points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
     fixed = replace(camera, T_base_camera=np.eye(4)[None])
-    states, images = reading.steps(observation.num_images)
+    states, images = reading.steps(observation.num_images, view)
     predicted = predict_motion(points, reading.radii[near], fixed)[states]
     moving = lengths(predicted) > MIN_FINGER_STEP_PX
     if moving.sum() < 10:
@@ -376,10 +397,13 @@ def _moves(observation: Observation, reading: Reading, arm: int) -> bool:
 def finger_flow(observation: Observation, reading: Reading, arm: int) -> float | None:
     """Correlation (-1..1) of the flow away from the projected tool point, near it, with the growth of the opening."""
     view = observation.arms[arm].wrist_view
+    kinematics = observation.kinematics
+    if kinematics is not None and len(kinematics.embodiment.arms[arm].gripper.finger_joints) == 1:
+        return None  # one jaw moves, so flow is not away from the middle
     if reading.gripper is None or not _moves(observation, reading, arm):
         return None
     opening = np.diff(reading.gripper[:, arm])
-    states, images = reading.steps(observation.num_images)
+    states, images = reading.steps(observation.num_images, view)
     motion, camera = observation.motion(view), reading.cameras[view]
     poses = camera.poses(np.arange(len(reading.tools)))
     uv, depth = project_points(reading.tools[:, arm, :3, 3], camera.K, poses)

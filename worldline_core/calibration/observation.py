@@ -9,12 +9,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from worldline_core.actions.robot_masks import robot_capsules
-from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, arm_blocks, image_frames
+from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, arm_blocks, frames_with_all
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -26,6 +27,8 @@ STILL_CHANGE = 4.0
 """Changes below this many grey levels are compression or sensor noise."""
 METRES_PER_RADIAN = 0.15
 """A wrist camera that turns by one radian shows about as much change as one that travels this far."""
+MIN_SHAPED_LINKS = 3
+"""With shapes of fewer links of an arm, capsules along its links stand for it."""
 _STEPS_AT_ONCE = 64
 _CAPSULE_SAMPLES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 _TOOL_POINTS_M = np.array([0.0, 0.05, 0.1, 0.15])
@@ -86,7 +89,7 @@ class Observation:
 
     def motion(self, view: str) -> Motion:
         if view not in self._motion:
-            self._motion[view] = _motion(self.gray[view])
+            self._motion[view] = measured_motion(self.gray[view])
         return self._motion[view]
 
     def stands_still(self, view: str) -> bool:
@@ -164,7 +167,8 @@ def cell_means(values: np.ndarray) -> np.ndarray:
     return rows.reshape(n, r, c, CELL_PX, *values.shape[3:]).sum(axis=3) / np.float32(CELL_PX**2)
 
 
-def _motion(gray: np.ndarray) -> Motion:
+def measured_motion(gray: np.ndarray) -> Motion:
+    """Image motion of a view's small grey images (n, h, w)."""
     if len(gray) < 2:
         empty = np.zeros((0, gray.shape[1] // CELL_PX, gray.shape[2] // CELL_PX), dtype=np.float32)
         return Motion(np.zeros((*empty.shape, 2), dtype=np.float32), empty, empty)
@@ -216,9 +220,9 @@ class Reading:
         kinematic_tools: (n, a, 4, 4) from joints where the recording also has tool poses, else None.
         cameras: by view, K at the size of the grey images.
         gripper, gripper_command: (n, a) openings, None where the state has no gripper columns.
-        points, radii: (n, p, 3), (p,) on the arms [m] (capsules of the links, or the hand where only tools are known).
-        whole_arms: whether the points are those of whole arms.
-        first_image: number of the image that belongs to frame 0 (may be negative).
+        points, radii: (n, p, 3), (p,) on the arms [m].
+        shape: what the points are of: the links' surfaces, capsules along the links, or hands where only tools are known.
+        first: recorded frame that is frame 0.
     """
 
     conventions: RecordedConventions
@@ -231,20 +235,21 @@ class Reading:
     gripper_command: np.ndarray | None
     points: np.ndarray
     radii: np.ndarray
-    whole_arms: bool
-    first_image: int
+    shape: Literal["surfaces", "capsules", "hands"]
+    first: int
     _predicted: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     def with_image_lag(self, frames: int) -> Reading:
         """The same geometry with images that trail the states by so many frames."""
         conventions = self.conventions.model_copy(update={"image_lag_frames": frames})
-        return replace(self, conventions=conventions, first_image=self.first_image + frames)
+        return replace(self, conventions=conventions)
 
-    def steps(self, num_images: int) -> tuple[slice, slice]:
-        """Steps of the states, and the steps of the images that belong to them."""
-        start = max(0, -self.first_image)
-        stop = max(start, min(len(self.tools), num_images - self.first_image) - 1)
-        return slice(start, stop), slice(start + self.first_image, stop + self.first_image)
+    def steps(self, num_images: int, view: str) -> tuple[slice, slice]:
+        """Steps of the states, and the steps of a view's images that belong to them."""
+        first = self.first + self.conventions.image_lag(view)
+        start = max(0, -first)
+        stop = max(start, min(len(self.tools), num_images - first) - 1)
+        return slice(start, stop), slice(start + first, stop + first)
 
     @cached_property
     def tool_speed(self) -> np.ndarray:
@@ -277,8 +282,10 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
         if kinematic is None:
             return None
         tools, kinematic = kinematic, None
-    whole_arms = len(radii) > 0
-    if not whole_arms:  # from the tool back along its z axis
+    shape: Literal["surfaces", "capsules", "hands"] = "hands"
+    if kinematics is not None and len(radii):
+        shape = "surfaces" if _has_surfaces(kinematics) else "capsules"
+    else:  # from the tool back along its z axis
         points = tools[:, :, None, :3, 3] - _TOOL_POINTS_M[:, None] * tools[:, :, None, :3, 2]
         points = points.reshape(len(tools), -1, 3)
         radii = np.full(points.shape[1], _TOOL_RADIUS_M)
@@ -299,8 +306,8 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
         episode.action[:, columns].astype(np.float64) if columns else None,
         points,
         radii,
-        whole_arms,
-        image_frames(recorded.num_frames, conventions).start,
+        shape,
+        frames_with_all(recorded.num_frames, conventions)[0],
     )
 
 
@@ -315,10 +322,27 @@ def _moved_arms(
         posture = {name: np.full(len(both), value) for name, value in noted.items()}
         links = kinematics.link_poses(both, posture=posture)
         fk = kinematics.tools_of(links).numpy()
-        capsules, radius = robot_capsules(kinematics, {k: v[: episode.num_frames] for k, v in links.items()})
-        points, radii = _sampled(capsules.numpy(), radius.numpy())
+        links = {name: poses[: episode.num_frames] for name, poses in links.items()}
+        if _has_surfaces(kinematics):
+            poses = ((links[name].numpy(), shape) for name, shape in kinematics.surfaces.items())
+            parts = [(shape @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3], size) for T, (shape, size) in poses]
+            points, radii = np.concatenate([p for p, _ in parts], axis=1), np.concatenate([r for _, r in parts])
+        else:
+            capsules, radius = robot_capsules(kinematics, links)
+            points, radii = _sampled(capsules.numpy(), radius.numpy())
         observation.moved_arms[key] = fk[: episode.num_frames], fk[episode.num_frames :], points, radii
     return observation.moved_arms[key]
+
+
+def _has_surfaces(kinematics: ArmKinematics) -> bool:
+    """True if the description has the shapes of each arm's links, of at least MIN_SHAPED_LINKS."""
+    for arm in kinematics.embodiment.arms:
+        link, shaped = arm.end_effector_link, 0
+        while link in kinematics.link_parents:
+            shaped, link = shaped + (link in kinematics.surfaces), kinematics.link_parents[link]
+        if shaped < MIN_SHAPED_LINKS:
+            return False
+    return True
 
 
 def _sampled(capsules: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

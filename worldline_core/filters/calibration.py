@@ -338,6 +338,8 @@ def detect_mistake(
     if diagnosis.verdict == "explained":
         lags = all(field.endswith("lag_frames") for field in diagnosis.best.departures)
         reason = "time_alignment" if lags else "calibration"
+    elif diagnosis.verdict == "unexplained" and diagnosis.ranked[0].lag_at_edge:
+        reason = "time_alignment"
     return Verdict(
         reason,
         diagnosis.verdict in ("consistent", "off", "too_little_evidence"),  # "off" is an estimate: it warns
@@ -369,9 +371,11 @@ def _numbers(diagnosis: Diagnosis, step: int) -> Numbers:
         other = diagnosis.best.other
         lines = found.model_copy(update=lags).config_lines() if other is None else (": ".join(other),)
         numbers |= {"score_repaired": diagnosis.best.score, "config": "; ".join(lines)}
-    for error in diagnosis.camera_errors:
-        kind = f"{error.view} {error.kind}"
-        numbers |= {f"{kind} [{error.unit}]": round(error.size, 3), f"{kind} unseen up to": round(error.bound, 3)}
+    for view, each in [(error.view, each) for error in diagnosis.camera_errors for each in error.kinds]:
+        kind = f"{view} {each.kind}"
+        numbers |= {f"{kind} [{each.unit}]": round(each.size, 3), f"{kind} unseen up to": round(each.bound, 3)}
+    for view, why in diagnosis.not_judged.items():
+        numbers[f"{view} not judged"] = why
     if diagnosis.off:
         numbers |= {"off": "; ".join(map(str, diagnosis.off))}
     if diagnosis.verdict == "unexplained":

@@ -120,7 +120,8 @@ class RecordedConventions(StrictModel):
     gripper: Literal["as_written", "inverted"] = Field(default="as_written", description="inverted: 1 means closed")
     views: tuple[str, ...] | None = Field(
         default=None,
-        description="views that extrinsics, camera_axes, extrinsics_unit and intrinsics_size speak of; null: all",
+        description="views that extrinsics, camera_axes, extrinsics_unit, intrinsics_size and image_lag_frames speak of; "
+        "null: all",
     )
 
     @model_validator(mode="after")
@@ -128,6 +129,10 @@ class RecordedConventions(StrictModel):
         if self.intrinsics_size is not None and min(self.intrinsics_size) < 1:
             raise ValueError(f"intrinsics_size {self.intrinsics_size} is no image size")
         return self
+
+    def image_lag(self, view: str) -> int:
+        """Frames by which the images of a view trail the states."""
+        return self.image_lag_frames if self.views is None or view in self.views else 0
 
     @property
     def departures(self) -> tuple[str, ...]:
@@ -149,10 +154,11 @@ class RecordedConventions(StrictModel):
         return tuple(lines)
 
 
-def image_frames(num_frames: int, conventions: RecordedConventions) -> slice:
-    """Which recorded images belong to the frames of the repaired episode, in order."""
+def image_frames(num_frames: int, conventions: RecordedConventions, view: str) -> slice:
+    """Which recorded images of a view belong to the frames of the repaired episode, in order."""
     first, last = frames_with_all(num_frames, conventions)
-    return slice(first + conventions.image_lag_frames, last + conventions.image_lag_frames)
+    lag = conventions.image_lag(view)
+    return slice(first + lag, last + lag)
 
 
 def apply_conventions(episode: Episode, conventions: RecordedConventions) -> Episode:
@@ -240,8 +246,8 @@ def shift(episode: Episode, conventions: RecordedConventions) -> Episode:
     cut = episode.cut(first, last)
     with_images = None
     if episode.video_frames is not None:
-        images = image_frames(episode.num_frames, conventions)
-        with_images = max(0, min(episode.video_frames, images.stop) - images.start)
+        lags = {conventions.image_lag_frames} | ({0} if conventions.views is not None else set())
+        with_images = max(0, min(min(episode.video_frames, last + late) - first - late for late in lags))
     return replace(cut, cameras=cameras, video_frames=with_images)
 
 

@@ -11,7 +11,8 @@
         distortion: {model: radtan, coefficients: [...]}      # only where the images still have it
 
 Instead of T a view may name a feature of the dataset that holds the pose of each frame: `T_feature: {name: ..., format:
-xyz_rpy_fixed}` (x y z [m], roll pitch yaw [rad] about fixed axes) or `format: matrix` (16 numbers, row by row).
+xyz_rpy_fixed}` (x y z [m], roll pitch yaw [rad] about fixed axes) or `format: matrix` (16 numbers, row by row). Or, of a wrist
+camera, `mount: embodiment`: where the robot's description mounts it, by the measured joints (no T, maps or axes then).
 """
 
 from __future__ import annotations
@@ -29,8 +30,10 @@ from worldline_core.data.episodes.source import LensConfig
 from worldline_core.data.guards.plain_files import read_json, validated
 from worldline_core.data.guards.rejection import RejectedInputError, check_shape, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
-from worldline_core.errors import ConfigError
+from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.geometry.cameras import CameraAxes, Extrinsics, ImageTransform
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 _ASPECT_TOLERANCE = 0.01
@@ -49,16 +52,20 @@ class CameraEntry(StrictModel):
     width: int = Field(ge=1)
     height: int = Field(ge=1)
     K: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-    maps: Extrinsics
-    axes: CameraAxes
+    maps: Extrinsics | None = None
+    axes: CameraAxes | None = None
     T: list[Any] | None = None
     T_feature: PoseFeature | None = None
+    mount: Literal["embodiment"] | None = None
     distortion: LensConfig | None = None
 
     @model_validator(mode="after")
     def _one_pose(self) -> CameraEntry:
-        if (self.T is None) == (self.T_feature is None):
-            raise ValueError("give T or T_feature, one of them")
+        if sum(given is not None for given in (self.T, self.T_feature, self.mount)) != 1:
+            raise ValueError("give T, T_feature or mount, one of them")
+        conventions = self.maps is not None, self.axes is not None
+        if any(conventions) if self.mount is not None else not all(conventions):
+            raise ValueError("maps and axes belong to T and T_feature, and to nothing else")
         return self
 
 
@@ -98,12 +105,14 @@ def add_calibrated_view(
     num_frames: int,
     read_feature: Callable[[str], np.ndarray],
     where: str,
+    mounted: Callable[[str], np.ndarray] | None = None,
 ) -> None:
     """Add the camera of a view, and its lens where images still show it; nothing where the dataset's own column holds no
     pose (all zeros: it was never measured).
 
     Args:
         image_size: (height, width) of the recorded video. K follows where only the scale differs.
+        mounted: poses (num_frames, 4, 4) of a wrist camera by its robot's description; None where nothing has joints.
 
     Raises: RejectedInputError: missing_calibration (K is of another picture), length_mismatch, invalid_extrinsics,
         missing_column.
@@ -118,15 +127,41 @@ def add_calibrated_view(
             got=f"{entry.width}x{entry.height}",
             next_step="give K for the recorded image: the sizes do not show what was cropped",
         )
-    if entry.T_feature is not None:
+    extrinsics, axes = entry.maps or "camera_to_base", entry.axes or "opencv"
+    if entry.mount is not None:
+        if mounted is None:
+            raise RejectedInputError("missing_calibration", "A mount needs joints", where=f"{where}, view {view}")
+        matrices = mounted(view)
+    elif entry.T_feature is not None:
         matrices = _feature_poses(entry.T_feature, read_feature, num_frames, f"{where}, view {view}")
         if matrices is None:
             return
     else:
         matrices = _matrices(entry.T or [], num_frames, f"{where}, view {view}")
-    pose = camera_pose(view, matrices, extrinsics=entry.maps, axes=entry.axes, where=where)
+    pose = camera_pose(view, matrices, extrinsics=extrinsics, axes=axes, where=where)
     K = ImageTransform.of((entry.height, entry.width)).resize(image_size).intrinsics(np.asarray(entry.K))
     cameras.add(view, K, pose, image_size, None if entry.distortion is None else entry.distortion.distortion)
+
+
+def mounted_camera(embodiment: str, state: np.ndarray, view: str, where: str) -> np.ndarray:
+    """T_base_camera (n, 4, 4) of a wrist camera by its robot's description, from the measured joints (n, j).
+
+    Raises: RejectedInputError (missing_calibration) where the description is not here, or mounts no camera for the view.
+    """
+    try:
+        poses = ArmKinematics(load_embodiment(embodiment)).wrist_camera_poses(state.astype(np.float64))
+    except (ConfigError, UnavailableError) as error:
+        raise RejectedInputError(
+            "missing_calibration", "The robot's description mounts no camera", where=f"{where}, view {view}",
+            got=error.what, next_step="give T or T_feature",
+        ) from error  # fmt: skip
+    if view not in poses:
+        raise RejectedInputError(
+            "missing_calibration", "The robot's description mounts no camera of this view", where=f"{where}, view {view}",
+            expected=f"one of {', '.join(poses)}" if poses else f"wrist_camera in {embodiment}.yaml", got=view,
+            next_step="give T or T_feature, or add wrist_camera to the embodiment (docs/embodiments.md)",
+        )  # fmt: skip
+    return poses[view].numpy()
 
 
 def _matrices(listed: list[Any], num_frames: int, where: str) -> np.ndarray:

@@ -41,7 +41,7 @@ from worldline_core.data.guards.rejection import (
 )
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
 from worldline_core.data.lerobot.dataset import DatasetInfo, LeRobotV3Dataset, LeRobotV21Dataset, check_files, is_depth
-from worldline_core.data.sources.calibration_file import add_calibrated_view, read_calibration
+from worldline_core.data.sources.calibration_file import add_calibrated_view, mounted_camera, read_calibration
 from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.errors import ConfigError, DataError
 
@@ -384,9 +384,7 @@ class LeRobotSource:
 
     def _episode(self, episode_id: str, index: int, times: np.ndarray, cameras: RecordedCameras) -> Episode:
         config, dataset = self._config, self._dataset
-        state, action, overshoot = self._columns.read(
-            lambda feature: dataset.column(index, feature), degrees=config.angle_unit == "deg"
-        )
+        state, action, overshoot = self._read_columns(index)
         instruction, tasks = self._instruction(index)
         return Episode(
             **config.declared(self._label),
@@ -411,6 +409,10 @@ class LeRobotSource:
                 **cameras.notes(),
             },
         )
+
+    def _read_columns(self, index: int) -> tuple[np.ndarray, np.ndarray, int]:
+        degrees = self._config.angle_unit == "deg"
+        return self._columns.read(lambda feature: self._dataset.column(index, feature), degrees=degrees)
 
     def _instruction(self, index: int) -> tuple[str, int]:
         """The first frame's task, and how many different ones the episode has."""
@@ -459,6 +461,7 @@ class LeRobotSource:
                 num_frames=length,
                 read_feature=lambda feature: self._dataset.column(index, feature),
                 where=where,
+                mounted=lambda view: mounted_camera(self._config.embodiment, self._read_columns(index)[0], view, where),
             )
         return cameras
 

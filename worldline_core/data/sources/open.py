@@ -185,7 +185,11 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
     loaded = replace(loaded, episode=replace(repaired, conventions={**repaired.conventions, **declared}))
     if not (conventions.camera_lag_frames or conventions.image_lag_frames):
         return loaded
-    kept = range(recorded.num_video_frames)[image_frames(recorded.num_frames, conventions)]
+
+    def kept(view: str) -> range:
+        images = range(recorded.num_video_frames)[image_frames(recorded.num_frames, conventions, view)]
+        return images[: repaired.num_video_frames]
+
     each_image, robot_masks, thing_labels = loaded.each_image, loaded.robot_masks, loaded.thing_labels
 
     def check_count(found: int, view: str) -> None:
@@ -193,23 +197,23 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
         check_length("Video", where, states=recorded.num_video_frames, unit="frames", found=found)
 
     def images(view: str) -> Iterator[np.ndarray]:
-        count = 0
+        count, wanted = 0, kept(view)
         for count, image in enumerate(each_image(view), 1):
-            if count - 1 in kept:
+            if count - 1 in wanted:
                 yield image
         check_count(count, view)
 
     def cut(found: Masks | None, view: str) -> Masks | None:
         if found is not None:
             check_count(len(found), view)
-        return None if found is None else found[kept.start : kept.stop]
+        return None if found is None else found[kept(view).start : kept(view).stop]
 
     return replace(
         loaded,
         images=images,
         robot_masks=lambda view: cut(robot_masks(view), view),
         thing_labels=lambda view: cut(thing_labels(view), view),
-        clips={view: clip.cut(kept.start, kept.stop) for view, clip in loaded.clips.items()},
+        clips={view: clip.cut(kept(view).start, kept(view).stop) for view, clip in loaded.clips.items()},
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.actions.robot_masks import project_capsules
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames, pieces
@@ -124,7 +125,8 @@ class EpisodeMeasurement:
 
     def measure(self, rollouts: Mapping[str, RolloutSet]) -> dict[str, dict[str, Any]]:
         """Values of every frame, by method, for every view and seed that was predicted. Under the method ``true``: accuracy of the
-        segmenters' masks of robot and moved thing on the recording itself, where it has exact masks.
+        segmenters' masks of robot and moved thing on the recording itself: against its exact masks, or the robot's alone against
+        kinematic ones.
 
         Raises: DataError when a prediction has another frame size, another rate or more frames than the recording.
         """
@@ -231,10 +233,31 @@ class EpisodeMeasurement:
             if first is None:  # copies: views would keep the whole first piece
                 first = frames[0].copy(), masks[""][0].copy()
             true.add_object(frames, moved)
-            if robot is not None:
-                accuracy = {f"robot_iou_exact{suffix}": frame_iou(robot, own) for suffix, own in masks.items()}
+            name, mask = "exact", robot
+            if mask is None:
+                name, mask = "kinematic", self._kinematic_masks(begin, frames, stride)
+            if mask is not None:
+                accuracy = {f"robot_iou_{name}{suffix}": frame_iou(mask, own) for suffix, own in masks.items()}
                 true.add(**{name: _null_if_nan(values) for name, values in accuracy.items()})
             yield _Piece(frames, own_points, masks, first, robot, moved)
+
+    def _kinematic_masks(self, begin: int, frames: np.ndarray, stride: int) -> np.ndarray | None:
+        """Masks (n, h, w) of the robot's capsules in the head view, frames `begin` and on; None without its camera."""
+        if self.tracks is None:
+            return None
+        tracks = self.tracks.tracks(self.episode_id)
+        view = tracks.views.index(HEAD)
+        if tracks.camera_motion[view] == "absent":
+            return None
+        index = np.arange(begin, begin + len(frames)) * stride
+        capsules, radii, K, poses = (
+            torch.from_numpy(np.asarray(values, dtype=np.float64))[None]
+            for values in (
+                tracks.capsules[index], tracks.capsule_radii, tracks.K[[view]], tracks.T_base_camera[index][:, [view]]
+            )
+        )  # fmt: skip
+        height, width = frames.shape[1:3]
+        return project_capsules(capsules, radii, K, poses, tracks.image_size, (height, width))[0, 0].numpy()
 
     def _add_full_frame(self, video: _Video, predicted: np.ndarray, true: np.ndarray, where: str) -> None:
         if predicted.shape != true.shape:

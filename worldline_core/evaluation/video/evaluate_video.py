@@ -1,7 +1,8 @@
 """The step evaluate_video: full-frame metrics and robot-mask IoU of predicted videos.
 
 ``robot_iou`` follows the paper: one segmenter masks the true and the predicted video independently of each other. ``robot_iou_exact``
-compares the predicted video's mask with the recording's exact one; the method ``true`` shows how good the segmenter itself is. Means
+compares the predicted video's mask with the recording's exact one; the method ``true`` shows how good the segmenter itself is, against
+exact masks or kinematic ones. Where it does not know a robot, ``robot_iou`` is withheld with the reason. Means
 over trajectories of every frame show drift along a rollout. `metric_registry` lists every metric.
 """
 
@@ -48,6 +49,8 @@ from worldline_core.store.atomic import write_json_atomic
 
 logger = logging.getLogger(__name__)
 
+MIN_SEGMENTER_IOU = 0.7
+"""Below this agreement with kinematic masks on true frames a segmenter does not know the robot."""
 BY_FRAME_FILE = "by_frame.parquet"
 _BY_FRAME_COLUMNS: tuple[str, ...] = ("method", "split", "view", "metric", "frame", "mean", "count")
 
@@ -137,10 +140,12 @@ def _write(
 
     scores = [score(method, row, HEAD, seed, metric, value) for method, row, seed, metric, value in pairs]
     by_frame: list[tuple[str, str, str, str, list[float | None]]] = []
+    withheld = unchecked_segmenters(records, segmenters)
     for method, row, content in records:
         for item in content["measured"]:
-            by_frame += [(method, row.split, item["view"], name, frames) for name, frames in item["frames"].items()]
-            values = {name: finite_mean(frames) for name, frames in item["frames"].items()} | item.get("video", {})
+            kept_frames = {n: frames for n, frames in item["frames"].items() if (row.embodiment, n) not in withheld}
+            by_frame += [(method, row.split, item["view"], name, frames) for name, frames in kept_frames.items()]
+            values = {name: finite_mean(frames) for name, frames in kept_frames.items()} | item.get("video", {})
             # What is empty in every frame is left out.
             scores += [
                 score(method, row, item["view"], item["seed"], name, value)
@@ -158,6 +163,10 @@ def _write(
             expected=f"predictions of the views {', '.join(config.views)}",
             next_step="evaluate_video.views names what is measured",
         )  # fmt: skip
+    for (embodiment, metric), reason in withheld.items():
+        logger.warning("%s is withheld: %s: %s", metric, embodiment, reason)
+        known = [unavailable[metric]] if metric in unavailable else []
+        unavailable = {**unavailable, metric: "; ".join([*known, f"{embodiment}: {reason}"])}
     accuracy = summarise([score for score in scores if score.method == TRUE_METHOD], **options)["metrics"]
     accuracy = {group: methods[TRUE_METHOD] for group, methods in accuracy.items()}
     summary = {
@@ -181,6 +190,35 @@ def _write(
         "methods": summary["methods"],
         "scores": len(scores),
     }
+
+
+def unchecked_segmenters(
+    records: Sequence[Measured], segmenters: Mapping[str, Segmenter]
+) -> dict[tuple[str, str], str]:
+    """By embodiment and metric, why a segmenter's IoU says nothing about a robot.
+
+    Where a recording has no exact masks, the segmenter's masks of its true frames must agree with the kinematic ones.
+    """
+    withheld = {}
+    for suffix in segmenters:
+        agreed: dict[str, list[float | None]] = defaultdict(list)
+        for method, row, content in records:
+            for item in content["measured"] if method == TRUE_METHOD else ():
+                if f"robot_iou_exact{suffix}" not in item["frames"]:
+                    agreed[row.embodiment].append(finite_mean(item["frames"].get(f"robot_iou_kinematic{suffix}", ())))
+        for embodiment, values in agreed.items():
+            mean = finite_mean(values)
+            if mean is None:
+                reason = "no exact masks, and no head camera to draw kinematic ones with: the segmenter is unchecked"
+            elif mean < MIN_SEGMENTER_IOU:
+                reason = (
+                    f"its masks of true frames agree with kinematic ones by {mean:.2f} (of {len(values)} episodes), "
+                    f"less than {MIN_SEGMENTER_IOU}"
+                )
+            else:
+                continue
+            withheld[embodiment, f"robot_iou{suffix}"] = reason
+    return withheld
 
 
 def write_by_frame(path: Path, videos: Sequence[tuple[str, str, str, str, Sequence[float | None]]]) -> None:

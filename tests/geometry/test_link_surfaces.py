@@ -1,0 +1,92 @@
+"""Points on the links: from meshes and shapes of a description, where they are, and none of what cannot be read."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from worldline_core.errors import DataError
+from worldline_core.geometry.embodiment import Embodiment, load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.link_surfaces import link_surfaces, mesh_vertices
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=np.float32)
+MJCF = """<mujoco><compiler angle="degree" meshdir="meshes"/>
+<default><default class="seen"><geom type="mesh" contype="0"/><mesh scale=".1 .1 .1"/></default></default>
+<asset><mesh class="seen" name="m" file="part.{form}"/></asset>
+<worldbody><body name="arm" childclass="seen"><joint name="j"/>
+<geom mesh="m" pos="0 0 1" euler="0 0 90"/></body>
+<body name="ball"><geom type="sphere" size=".2" pos="1 0 0"/></body>
+<body name="brick"><geom type="box" size=".1 .2 .3"/></body></worldbody></mujoco>"""
+URDF = """<robot name="r"><link name="base"/>
+<link name="arm"><visual><origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/>
+<geometry><mesh filename="package://any/meshes/part.{form}" scale=".1 .1 .1"/></geometry></visual></link>
+<link name="ball"><collision><origin xyz="1 0 0"/><geometry><sphere radius=".2"/></geometry></collision></link>
+<link name="brick"><visual><geometry><box size=".2 .4 .6"/></geometry></visual></link>
+{joints}</robot>"""
+JOINTS = "".join(
+    f'<joint name="j{n}" type="revolute"><parent link="base"/><child link="{n}"/></joint>'
+    for n in ("arm", "ball", "brick")
+)
+
+
+def write_mesh(folder: Path, form: str) -> None:
+    folder.mkdir(exist_ok=True)
+    faces = [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)]
+    if form == "obj":
+        lines = [f"v {x} {y} {z}" for x, y, z in CORNERS] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+        (folder / "part.obj").write_text("\n".join(lines))
+        return
+    body = b"".join(struct.pack("<12fH", *np.zeros(3), *CORNERS[list(face)].ravel(), 0) for face in faces)
+    (folder / "part.stl").write_bytes(bytes(80) + struct.pack("<I", len(faces)) + body)
+
+
+def described(folder: Path, form: str, text: str, **changes: Any) -> Embodiment:
+    path = folder / f"robot.{form}"
+    path.write_text(text)
+    arm = {"name": "right", "joints": ["j"], "limits": [(-1, 1)], "end_effector_link": "arm",
+           "T_link_tool": {}, "gripper": {"closed": 0.0, "open": 1.0}}  # fmt: skip
+    return Embodiment.model_validate({
+        "name": "r", "base_link": "world", "arms": [arm], "description_path": path,
+        "description": {"format": form, "file": path.name, **changes},
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize("mesh", ["stl", "obj"])
+@pytest.mark.parametrize("form", ["mjcf", "urdf"])
+def test_points_are_where_the_shapes_are(tmp_path: Path, form: str, mesh: str) -> None:
+    write_mesh(tmp_path / "meshes", mesh)
+    text = (MJCF if form == "mjcf" else URDF).format(form=mesh, joints=JOINTS)
+    found = link_surfaces(described(tmp_path, form, text))
+    points, _ = found["arm"]
+    turned = np.array([[0, 0, 1], [0, 0.1, 1], [-0.2, 0, 1], [0, 0, 1.3]])
+    assert {tuple(np.round(point, 6) + 0.0) for point in points} == {tuple(row) for row in turned}
+    points, radii = found["ball"]
+    assert (points.tolist(), radii.tolist()) == ([[1, 0, 0]], [0.2])
+    assert np.abs(found["brick"][0]).max(axis=0) == pytest.approx([0.1, 0.2, 0.3])
+
+
+def test_a_mesh_that_is_not_here_gives_no_points_and_a_damaged_one_is_refused(tmp_path: Path) -> None:
+    assert "arm" not in link_surfaces(described(tmp_path, "mjcf", MJCF.format(form="stl")))
+    assert len(mesh_vertices(tmp_path / "part.dae")) == 0
+    for data in (b"", bytes(80) + struct.pack("<I", 5) + b"\0" * 50):
+        (tmp_path / "part.stl").write_bytes(data)
+        with pytest.raises(DataError, match="mesh"):
+            mesh_vertices(tmp_path / "part.stl")
+
+
+@pytest.mark.parametrize("name", ["viperx_graphite", "ur5e_silver", "xarm7_single", "panda_ivory"])
+def test_shipped_spheres_lie_on_the_links(name: str) -> None:
+    """Each link's points in MuJoCo's reading of the file, against those by our kinematics."""
+    kinematics = ArmKinematics(load_embodiment(name))
+    model = mujoco.MjModel.from_xml_path(str(kinematics.embodiment.description_path))
+    for link, (points, radii) in kinematics.surfaces.items():
+        geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body(link).id]
+        assert np.allclose(model.geom_pos[geoms], points)
+        assert np.allclose(model.geom_size[geoms, 0], radii)
+    assert len(kinematics.surfaces) >= 8
