@@ -6,16 +6,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
 import tools.corrupted.__main__ as command
-from tools.corrupted import lerobot_v21
 from tools.corrupted.attacks import ATTACKS
 from tools.corrupted.corpus import confusion, is_right, outcomes, write_corpus
-from tools.corrupted.labels import Label
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.guards.rejection import REASONS
@@ -44,30 +41,6 @@ def test_every_damaged_recording_is_accounted_for_by_its_true_reason(tmp_path: P
         "a set must not name this machine's folders"
     )
     assert all(row.detail.strip() for row in rows)
-
-
-def test_the_damage_depends_on_the_seed_alone(tmp_path: Path) -> None:
-    content = {}
-    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        root = tmp_path / name / "corpus" / "set"
-        lerobot_v21.write(root, 1, 1, np.random.default_rng(seed))
-        files = sorted(path for path in root.rglob("*") if path.is_file() and not path.is_symlink())
-        content[name] = [(path.relative_to(root), path.read_bytes()) for path in files]
-    assert content["a"] == content["b"]
-    assert content["a"] != content["c"]
-
-
-def test_an_outcome_counts_only_at_the_stage_that_has_to_find_it() -> None:
-    from tools.corrupted.corpus import Outcome
-
-    label = Label("e", "layout", "still", "filter", ("static",))
-    assert is_right(label, Outcome("filter", "static"))
-    assert not is_right(label, Outcome("curate", "static"))
-    assert not is_right(label, Outcome("filter", "corrupted"))
-    assert not is_right(label, None)
-    clean = Label("e", "layout", "clean")
-    assert is_right(clean, Outcome("stage2", "missing_view"))
-    assert not is_right(clean, Outcome("filter", "static"))
 
 
 def test_the_table_of_attacks_names_a_wrong_ending(

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
 pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
 from tools.corrupted import mutations
-from tools.corrupted.mutations import attack, mutations_of, read_everything
+from tools.corrupted.mutations import attack, read_everything
 from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.sources.open import SourceConfig
 
@@ -43,15 +42,12 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SourceConfig]
 @pytest.mark.parametrize("cases", [CASES // 4, pytest.param(CASES, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_damage_ends_in_a_named_error(sources: dict[str, SourceConfig], layout: str, cases: int) -> None:
+    assert set(sources) == set(LAYOUTS)
     config = sources[layout]
     read_everything(config, config.path)
     unexpected = list(attack(config, config.path, cases, seed=1))
     assert not unexpected, unexpected
     read_everything(config, config.path)
-
-
-def test_every_layout_is_damaged(sources: dict[str, SourceConfig]) -> None:
-    assert set(sources) == set(LAYOUTS)
 
 
 def test_an_error_that_is_not_ours_is_found(sources: dict[str, SourceConfig], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,12 +61,3 @@ def test_an_error_that_is_not_ours_is_found(sources: dict[str, SourceConfig], mo
     config = sources["lerobot_v21"]
     found = list(attack(config, config.path, 60, seed=0))
     assert {error.error.split(":")[0] for error in found} & {"KeyError", "TypeError", "JSONDecodeError"}
-
-
-def test_damage_depends_on_the_seed_alone_and_changes_something() -> None:
-    content = json.dumps({"a": [1, 2, {"b": "c"}], "d": None}).encode()
-    for mutate in {*mutations_of(Path("x.json")), *mutations_of(Path("x.mp4"))}:
-        first, second = (mutate(content, np.random.default_rng(4)) for _ in range(2))
-        assert first == second
-        results = {mutate(content, np.random.default_rng(seed)) for seed in range(30)}
-        assert len(results) > 10, mutate.__name__
