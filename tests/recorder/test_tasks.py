@@ -69,7 +69,7 @@ def test_every_task_succeeds_in_about_half_of_the_draws_and_fails_in_several_way
 def test_bodies_reach_their_workspace(name: str) -> None:
     recorder = EpisodeRecorder(name)
     tasks = [task for task in TASKS if task != "carry" or len(BODIES[name].arms) == 2]
-    for number in range(10):
+    for number in range(15):
         random = np.random.default_rng([3, number])
         assert recorder.move(layout_of(recorder, tasks[number % len(tasks)], random), random, 33) is not None
 
