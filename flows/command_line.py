@@ -83,6 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_calibrate(commands)
     doctor = commands.add_parser("doctor", help="say what this machine can do")
     doctor.add_argument("--json", action="store_true", help="print JSON")
+    doctor.add_argument("--licences", action="store_true", help="list the licences of what is installed and shipped")
     doctor.set_defaults(run=_doctor)
     return parser
 
@@ -243,8 +244,11 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
 
 
 def _doctor(arguments: argparse.Namespace) -> None:
-    from worldline_core.doctor import examine_machine, format_findings
+    from worldline_core.doctor import examine_machine, format_findings, third_party_licences
 
+    if arguments.licences:
+        print("\n".join(third_party_licences(Path.cwd())))
+        return
     findings = examine_machine(Path.cwd())
     if arguments.json:
         import json

@@ -1,8 +1,9 @@
-"""Checks of `worldline doctor`: cores, memory, accelerators, codecs, GL, weights, Prefect."""
+"""Checks of `worldline doctor`: cores, memory, accelerators, codecs, GL, weights, Prefect; licences of what is installed."""
 
 from __future__ import annotations
 
 import ctypes.util
+import importlib.metadata
 import importlib.util
 import os
 import platform
@@ -14,7 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from worldline_core.errors import installing
+from worldline_core.config import CONFIG_ROOT
+from worldline_core.errors import WorldLineError, installing
 from worldline_core.shipped import SHIPPED, project_path
 
 EXTRAS = {
@@ -31,6 +33,9 @@ PUBLISHED_MODELS = (
     "facebook/sam3",
     "Qwen/Qwen3-VL-8B-Instruct",
 )
+
+
+_BUNDLED_GPL = ("libx264", "libx265")
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,32 @@ def format_findings(findings: list[MachineCheck]) -> str:
     return "\n".join(lines + (["", "What you can do:", *advice] if advice else []))
 
 
+def third_party_licences(project: Path) -> list[str]:
+    """A line for each installed package with the licence that it states and the libraries in its wheel, and for each licence
+    file beside shipped files."""
+    lines = []
+    for package in sorted(importlib.metadata.distributions(), key=lambda found: found.name.lower()):
+        facts = package.metadata
+        listed = facts.get_all("Classifier") or []
+        classifiers = [text.rsplit(" :: ", 1)[-1] for text in listed if text.startswith("License ::")]
+        stated = facts.get("License-Expression") or ", ".join(classifiers) or (facts.get("License") or "").strip()
+        files = [path for path in package.files or () if path.parts[0].endswith(".libs")]
+        bundled = sorted({path.name.split("-")[0].split(".")[0] for path in files})
+        gpl = [name for name in bundled if name in _BUNDLED_GPL]
+        lines.append(
+            f"{package.name} {package.version}: {stated.splitlines()[0][:80] if stated else 'not stated'}"
+            + (f"; in its wheel: {', '.join(bundled)}" if bundled else "")
+            + (f" ({' and '.join(gpl)}: GPL-2.0-or-later)" if gpl else "")
+        )
+    beside = [*project_path(project, SHIPPED).rglob("LICENSE"), *(CONFIG_ROOT / "embodiments" / "licenses").iterdir()]
+    for path in sorted(beside):
+        text = [
+            line.strip() for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()
+        ]
+        lines.append(f"{path}: {next((line for line in text if 'license' in line.lower()), text[0])[:80]}")
+    return lines
+
+
 def _hardware(project: Path) -> Iterator[MachineCheck]:
     import torch
 
@@ -87,9 +118,15 @@ def _hardware(project: Path) -> Iterator[MachineCheck]:
 def _libraries() -> Iterator[MachineCheck]:
     import av
 
-    missing = [name for name in ("libx264", "libdav1d") if name not in av.codecs_available]
-    found = f"PyAV {av.__version__}" + (f" without {', '.join(missing)}" if missing else ": H.264, AV1 decode")
-    yield _check("video codecs", not missing, found, "reinstall av from PyPI")
+    from worldline_core.data.video.encoder import video_codec
+
+    try:
+        found, advice = f"PyAV {av.__version__}: writes {video_codec()}", "reinstall av from PyPI"
+    except WorldLineError as error:
+        found, advice = error.what, error.next_step or f"expected {error.expected}"
+    readable = "libdav1d" in av.codecs_available
+    found += "" if readable else ", reads no AV1"
+    yield _check("video codecs", readable and ": writes" in found, found, advice)
     for package, purpose in EXTRAS.items():
         present = importlib.util.find_spec(package) is not None
         advice = installing(purpose.split()[0])

@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from worldline_core.data.video.clip import VideoClip, decode_frames, decode_video, video_size
-from worldline_core.data.video.encoder import X264_PARAMETERS, Encoding, VideoEncoder, concatenate_videos, encode_video
-from worldline_core.errors import DataError
+from worldline_core.data.video.encoder import (
+    CODEC_VARIABLE,
+    X264_PARAMETERS,
+    Encoding,
+    VideoEncoder,
+    concatenate_videos,
+    encode_video,
+)
+from worldline_core.errors import ConfigError, DataError, UnavailableError
 
 
 def picture(number: int, count: int = 12) -> np.ndarray:
@@ -18,8 +25,15 @@ def picture(number: int, count: int = 12) -> np.ndarray:
     return np.stack([value, 200 - value, np.full_like(value, 100)], axis=-1).astype(np.uint8)
 
 
+@pytest.fixture(params=["h264", "av1"])
+def codec(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Each codec that videos are encoded with."""
+    monkeypatch.setenv(CODEC_VARIABLE, request.param)
+    return request.param
+
+
 @pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv444p"])
-def test_a_video_keeps_its_pictures_and_its_bytes(tmp_path: Path, pixel_format: str) -> None:
+def test_a_video_keeps_its_pictures_and_its_bytes(tmp_path: Path, pixel_format: str, codec: str) -> None:
     frames = picture(0)
     for name in ("a.mp4", "b.mp4"):
         encode_video(tmp_path / name, frames, 8, crf=8, pixel_format=pixel_format)  # type: ignore[arg-type]
@@ -28,6 +42,17 @@ def test_a_video_keeps_its_pictures_and_its_bytes(tmp_path: Path, pixel_format: 
     assert decoded.shape == frames.shape
     assert np.abs(decoded.astype(int) - frames).mean() < 4
     assert video_size(tmp_path / "a.mp4") == (32, 48, 8.0)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].codec_context.codec.canonical_name == codec
+
+
+def test_a_codec_is_named_where_it_cannot_be_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(av, "codecs_available", av.codecs_available - {"libx264"})
+    with pytest.raises(UnavailableError, match=r"(?s)expected: libx264.*WORLDLINE_VIDEO_CODEC=av1"):
+        encode_video(tmp_path / "a.mp4", picture(0), 8)
+    monkeypatch.setenv(CODEC_VARIABLE, "mpeg4")
+    with pytest.raises(ConfigError, match=r"(?s)WORLDLINE_VIDEO_CODEC.*h264 or av1.*mpeg4"):
+        encode_video(tmp_path / "a.mp4", picture(0), 8)
 
 
 @pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv444p"])
@@ -52,6 +77,7 @@ def test_bytes_do_not_depend_on_the_processor(
     assert (tmp_path / "here.mp4").read_bytes() == (tmp_path / "plain.mp4").read_bytes()
 
 
+@pytest.mark.usefixtures("codec")
 def test_key_frames_are_where_they_are_wanted(tmp_path: Path) -> None:
     with VideoEncoder(tmp_path / "k.mp4", (32, 48), 30, Encoding(key_frame_interval=32)) as encoder:
         for frame in np.tile(picture(0, 1), (70, 1, 1, 1)):
@@ -61,12 +87,14 @@ def test_key_frames_are_where_they_are_wanted(tmp_path: Path) -> None:
     assert keys == [0, 32, 64]
 
 
+@pytest.mark.usefixtures("codec")
 @pytest.mark.parametrize("colour", [(255, 0, 0), (0, 255, 0), (0, 0, 255), (200, 100, 50), (0, 0, 0), (255, 255, 255)])
 def test_colours_are_not_shifted(tmp_path: Path, colour: tuple[int, int, int]) -> None:
     encode_video(tmp_path / "c.mp4", np.tile(np.array(colour, np.uint8), (4, 32, 48, 1)), 8, crf=5)
     assert np.abs(decode_video(tmp_path / "c.mp4")[2].astype(int) - colour).max() <= 3
 
 
+@pytest.mark.usefixtures("codec")
 @pytest.mark.parametrize("fps", [8.0, 29.97, 30.0])
 @pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv444p"])
 def test_frames_of_a_joined_video_are_found_exactly(tmp_path: Path, fps: float, pixel_format: str) -> None:

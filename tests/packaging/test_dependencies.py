@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+from worldline_core.doctor import third_party_licences
+
 PACKAGES = ("worldline_core", "tasks", "flows")
 NOT_IMPORTED = {"fastapi": "a bound for Prefect's server", "torchvision": "imported by transformers' video processors"}
 
@@ -25,6 +27,15 @@ def canonical(name: str) -> str:
 @pytest.fixture(scope="module")
 def project(project_root: Path) -> dict:
     return tomllib.loads((project_root / "pyproject.toml").read_text())["project"]
+
+
+def test_licences_of_packages_bundled_libraries_and_shipped_files_are_listed(project_root: Path) -> None:
+    lines = {line.partition(":")[0]: line for line in third_party_licences(project_root)}
+    av = next(line for name, line in lines.items() if name.startswith("av "))
+    assert re.search(r"BSD-3-Clause; in its wheel: .*libdav1d.* \(libx264 and libx265: GPL-2.0-or-later\)", av)
+    assert next(line for name, line in lines.items() if name.startswith("pyarrow ")).count("Apache") == 1
+    for path in sorted((project_root / "artifacts/shipped/robots").glob("*/LICENSE")):
+        assert "License" in lines[str(path)]
 
 
 def names(requirements: Iterable[str]) -> set[str]:

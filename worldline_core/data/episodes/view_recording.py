@@ -175,9 +175,9 @@ def _encoded(
                 encoder.add(image)
             count += 1
     check_length("Video", path.stem, states=recorded.num_frames, unit="frames", found=count)
-    if transform is None:
+    if transform is None or encoder is None:
         raise RejectedInputError("truncated_video", "View has no pictures", where=path.stem)
-    return transform, "h264", video.pixel_format
+    return transform, encoder.codec, video.pixel_format
 
 
 def _check_even_sides(size: tuple[int, int], pixel_format: str, view: str) -> None:

@@ -2,19 +2,21 @@
 
 Axis legend: frames are `uint8 (N, H, W, 3)`, RGB, first frame first.
 
-Encoding is single-threaded libx264 without B-frames, so the same frames give the same bytes, each clip starts at a key
-frame, and presentation order equals file order: clips can be joined without encoding again and found by frame number.
+Encoding is single-threaded and without B-frames, so the same frames give the same bytes, each clip starts at a key frame,
+and presentation order equals file order: clips can be joined without encoding again and found by frame number. The encoder
+is libx264 (H.264, GPL), or libaom (AV1, BSD) where WORLDLINE_VIDEO_CODEC is `av1`.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
 import av
 import cv2
@@ -25,7 +27,7 @@ from av.codec.context import Flags
 from av.container import OutputContainer
 from av.video.stream import VideoStream
 
-from worldline_core.errors import DataError
+from worldline_core.errors import ConfigError, DataError, UnavailableError
 
 _START_CODE = b"\x00\x00\x01"
 
@@ -63,6 +65,9 @@ def _are_lengths(data: bytes) -> bool:
 
 
 PixelFormat = Literal["yuv420p", "yuv444p"]
+VideoCodec = Literal["h264", "av1"]
+CODEC_VARIABLE = "WORLDLINE_VIDEO_CODEC"
+_ENCODERS: dict[VideoCodec, str] = {"h264": "libx264", "av1": "libaom-av1"}
 
 # BT.601, limited range, at every size, and stated in the file: readers that ignore what it states (OpenCV) assume it too.
 # Rows give Y, U, V of an RGB value in 0..255.
@@ -75,6 +80,35 @@ BITEXACT = {"fflags": "+bitexact", "movflags": "+faststart"}
 X264_PARAMETERS = "cpu-independent=1"
 """Without this x264 chooses other algorithms on other processors, and with AVX-512 about one clip in a hundred came out
 differently from run to run."""
+
+
+def video_codec() -> VideoCodec:
+    """The codec that videos are encoded with, as the environment variable WORLDLINE_VIDEO_CODEC says (default: h264).
+
+    Raises: ConfigError for another codec; UnavailableError where the installed PyAV has no encoder for it.
+    """
+    codec = os.environ.get(CODEC_VARIABLE) or "h264"
+    if codec not in _ENCODERS:
+        raise ConfigError(
+            "Not a codec to encode with", where=CODEC_VARIABLE, expected=" or ".join(_ENCODERS), got=codec
+        )
+    codec = cast("VideoCodec", codec)
+    if _ENCODERS[codec] not in av.codecs_available:
+        raise UnavailableError(
+            "PyAV has no encoder for the videos that are written",
+            where=f"PyAV {av.__version__}",
+            expected=_ENCODERS[codec],
+            next_step=f"set {CODEC_VARIABLE}={'av1' if codec == 'h264' else 'h264'}, or install PyAV's wheel",
+        )
+    return codec
+
+
+def _encoder_options(codec: VideoCodec, encoding: Encoding) -> dict[str, str]:
+    if codec == "h264":
+        return {"crf": str(encoding.crf), "preset": encoding.preset, "bf": "0", "x264-params": X264_PARAMETERS}
+    # AV1's scale of quality has 63 steps instead of 51. Without lag no frame waits for later ones.
+    crf = str(round(encoding.crf * 1.1))
+    return {"crf": crf, "b:v": "0", "usage": "realtime", "cpu-used": "8", "lag-in-frames": "0", "row-mt": "0"}
 
 
 @contextmanager
@@ -122,10 +156,11 @@ def _planar(frame: np.ndarray, pixel_format: PixelFormat) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Encoding:
-    """How pictures become H.264.
+    """How pictures are encoded.
 
     Attributes:
         crf: quality, 0 (exact up to the colour conversion) .. 51; 18 is visually exact, 28 small.
+        preset: of x264.
         key_frame_interval: frames from one key frame to the next at most.
     """
 
@@ -136,7 +171,7 @@ class Encoding:
 
 
 class VideoEncoder:
-    """Writes an H.264 mp4 picture by picture; use as a context manager. Its bytes depend on the arguments alone.
+    """Writes an mp4 picture by picture; use as a context manager. Its bytes depend on the arguments and the codec alone.
 
     Args:
         size: (height, width); both even for yuv420p.
@@ -157,23 +192,21 @@ class VideoEncoder:
             )
         self.path = path
         self.size = size
+        self.codec = video_codec()
         self.count = 0
         self._rate = frame_rate(fps)
         self._pixel_format: PixelFormat = pixel_format
         self._out = av.open(str(path), "w", format="mp4", options=BITEXACT)
-        stream = self._out.add_stream("libx264", rate=self._rate)
+        stream = cast("VideoStream", self._out.add_stream(_ENCODERS[self.codec], rate=self._rate))
         stream.width, stream.height, stream.pix_fmt = width, height, pixel_format
         context = stream.codec_context
         context.thread_count = 1
         context.time_base = 1 / self._rate
         context.flags |= int(Flags.bitexact)
         stream.options = {
-            "crf": str(encoding.crf),
-            "preset": encoding.preset,
-            "bf": "0",
+            **_encoder_options(self.codec, encoding),
             "g": str(encoding.key_frame_interval),
             "threads": "1",
-            "x264-params": X264_PARAMETERS,
             "colorspace": "smpte170m",
             "color_primaries": "bt709",
             "color_trc": "bt709",
@@ -232,7 +265,7 @@ def encode_video(
     preset: str = "slow",
     pixel_format: PixelFormat = "yuv420p",
 ) -> None:
-    """Write frames as an H.264 mp4 whose bytes depend on the arguments alone.
+    """Write frames as an mp4 whose bytes depend on the arguments and the codec alone.
 
     Args:
         frames: uint8 (H, W, 3) RGB one after the other; H and W even for yuv420p.
@@ -275,12 +308,14 @@ def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float
             count = 0
             with av.open(str(part)) as source:
                 template = source.streams.video[0]
+                is_h264 = template.codec_context.codec.canonical_name == "h264"
                 if stream is None:
-                    stream = out.add_stream_from_template(template)
+                    # Opaque where the decoder (dav1d) has another name than an encoder.
+                    stream = out.add_stream_from_template(template, opaque=not is_h264)
                     stream.time_base = template.time_base
                 ticks = 1 / (rate * (template.time_base or 1 / rate))
-                # The encoder's own message (a kilobyte of settings) would otherwise repeat for each clip.
-                without_message = BitStreamFilterContext("filter_units=remove_types=6", template)
+                # x264's own message (a kilobyte of settings) would otherwise repeat for each clip.
+                without_message = BitStreamFilterContext("filter_units=remove_types=6" if is_h264 else "null", template)
                 for filtered in _filtered(source.demux(template), without_message):
                     packet = length_prefixed(filtered, template)
                     packet.pts = packet.dts = round((first_frame + count) * ticks)
