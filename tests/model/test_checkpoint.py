@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from worldline_core.errors import CheckpointError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import ActionContract, WorldModelConfig
+from worldline_core.model.world_model_config import ActionContract, CausalSpec, WorldModelConfig
 
 CONTRACT = ActionContract(
     controls="action",
@@ -75,8 +75,13 @@ def test_the_generation_tower_is_taken_out_of_a_checkpoint_with_both(folder: Pat
 
 
 def test_what_does_not_fit_the_caller_is_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"(?s)wrong kind.*expected: causal.*got: stage2"):
+    with pytest.raises(CheckpointError, match=r"(?s)wrong kind.*expected: causal.*got: stage2.*task distill"):
         load_checkpoint(folder, expect_kind="causal")
+    spec = CausalSpec(block_size=1, sink_blocks=1, recent_blocks=2, anchor_blocks=None, sigmas=(1.0, 0.0))
+    save_checkpoint(tmp_path / "k", build(), kind="causal", action_contract=CONTRACT, causal=spec)
+    for wanted in (("base", "stage1", "stage2"), "stage2"):  # of Stage II's training, of a rollout of full clips
+        with pytest.raises(CheckpointError, match=r"(?s)got: causal.*--input causal=.*block_causal"):
+            load_checkpoint(tmp_path / "k", expect_kind=wanted)
     with pytest.raises(CheckpointError, match=r"(?s)contract differs.*tracks: fps.*expected:.*8\.0.*got:.*10\.0"):
         CONTRACT.require(where="tracks", fps=10.0, controls="action")
     with pytest.raises(CheckpointError, match="No checkpoint here"):

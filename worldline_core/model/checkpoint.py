@@ -280,6 +280,14 @@ def read_checkpoint_info(folder: Path) -> CheckpointInfo:
     return described(CheckpointInfo, {k: v for k, v in content.items() if k not in ("format", "version")}, path)
 
 
+_KIND_HINTS = {
+    "causal": "train from the Stage II model that it was distilled from, or go on with it by"
+    " worldline task distill --input causal=FOLDER; its rollouts have sampler.kind block_causal",
+    "stage2": "worldline task distill makes a causal model of it; its rollouts have sampler.kind full_clip",
+    "stage1": "worldline task train_stage2 makes a model that takes controls of it",
+}
+
+
 def load_checkpoint(
     folder: Path,
     *,
@@ -305,7 +313,11 @@ def load_checkpoint(
     kinds = (expect_kind,) if isinstance(expect_kind, str) else expect_kind
     if kinds is not None and info.kind not in kinds:
         raise CheckpointError(
-            "The checkpoint is of the wrong kind", where=folder, expected=" or ".join(kinds), got=info.kind
+            "The checkpoint is of the wrong kind",
+            where=folder,
+            expected=" or ".join(kinds),
+            got=info.kind,
+            next_step=_KIND_HINTS.get(info.kind),
         )
     config = info.config
     if towers == "both" and config.towers != "both":

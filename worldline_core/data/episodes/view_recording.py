@@ -253,7 +253,7 @@ def _write_copy(
         written.time_base = tick
         for number, packet in enumerate(chain(packets, (None,))):  # None: what the decoder still holds
             for frame in stream.codec_context.decode(packet):
-                picture = Picture(frame)
+                picture = Picture(frame, clip.path)
                 if picture.damaged or picture.stored_size != size:
                     raise damaged_frame(clip, picture, found)
                 yield picture

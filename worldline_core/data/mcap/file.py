@@ -526,7 +526,7 @@ def _picture(frame: av.VideoFrame, where: str, *, calibrated: bool) -> tuple[int
     check_image_size(frame.width, frame.height, where)
     if frame.is_corrupt or frame.pts is None:
         raise _lost_frame(f"{where}, frame {frame.pts}")
-    picture = Picture(frame)
+    picture = Picture(frame, where)
     if calibrated and picture.orientation != UPRIGHT:
         raise turned_view(where, picture.orientation)
     return int(frame.pts), picture.rgb

@@ -179,7 +179,7 @@ def shown_size(path: AnyPath) -> tuple[int, int, int]:
         frame = next(container.decode(stream), None)
         if frame is None:
             raise undecodable(path, "no frames")
-        picture = Picture(frame)
+        picture = Picture(frame, path)
         return *picture.size, picture.orientation
 
 
@@ -254,7 +254,7 @@ def _counted(clip: VideoClip) -> Iterator[Picture]:
             if frame.pts is None:
                 continue
             if clip.skip <= seen < clip.skip + clip.num_frames:
-                yield Picture(frame, reformatter)
+                yield Picture(frame, clip.path, reformatter)
             seen += 1
             if clip.file_frames is None and seen == expected:
                 return
@@ -271,7 +271,7 @@ def _timed(clip: VideoClip) -> Iterator[Picture]:
                 continue
             number = (float(frame.pts * time_base) - clip.start_time) * clip.fps
             if round(number) == found and abs(number - found) < FRAME_TOLERANCE:
-                yield Picture(frame, reformatter)
+                yield Picture(frame, clip.path, reformatter)
                 found, nearest = found + 1, math.inf
             elif abs(number - found) < abs(nearest):
                 nearest = number - found
@@ -379,7 +379,7 @@ class FrameDecoder:
                     continue
                 if late > FRAME_TOLERANCE:
                     break
-                yield Picture(frame, self._reformatter).rgb
+                yield Picture(frame, clip.path, self._reformatter).rgb
                 found += 1
                 if found == len(times):
                     return

@@ -31,11 +31,13 @@ class Picture:
     """One decoded frame.
 
     Args:
+        where: the file or topic that it comes from, for errors.
         reformatter: shared by frames of one size and format, since setting one up costs as much as a small frame.
     """
 
-    def __init__(self, frame: VideoFrame, reformatter: VideoReformatter | None = None) -> None:
+    def __init__(self, frame: VideoFrame, where: object, reformatter: VideoReformatter | None = None) -> None:
         self._frame = frame
+        self._where = where
         self._reformatter = reformatter
 
     @cached_property
@@ -116,6 +118,7 @@ class Picture:
             raise RejectedInputError(
                 "unreadable",
                 "Colours of the video cannot be converted",
+                where=self._where,
                 expected="a matrix of " + ", ".join(dict.fromkeys(_MATRICES.values())),
                 got=f"matrix coefficients {stated} (ITU-T H.273)",
                 next_step="encode the video again with -vf scale=out_color_matrix=bt709 -colorspace bt709",
