@@ -38,7 +38,7 @@ from worldline_core.evaluation.paired import (
 from worldline_core.evaluation.recordings import HEAD
 from worldline_core.evaluation.scores import SCORES_FILE, Interval
 from worldline_core.pages import charts
-from worldline_core.pages.page import Table, code, interval, render, words
+from worldline_core.pages.page import render, words
 from worldline_core.pictures import contact_sheet, jpeg_bytes
 from worldline_core.report.context import SPLIT_LABELS
 from worldline_core.report.videos import compared_rows
@@ -403,10 +403,13 @@ def compare_with_history(
     content = asdict(compared) | {"changes": changes, "regressions": compared.regressions}
     write_json_atomic(history / "comparison.json", content)
     nights = read_history(history)
-    page = render(
-        "report/nights.html", title="WorldLine nightly evaluation", compared=compared, nights=nights, charts=_trends(nights),
-        tables=[_changes(compared, verdict) for verdict in ("worse", "missing", "better")],
-    )  # fmt: skip
+    values = {
+        "title": "WorldLine nightly evaluation",
+        "compared": compared,
+        "nights": nights,
+        "charts": _trends(nights),
+    }
+    page = render("report/nights.html", **values)
     write_bytes_atomic(history / "index.html", page.encode())
     return compared
 
@@ -447,21 +450,6 @@ def _write_pictures(history: Path, compared: NightlyComparison, artifacts: Mappi
         sheet = contact_sheet(compared_rows(rollouts[method], episodes, recording, [HEAD]), title=what)
         write_bytes_atomic(history / written[what], jpeg_bytes(sheet))
     return written
-
-
-def _changes(compared: NightlyComparison, verdict: Verdict) -> Table | None:
-    rows = [
-        [
-            code(c.metric),
-            *(interval(None if value is None else asdict(value), 3) for value in (c.previous, c.present)),
-            None if c.test is None else interval(asdict(c.test), 3, signed=True),
-            c.worst,
-        ]
-        for c in compared.changes
-        if c.verdict == verdict
-    ]
-    headings = "Metric", "Last good night", "This night", "Difference on the same recordings", "Most on"
-    return Table(headings, rows, [1, 2, 3], verdict.capitalize()) if rows else None
 
 
 def _trends(nights: Sequence[Night]) -> list[Markup]:

@@ -185,7 +185,7 @@ def policy_evaluation(summary: JsonObject) -> dict[str, object]:
     }
 
 
-def policy_ranking(policies: JsonObject) -> dict[str, object]:
+def policy_ranking(policies: JsonObject) -> JsonObject:
     """Agreement of recorded and predicted success rates of policies, and every policy's rates."""
     methods = in_order(policies)
     rates = {m.name: policies[m.name][ALL]["policies"] for m in methods}
@@ -212,10 +212,13 @@ def planning_evaluation(summary: JsonObject) -> dict[str, object]:
     }  # fmt: skip
     series = [Series("direct execution", x, [summary["direct_execution"]["mean"]] * len(x), colour="c5", dashed=True)]
     for m in order:
-        bounds = ("mean", "low", "high") if m.kind in MODELS else ("mean",)
-        values = [[(value or {})[key] for value in success[m.name].values()] for key in bounds]
-        style = {"colour": m.colour, "dashed": m.group == "run", "markers": True}
-        series.append(Series(m.long_label, [*success[m.name]], *values, **style))
+        mean, low, high = (
+            [float((value or {})[key]) for value in success[m.name].values()] for key in ("mean", "low", "high")
+        )
+        bounds = (low, high) if m.kind in MODELS else (None, None)
+        series.append(
+            Series(m.long_label, [*success[m.name]], mean, *bounds, m.colour, dashed=m.group == "run", markers=True)
+        )
     chart = line_chart(
         series, title="Success of the chosen candidate, 95 % interval over banks", x_label="candidates N", y_label="success",
         log_x=True, x_ticks=x, in_percent=True, y_range=(0.0, 1.02),
