@@ -39,7 +39,7 @@ def write_set(root: Path, count: int) -> None:
     poses = np.tile(np.diag([1.0, -1, -1, 1]), (count, 1, 1, 1))
     poses[:, 0, :3, 3] = np.stack([0.2 * np.sin(time), 0.1 * np.cos(time), np.full(count, 0.8)], axis=1)
     K = np.array([[90.0, 0, 63.5], [0, 91.0, 47.5], [0, 0, 1]])
-    state = np.stack([np.sin(time), np.cos(time)], axis=1).astype(np.float32)
+    state = np.stack([np.sin(time), 0.5 + 0.5 * np.cos(time)], axis=1).astype(np.float32)
     episode = Episode(
         episode_id="long", source="toy", embodiment="none", scene="s", task_family="lift", instruction="lift the red cube",
         outcome="success", split="test", fps=FPS, state=state, action=state, timestamps=time, T_base_ee=poses, gripper=state[:, 1:],
@@ -65,6 +65,9 @@ class Recorded:
         self.episodes, self.rollouts = EpisodeSet.open(root / "episodes"), RolloutSet.open(root / "rollouts")
         self.tracks_of_episode = shown_tracks(self.episodes.episode(0))
         self.videos = {view: VideoFrames(self.episodes.clip(0, view)) for view in VIEWS}
+
+    def __contains__(self, _: str) -> bool:
+        return True
 
     def tracks(self, _: str) -> Any:
         return self.tracks_of_episode
