@@ -12,12 +12,7 @@ from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.cameras import CameraPose, project_points
 from worldline_core.geometry.tensor_transforms import is_rigid
-from worldline_core.geometry.transforms import (
-    MAX_ROTATION_DEVIATION,
-    mean_pose,
-    repair_rotations,
-    rotation_deviation,
-)
+from worldline_core.geometry.transforms import MAX_ROTATION_DEVIATION, mean_pose, repair_rotations, rotation_deviation
 
 K = np.array([[322.0, 0.0, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]])
 
@@ -62,10 +57,7 @@ def test_a_rotation_within_the_threshold_is_repaired_and_counted(deviation: floa
     recorded = poses()
     true = recorded.copy()
     recorded[[1, 3], :3, :3] = off_by(deviation, recorded[[1, 3], :3, :3])
-    for extrinsics, expected in (
-        ("camera_to_base", true),
-        ("base_to_camera", np.linalg.inv(true)),
-    ):
+    for extrinsics, expected in (("camera_to_base", true), ("base_to_camera", np.linalg.inv(true))):
         pose = CameraPose.of(recorded, extrinsics=extrinsics, axes="opencv", where="episode 4, view head")
         assert pose.repair.count == 2
         assert pose.repair.largest == pytest.approx(deviation, rel=1e-2)

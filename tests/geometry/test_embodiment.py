@@ -112,8 +112,7 @@ def test_position_beyond_a_limit_is_named_with_its_limits(tmp_path):
     embodiment = load_embodiment(write(tmp_path))
     state = np.array([[0.0, 0.0, 0.0], [1.5, -2.1, 0.0], [1.2, 0.0, 0.0]])
     with pytest.raises(
-        DataError,
-        match=r"beyond its limit[\s\S]*episode 3.*frame 1, pan[\s\S]*-1 to 1[\s\S]*1\.5; 2 of 3 frames",
+        DataError, match=r"beyond its limit[\s\S]*episode 3.*frame 1, pan[\s\S]*-1 to 1[\s\S]*1\.5; 2 of 3 frames"
     ):
         embodiment.check_limits(state, "episode 3")
     embodiment.check_limits(state[:1], "episode 3")

@@ -8,12 +8,7 @@ import pytest
 import torch
 
 from worldline_core.errors import DataError
-from worldline_core.model.block_causal_attention import (
-    CachedAttention,
-    KVCache,
-    TeacherForcingAttention,
-    block_bounds,
-)
+from worldline_core.model.block_causal_attention import CachedAttention, KVCache, TeacherForcingAttention, block_bounds
 from worldline_core.model.layers import Rotation, rotate
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CausalSpec

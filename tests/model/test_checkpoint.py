@@ -16,13 +16,7 @@ from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_inf
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, CausalSpec, WorldModelConfig
 
-CONTRACT = ActionContract(
-    controls="action",
-    fps=8.0,
-    sigma_px_ref=10.0,
-    grid_size=(8, 12),
-    tokenizer="0123",
-)
+CONTRACT = ActionContract(controls="action", fps=8.0, sigma_px_ref=10.0, grid_size=(8, 12), tokenizer="0123")
 
 
 def build(**changes: object) -> WorldModel:

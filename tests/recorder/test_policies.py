@@ -49,11 +49,7 @@ def test_a_late_policy_does_the_same_later_and_a_late_gripper_alone(recorder):
     layout = sample_layout(recorder.scene.robot, "lift", np.random.default_rng(2))
     on_time, late, gripper = (
         recorder.move(layout, np.random.default_rng(9), 33, policy).action
-        for policy in (
-            ScriptedPolicy(),
-            ScriptedPolicy(delay_frames=5),
-            ScriptedPolicy(gripper_delay_frames=-3),
-        )
+        for policy in (ScriptedPolicy(), ScriptedPolicy(delay_frames=5), ScriptedPolicy(gripper_delay_frames=-3))
     )
     np.testing.assert_array_equal(late[5:], on_time[:-5])
     np.testing.assert_array_equal(late[:5], np.repeat(on_time[:1], 5, axis=0))

@@ -18,11 +18,7 @@ from worldline_core.config import load_config
 from worldline_core.errors import UnavailableError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 from worldline_core.rehearsal.outside_models import OUTSIDE_MODELS, write_outside_models
-from worldline_core.rehearsal.rehearsal import (
-    ABLATION_SIZES,
-    changes_of,
-    table,
-)
+from worldline_core.rehearsal.rehearsal import ABLATION_SIZES, changes_of, table
 from worldline_core.report.ablation_table import load_variants
 
 PRESET = "cosmos3-nano"

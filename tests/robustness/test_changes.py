@@ -89,10 +89,7 @@ def test_a_file_that_becomes_a_link_between_check_and_use(
 
     during("set-000001", swap, monkeypatch)
     curate(config, {}, tmp_path / "out")
-    assert quarantined(tmp_path / "out") in (
-        {"set-000001": "changed_while_reading"},
-        {"set-000001": "path_traversal"},
-    )
+    assert quarantined(tmp_path / "out") in ({"set-000001": "changed_while_reading"}, {"set-000001": "path_traversal"})
     assert not list((tmp_path / "out" / "run").rglob("*.mp4"))
 
 

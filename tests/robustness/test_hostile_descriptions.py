@@ -45,10 +45,7 @@ def test_hostile_yaml_is_refused_by_name(text: str | bytes, tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "x.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    for read in (
-        lambda: load_config(CurateConfig, path=path, section="curate"),
-        lambda: load_embodiment(path),
-    ):
+    for read in (lambda: load_config(CurateConfig, path=path, section="curate"), lambda: load_embodiment(path)):
         began = time.monotonic()
         with pytest.raises(ConfigError, match="Not valid YAML"):
             read()

@@ -11,13 +11,7 @@ import pytest
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError, UnavailableError
-from worldline_core.scale.account import (
-    InputRow,
-    check_account,
-    read_account,
-    write_account,
-    write_shard_account,
-)
+from worldline_core.scale.account import InputRow, check_account, read_account, write_account, write_shard_account
 from worldline_core.scale.mapping import ends_the_run
 from worldline_core.store import remote as transient
 from worldline_core.store.remote import UnreachableInputError, is_transient, with_retries

@@ -98,12 +98,7 @@ def test_held_out_recordings_shorter_than_the_longest_clips_validate_what_fits(
 
 
 def stage2(**changes: Any) -> Stage2Config:
-    values = {
-        "trainer": TRAINER,
-        "clips": {"lengths": [9, 13, 17]},
-        "action_multiplier": 3.0,
-        "relational": None,
-    }
+    values = {"trainer": TRAINER, "clips": {"lengths": [9, 13, 17]}, "action_multiplier": 3.0, "relational": None}
     return Stage2Config.model_validate(values | changes)
 
 

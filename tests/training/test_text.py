@@ -23,10 +23,7 @@ CLIP = ClipFacts(17, 8.0, (32, 32))
 
 
 def test_stage1_feeds_the_chat_prompt_of_each_clip(
-    world: Any,
-    tiny_model: dict[str, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    world: Any, tiny_model: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_qwen2_tokenizer(tmp_path / "tokenizer")
     config = Stage1Config.model_validate(
