@@ -114,7 +114,8 @@ def diagnose(
     verdict, best, rivals = decide(as_recorded, ranked)
     if ranked[0].lag_at_edge and verdict == "unexplained":
         notes = (*notes, f"{ranked[0].text}: at the edge of what is tried; the lag may be larger")
-    notes = (*notes, *(f"{view}: its pictures stay the same while its arm moves" for view in search.frozen))
+    if verdict == "unexplained":
+        notes = (*notes, *(f"{view}: its pictures stay the same while its arm moves" for view in search.frozen))
     if rivals:
         notes = (*notes, f"These explain it equally well, nothing recorded tells which: {'; '.join(rivals)}")
     if best.other is not None:
@@ -153,13 +154,16 @@ class _Search:
             **(pose_terms(self.observation, reading) if poses is None else poses),
             **image_terms(self.observation, reading),
             **gripper_terms(self.observation, reading),
-            **dict.fromkeys((f"frozen {view}" for view in self.frozen), WORST_TERM),
+            **dict.fromkeys((f"frozen {view}" for view in frozen_views(self.observation, reading)), WORST_TERM),
         }
 
     def explain(self, reading: Reading, terms: dict[str, float], other: tuple[str, str] | None = None) -> Explanation:
         """A reading with its score: the sum of its terms, less the cost of departing from the contract."""
         departures = len(reading.conventions.departures) + (other is not None)
         cost = COMPLEXITY * (departures + (reading.conventions.views is not None) / 2)
+        # That no video is frozen in a reading is no gain: the picture of an arm that rests stays the same.
+        thawed = len(self.frozen) - sum(name.startswith("frozen ") for name in terms)
+        cost -= WORST_TERM * max(0, thawed)
         return Explanation(reading.conventions, float(sum(terms.values())) - cost, terms, other)
 
     @cached_property
@@ -225,7 +229,8 @@ class _Search:
             if not chosen or len(chosen) == len(views):
                 continue
             own = tuple(f" {view}" for view in chosen)
-            merged = {name: terms[name] if name.endswith(own) else value for name, value in written.items()}
+            merged = {name: value for name, value in written.items() if not name.endswith(own)}
+            merged |= {name: value for name, value in terms.items() if name.endswith(own)}
             conventions = late.conventions.model_copy(update={"views": chosen})
             yield self.explain(replace(late, conventions=conventions), merged)
 
@@ -248,15 +253,9 @@ class _Search:
             yield from self.as_written(observation, (name, "exchanged"))
 
     def as_written(self, observation: Observation, other: tuple[str, str]) -> Iterator[Explanation]:
-        """The reading of another observation as written; none where no tool poses are known.
-
-        That no video is frozen in it is no gain: the picture of an arm that rests stays the same.
-        """
+        """The reading of another observation as written; none where no tool poses are known."""
         if (reading := read(observation, RecordedConventions())) is not None:
-            search = _Search(observation, reading)
-            found = self.explain(reading, search.terms(reading), other)
-            thawed = max(0, len(self.frozen) - len(search.frozen))
-            yield replace(found, score=found.score + WORST_TERM * thawed)
+            yield self.explain(reading, _Search(observation, reading).terms(reading), other)
 
     def other_robots(self) -> Iterator[Explanation]:
         """The recording as written, with the other robots that have the same arms, if it has joints.
@@ -287,7 +286,8 @@ class _Search:
         if not better or len(better) == len(views):
             return self.explain(reading, terms)
         others = tuple(f" {view}" for view in views if view not in better)
-        merged = {name: written[name] if name.endswith(others) else value for name, value in terms.items()}
+        merged = {name: value for name, value in terms.items() if not name.endswith(others)}
+        merged |= {name: value for name, value in written.items() if name.endswith(others)}
         partial = self.read(reading.conventions.model_copy(update={"views": better}))
         return self.explain(reading if partial is None else partial, merged)
 

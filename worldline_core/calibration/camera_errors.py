@@ -69,6 +69,8 @@ DEVIATIONS_ALONE, DEVIATIONS_TOGETHER = 6.0, 3.5
 """Standard deviations from zero of a significant error, of one episode and of a source."""
 ALIKE = 25.0
 """Kinds of error whose remaining squares are this near explain the pictures as well."""
+FOCAL_KNOWN = 10.0
+"""Half interval [%] above which the focal length may be what is wrong, where several kinds are alike."""
 LEFT_OVER = 20.0
 """Squares that one kind of error may leave; above, several kinds are off at once."""
 OUTLIER_DEVIATIONS = 3.0
@@ -174,7 +176,11 @@ class CameraError:
             left[name] = self.squares - float(pull[part] @ np.linalg.solve(weight[part, part], pull[part]))
         best = min(left.values())
         if best <= LEFT_OVER:
-            return tuple(name for name in left if left[name] <= best + ALIKE)
+            alike = [name for name in left if left[name] <= best + ALIKE]
+            focal = next(each for each in self.kinds if each.kind == "focal length")
+            # Where a turn and a shift look alike, the focal length that goes with them is known no better.
+            beside = len(alike) > 1 and focal.half_interval > FOCAL_KNOWN
+            return tuple(name for name in left if name in alike or (beside and name == focal.kind))
         return tuple(each.kind for each in self.kinds if each.kind in KINDS and each.size > each.half_interval)
 
     def __str__(self) -> str:

@@ -374,12 +374,13 @@ def finger_agreement(observation: Observation, reading: Reading, arm: int) -> fl
     if reading.shape == "hands" or not _moves(observation, reading, arm):
         return None
     camera, tool = reading.cameras[view], reading.tools[:, arm, :3, 3]
-    near = np.median(lengths(reading.points - tool[:, None]), axis=0) < FINGER_LENGTH_M
+    points, radii = reading.capsules
+    near = np.median(lengths(points - tool[:, None]), axis=0) < FINGER_LENGTH_M
     T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
-    points = reading.points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
+    points = points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
     fixed = replace(camera, T_base_camera=np.eye(4)[None])
     states, images = reading.steps(observation.num_images, view)
-    predicted = predict_motion(points, reading.radii[near], fixed)[states]
+    predicted = predict_motion(points, radii[near], fixed)[states]
     moving = lengths(predicted) > MIN_FINGER_STEP_PX
     if moving.sum() < 10:
         return 0.0  # whether there is a term must not depend on the reading

@@ -82,9 +82,7 @@ class Observation:
     kinematics: ArmKinematics | None
     _motion: dict[str, Motion] = field(default_factory=dict, repr=False)
     _stands: dict[str, bool] = field(default_factory=dict, repr=False)
-    moved_arms: dict[tuple[int, bytes], tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = field(
-        default_factory=dict, repr=False
-    )
+    moved_arms: dict[tuple[int, bytes], tuple[np.ndarray, ...]] = field(default_factory=dict, repr=False)
     """Cached by kinematics and joints: most readings leave both as they are."""
 
     def motion(self, view: str) -> Motion:
@@ -221,6 +219,7 @@ class Reading:
         cameras: by view, K at the size of the grey images.
         gripper, gripper_command: (n, a) openings, None where the state has no gripper columns.
         points, radii: (n, p, 3), (p,) on the arms [m].
+        capsules: points and radii along the links' capsules, whose thin fingers are told apart.
         shape: what the points are of: the links' surfaces, capsules along the links, or hands where only tools are known.
         first: recorded frame that is frame 0.
     """
@@ -236,6 +235,7 @@ class Reading:
     points: np.ndarray
     radii: np.ndarray
     shape: Literal["surfaces", "capsules", "hands"]
+    capsules: tuple[np.ndarray, np.ndarray]
     first: int
     _predicted: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
@@ -276,8 +276,9 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
     episode = apply_conventions(recorded, conventions)
     tools, kinematic, action = episode.T_base_ee, None, None
     points, radii = np.zeros((episode.num_frames, 0, 3)), np.zeros(0)
+    capsules = points, radii
     if kinematics is not None and episode.state_kind == "joints":
-        kinematic, action, points, radii = _moved_arms(observation, kinematics, episode)
+        kinematic, action, points, radii, *capsules = _moved_arms(observation, kinematics, episode)
     if tools is None:
         if kinematic is None:
             return None
@@ -307,14 +308,13 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
         points,
         radii,
         shape,
+        (capsules[0], capsules[1]),
         frames_with_all(recorded.num_frames, conventions)[0],
     )
 
 
-def _moved_arms(
-    observation: Observation, kinematics: ArmKinematics, episode: Episode
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Tool poses of states and of commands, points on the arms and their radii."""
+def _moved_arms(observation: Observation, kinematics: ArmKinematics, episode: Episode) -> tuple[np.ndarray, ...]:
+    """Tool poses of states and of commands, points on the arms and their radii, and those of capsules along the links."""
     both = np.concatenate([episode.state, episode.action]).astype(np.float64)
     key = (id(kinematics), both.tobytes())
     if key not in observation.moved_arms:
@@ -323,14 +323,13 @@ def _moved_arms(
         links = kinematics.link_poses(both, posture=posture)
         fk = kinematics.tools_of(links).numpy()
         links = {name: poses[: episode.num_frames] for name, poses in links.items()}
+        capsules, radius = robot_capsules(kinematics, links)
+        points, radii = along = _sampled(capsules.numpy(), radius.numpy())
         if _has_surfaces(kinematics):
             poses = ((links[name].numpy(), shape) for name, shape in kinematics.surfaces.items())
             parts = [(shape @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3], size) for T, (shape, size) in poses]
             points, radii = np.concatenate([p for p, _ in parts], axis=1), np.concatenate([r for _, r in parts])
-        else:
-            capsules, radius = robot_capsules(kinematics, links)
-            points, radii = _sampled(capsules.numpy(), radius.numpy())
-        observation.moved_arms[key] = fk[: episode.num_frames], fk[episode.num_frames :], points, radii
+        observation.moved_arms[key] = fk[: episode.num_frames], fk[episode.num_frames :], points, radii, *along
     return observation.moved_arms[key]
 
 
