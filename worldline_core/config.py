@@ -301,10 +301,8 @@ def load_config[Model: BaseModel](
     Raises:
         ConfigError: anything that is not right with it.
     """
-    if (preset is None) == (path is None):
-        raise ConfigError("Give either a preset or a configuration file", got=f"preset={preset}, config={path}")
-    source = preset_path(preset) if preset is not None else cast("Path", path)
-    given = _with_extended(source)
+    given = read_config(preset, path)
+    source = preset_path(preset) if preset is not None else path
     values = apply_overrides(given, overrides)
     for override in overrides:
         keys = override.partition("=")[0].strip().split(".")
@@ -317,6 +315,13 @@ def load_config[Model: BaseModel](
             raise ConfigError("A section is a mapping", where=f"{source}: {section}", got=type(values).__name__)
     places = [str(source) if section is None else f"{source}: {section}", *(f"--set {text}" for text in overrides)]
     return validate(model, values, where=", ".join(places))
+
+
+def read_config(preset: str | None, path: Path | None) -> dict[str, Any]:
+    """The values of a preset or a file, with those of the preset that it extends."""
+    if (preset is None) == (path is None):
+        raise ConfigError("Give either a preset or a configuration file", got=f"preset={preset}, config={path}")
+    return _with_extended(preset_path(preset) if preset is not None else cast("Path", path))
 
 
 def _with_extended(source: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -101,6 +101,11 @@ class ArtifactTask:
         """Entry point of ``python -m tasks.<name>``."""
         load_object("tasks.execution.command_line:run_task_command")(self)
 
+    def lacks(self, names: Iterable[str]) -> list[str]:
+        """Required inputs that are not among the names."""
+        given = list(names)
+        return [pattern for pattern in self.inputs if not any(_matches(name, pattern) for name in given)]
+
     def key(self, store: ArtifactStore, config: StrictModel, digests: Mapping[str, str]) -> str:
         """Content key of the artifact, given the digests of its inputs."""
         return store.key(self.name, self.version, config, dict(sorted(digests.items())))
@@ -116,7 +121,7 @@ class ArtifactTask:
     def check_inputs(self, names: Mapping[str, Any]) -> None:
         """Raises ConfigError for a missing or an unknown input."""
         unknown = [name for name in names if not any(_matches(name, p) for p in (*self.inputs, *self.optional_inputs))]
-        missing = [pattern for pattern in self.inputs if not any(_matches(name, pattern) for name in names)]
+        missing = self.lacks(names)
         if unknown or missing:
             optional = f"; optional: {', '.join(self.optional_inputs)}" if self.optional_inputs else ""
             raise ConfigError(

@@ -60,13 +60,25 @@ def find_artifacts(calls: Mapping[str, TaskCall], store: ArtifactStore) -> dict[
 
 
 def ready_inputs(
-    call: TaskCall, calls: Mapping[str, TaskCall], store: ArtifactStore, given: Mapping[str, Path] | None = None
+    call: TaskCall,
+    calls: Mapping[str, TaskCall],
+    store: ArtifactStore,
+    given: Mapping[str, Path | None] | None = None,
 ) -> dict[str, Path]:
     """The folders of a call's inputs: finished artifacts of the calls before it, or those that are `given` instead.
 
+    Args:
+        given: one of a group (``rollouts.NAME``) takes the place of the whole group; None leaves an input out.
+
     Raises: ArtifactError when an artifact is not finished; the message names the command that makes it.
     """
-    needed = {key: source for key, source in call.inputs.items() if key not in (given or {})}
+    given = given or {}
+    groups = {name.partition(".")[0] for name in given if "." in name}
+    needed = {
+        key: source
+        for key, source in call.inputs.items()
+        if key not in given and not ("." in key and key.partition(".")[0] in groups)
+    }
     before = {name: calls[name] for name in list(calls)[: list(calls).index(call.name)]}
     found = find_artifacts(before, store)
     folders = {key: _folder(source, found) for key, source in needed.items()}
@@ -76,9 +88,11 @@ def ready_inputs(
             f"{call.name} needs artifacts that are not finished",
             where=store.root,
             got=f"missing: {', '.join(source.name for source in missing)}",
-            next_step=f"run `{missing[0].command}` with the same preset first, or `worldline pipeline`",
+            next_step=f"run `{missing[0].command}` with the same preset first, or `worldline pipeline`; or give its folder as"
+            f" --input (NAME=FOLDER; an empty FOLDER leaves an optional input out)",
         )
-    return {key: folder for key, folder in folders.items() if folder is not None} | dict(given or {})
+    found_here = {key: folder for key, folder in folders.items() if folder is not None}
+    return found_here | {name: folder for name, folder in given.items() if folder is not None}
 
 
 def _folder(source: TaskCall | Path, found: Mapping[str, Artifact]) -> Path | None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, TextIO, cast
 
 from safetensors import SafetensorError
 
-from tasks.execution.artifact_task import ArtifactTask
+from tasks.execution.artifact_task import ArtifactTask, TaskCall
 from tasks.execution.chain import find_artifacts, find_call, load_chain, outline, ready_inputs
 from tasks.execution.supervisor import run_supervised
 from worldline_core.config import load_config
@@ -53,7 +53,7 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
     add_config_arguments(parser)
     parser.add_argument(
         "--input", action="append", default=[], metavar="NAME=FOLDER", dest="inputs",
-        help="feed this folder instead of the artifact that the preset would use",
+        help="feed this folder instead of the artifact that the preset would use; NAME= leaves an optional input out",
     )  # fmt: skip
     parser.add_argument(
         "--runner", choices=("auto", "serial", "processes", "dask", "ray"),
@@ -65,7 +65,17 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_task(task: ArtifactTask, arguments: argparse.Namespace) -> Artifact:
-    """Run one task with parsed arguments, on the finished artifacts of those before it in the chain."""
+    """Run one task with parsed arguments, on the finished artifacts of those before it in the chain.
+
+    Of a file that does not describe a whole run, and of a task that the chain does not call by this name, the task's own section is
+    read; nothing is looked up then.
+    """
+    chosen = arguments.config is not None or arguments.preset is not None
+    if task.name == "curate" and arguments.name is None and not (chosen or arguments.overrides):
+        raise ConfigError(
+            "Nothing says which recordings to read", expected="--config FILE or --preset NAME", got="neither",
+            next_step="write their source into a file (docs/sources.md); --preset demo reads the shipped ones",
+        )  # fmt: skip
     preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "demo"
     from tasks.execution.shard_mapper import shard_mapper
     from worldline_core.pipeline.pipeline_config import PipelineConfig, source_folders
@@ -75,26 +85,27 @@ def run_task(task: ArtifactTask, arguments: argparse.Namespace) -> Artifact:
     runner = load_config(RunnerConfig, preset=preset, path=arguments.config, overrides=overrides, section="runner")
     store, mapper = ArtifactStore(arguments.artifacts, runner.verify), shard_mapper(runner)
     given = dict(_parse_input(text) for text in arguments.inputs)
-    if arguments.name is None and (task.name == "curate" or (task.inputs and set(task.inputs) <= set(given))):
-        # The task's own section is enough: a file for one's own data need not describe a whole run.
+    calls: dict[str, TaskCall] = {}
+    if (task.name != "curate" and not PipelineConfig.lacking(preset, arguments.config)) or arguments.name is not None:
+        calls = outline(load_chain(), PipelineConfig.load(preset, arguments.config, overrides))
+    if not calls or (arguments.name is None and task.name not in calls and not task.lacks(given)):
         config = load_config(
             task.load_config(), preset=preset, path=arguments.config, overrides=overrides, section=task.name
         )
         if task.name == "curate":
             given = {f"source.{n}": path for n, path in source_folders(cast("CurateConfig", config)).items()} | given
-        return store.linked(task.name, task.run(store, config, given, mapper))
-    whole = PipelineConfig.load(preset, arguments.config, overrides)
-    calls = outline(load_chain(), whole)
+        folders = {name: folder for name, folder in given.items() if folder is not None}
+        return store.linked(task.name, task.run(store, config, folders, mapper))
     call = find_call(calls, task.name, arguments.name)
     task.check_inputs({**call.inputs, **given})
     return store.linked(call.name, task.run(store, call.config, ready_inputs(call, calls, store, given), mapper))
 
 
-def _parse_input(text: str) -> tuple[str, Path]:
+def _parse_input(text: str) -> tuple[str, Path | None]:
     name, separator, folder = text.partition("=")
-    if not separator or not name or not folder:
+    if not separator or not name:
         raise ConfigError("An input has the form NAME=FOLDER", got=text)
-    return name, Path(folder)
+    return name, Path(folder) if folder else None
 
 
 def run_task_command(task: ArtifactTask) -> None:

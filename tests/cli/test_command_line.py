@@ -72,11 +72,17 @@ for command in ("pipeline", "nightly"):
         # The named step to run is a command that works.
         ("render_actions --name render_actions.banks", ["`worldline task curate --name curate.banks`"]),
         ("curate --name filter", ["filter", "curate.banks"]),
+        # An input that is given looks up the others all the same, and a file of one section none.
+        ("train_stage1 --preset tiny --input episodes={tmp}", ["encode_latents", "an empty FOLDER"]),
+        ("train_stage2 --preset tiny --input episodes={tmp} --input stage1={tmp}", ["render_actions, encode_latents"]),
+        ("filter --config {tmp}/own.yaml", ["missing ['episodes']", "--input NAME=FOLDER"]),
+        ("curate", ["--config FILE", "--preset demo"]),
     ],
 )
 def test_a_mistake_ends_with_a_clear_error(
     arguments: str, facts: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "own.yaml").write_text("filter: {min_segment_frames: 9}\n")
     with pytest.raises(SystemExit, match="1"):
         main(["task", *arguments.format(tmp=tmp_path).split(), "--artifacts", str(tmp_path / "store")])
     error = capsys.readouterr().err

@@ -11,6 +11,7 @@ from published_lerobot import write_droid
 from pydantic import ValidationError
 from test_lerobot_rows import run, source
 
+from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
@@ -43,7 +44,8 @@ def write_robot(folder: Path, name: str = "my_arm") -> Path:
     text = (EMBODIMENT_ROOT / "droid_franka.yaml").read_text().replace("droid_franka", name)
     text = re.sub(r"- \[-?\d+\.\d+, -?\d+\.\d+\]", "- [-7.0, 7.0]", text)
     (folder / f"{name}.yaml").write_text(text)
-    (folder / "franka_panda.xml").write_bytes((EMBODIMENT_ROOT / "franka_panda.xml").read_bytes())
+    description = (EMBODIMENT_ROOT / "franka_panda.xml").read_text()
+    (folder / "franka_panda.xml").write_text(f"{description}<!-- the user's copy -->\n")
     return folder / f"{name}.yaml"
 
 
@@ -63,6 +65,10 @@ def test_recordings_of_an_own_robot_carry_it(working_folder: Path, folder: str, 
     robot.rename(working_folder / "elsewhere.yaml")
     embodiments._carried.clear()
     assert "my_arm" not in embodiment_names()
+    again = {"kind": "episode_set", "path": str(working_folder / "out"), "name": "again"}
+    curate(CurateConfig.model_validate({"sources": [again]}), {}, working_folder / "again")
+    assert (working_folder / "again/embodiments/my_arm.yaml").is_file()
+    embodiments._carried.clear()
     EpisodeSet.open(working_folder / "filtered")
     assert "my_arm" in embodiment_names()
     assert np.array_equal(ArmKinematics(load_embodiment("my_arm")).tool_poses(np.zeros((1, 8))), expected)

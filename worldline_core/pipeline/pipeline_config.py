@@ -9,7 +9,7 @@ from typing import Literal, Self, cast
 from pydantic import Field, model_validator
 
 from worldline_core.actions.actions_config import RenderActionsConfig
-from worldline_core.config import StrictModel, load_config
+from worldline_core.config import StrictModel, load_config, read_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ConfigError, UnavailableError
@@ -99,6 +99,12 @@ class PipelineConfig(StrictModel):
     def load(cls, preset: str | None, path: Path | None = None, overrides: Sequence[str] = ()) -> Self:
         """Read a preset, or a file of the same form instead, and apply ``a.b=value`` overrides."""
         return load_config(cls, preset=None if path else preset, path=path, overrides=overrides)
+
+    @classmethod
+    def lacking(cls, preset: str | None, path: Path | None) -> list[str]:
+        """Sections that a preset or a file lacks to describe a whole run."""
+        found = read_config(preset, path)
+        return [name for name, field in cls.model_fields.items() if field.is_required() and name not in found]
 
     @property
     def caches_latents(self) -> bool:

@@ -18,7 +18,7 @@ from worldline_core.data.curation.recorded_episode import TRIMMED, prepare_episo
 from worldline_core.data.curation.rules import check_held_out, decided_rows, drawn_episodes
 from worldline_core.data.curation.source_table import write_source_table, write_source_weights
 from worldline_core.data.episodes.episode_index import QuarantineRow, read_index, read_quarantine
-from worldline_core.data.episodes.episode_set_writer import VIDEOS_FILE, EpisodeSetWriter
+from worldline_core.data.episodes.episode_set_writer import EMBODIMENTS_FOLDER, VIDEOS_FILE, EpisodeSetWriter
 from worldline_core.data.episodes.source import EpisodeSource
 from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.reader_process import read_limited
@@ -30,7 +30,7 @@ from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.embodiment import carry_embodiments
 from worldline_core.scale.account import InputRow, check_account, crash_evidence, portable_message, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, ends_the_run, map_episodes
-from worldline_core.store.remote import UnreachableInputError, first_line, is_transient
+from worldline_core.store.remote import UnreachableInputError, first_line, is_remote, is_transient
 from worldline_core.store.store import helper_lock
 from worldline_core.untrusted_text import visible
 
@@ -63,10 +63,13 @@ def curate(
                 "A source reads a recording of this run, which is not here", where=f"sources[{number}]", got=name,
                 next_step=f"run `worldline task record --name record.{name}` with the same preset first",
             )  # fmt: skip
-    carry_embodiments(config.own_robots().values())
     mapper = mapper or SerialMapper()
     roots = tuple(str(inputs.get(f"source.{n}", source.path)) for n, source in enumerate(config.sources))
-    work = CurateWork(output, config, roots)
+    carry_embodiments(config.own_robots().values())
+    for source, place in zip(config.sources, map(parse_location, roots), strict=True):
+        if source.kind == "episode_set" and not is_remote(place):
+            carry_embodiments(sorted(place.glob(f"{EMBODIMENTS_FOLDER}/*.yaml")))
+    work = CurateWork(output, config.with_located_robots(), roots)
     listed = work.listed_episodes()
     identities = [episode.identity for episodes in listed for episode in episodes]
     if not EpisodeSetWriter.finished(output):

@@ -138,17 +138,21 @@ class CurateConfig(StrictModel):
         """Names of the run's own recordings, by the number of the source that reads each."""
         return {n: s.recording for n, s in enumerate(self.sources) if isinstance(s, RecordingSourceConfig)}
 
-    def own_robots(self) -> dict[str, Path]:
-        """Files of the sources' robots that do not ship with the project, by the keys that name them."""
-        named = {
-            f"sources.{n}.embodiment": getattr(source, "embodiment", None) for n, source in enumerate(self.sources)
-        }
-        found = {key: own_embodiment(name) for key, name in named.items() if name}
-        return {key: path for key, path in found.items() if path is not None}
+    def own_robots(self) -> dict[int, Path]:
+        """Files of robots that do not ship with the project, by the numbers of the sources that name them."""
+        named = {n: getattr(source, "embodiment", None) for n, source in enumerate(self.sources)}
+        found = {n: own_embodiment(name) for n, name in named.items() if name}
+        return {n: path for n, path in found.items() if path is not None}
+
+    def with_located_robots(self) -> CurateConfig:
+        """The configuration with absolute paths of such robots, for processes that may work in another folder."""
+        robots = {n: {"embodiment": str(path.resolve())} for n, path in self.own_robots().items()}
+        sources = tuple(source.model_copy(update=robots.get(n)) for n, source in enumerate(self.sources))
+        return self.model_copy(update={"sources": sources})
 
     def weights_read(self) -> Mapping[str, Path | None]:
         """Descriptions of robots, whose content counts in the cache key."""
-        robots = self.own_robots()
+        robots = {f"sources.{n}.embodiment": path for n, path in self.own_robots().items()}
         described = {f"{key}.description": load_embodiment(path).description_path for key, path in robots.items()}
         return {**robots, **described}
 
