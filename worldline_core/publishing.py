@@ -32,6 +32,7 @@ from worldline_core.store.artifact_files import (
     VOLATILE_FOLDER,
     digest_file,
     folder_files,
+    read_manifest,
     verify_artifact,
 )
 from worldline_core.store.remote import AnyPath, file_system, first_line, list_files, parse_location, with_retries
@@ -80,7 +81,11 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
     verify_artifact(folder)
     sources = set_files(folder)
     _check_may_publish(folder, public=public, allow_restricted=allow_restricted)
-    files = {name: PublishedFile(size=p.stat().st_size, sha256=digest_file(p)) for name, p in sorted(sources.items())}
+    digests = read_manifest(folder).get("files", {})  # which were just compared with the files
+    files = {
+        name: PublishedFile(size=path.stat().st_size, sha256=digests.get(name, {}).get("sha256") or digest_file(path))
+        for name, path in sorted(sources.items())
+    }
     _check_names(files, folder)
     contents = FileList(files=files)
     sending = sources | _card_files(folder, files)
@@ -131,10 +136,11 @@ def pull(where: str, folder: Path) -> FileList:
                 name = path.relative_to(unfinished)
                 if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
                     path.unlink()
-            missing = [name for name, file in contents.files.items() if not _is_at(file, unfinished / name)]
             with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-                fetched = pool.map(lambda name: _fetch(location, name, contents.files[name], unfinished), missing)
-                _raise_mismatch([name for name, whole in zip(missing, fetched, strict=True) if not whole], where)
+                fetched = pool.map(
+                    lambda name: _fetch(location, name, contents.files[name], unfinished), contents.files
+                )
+                _raise_mismatch([name for name, whole in zip(contents.files, fetched, strict=True) if not whole], where)
         set_files(unfinished)  # a set that refers to folders beside it would read what others put there
         verify_artifact(unfinished)
         unfinished.rename(folder)
@@ -209,13 +215,8 @@ def _check_names(names: Mapping[str, object], where: object) -> None:
     for name in names:
         pure = PurePosixPath(name)
         plain = name.isprintable() and "\\" not in name and pure.as_posix() == name and not pure.is_absolute()
-        above = any(str(parent) in names for parent in pure.parents)
-        if (
-            not plain
-            or above
-            or ".." in pure.parts
-            or pure.parts[:1] in ((), (VOLATILE_FOLDER,), (".cache",), (FILE_LIST,))
-        ):
+        taken = pure.parts[:1] in ((), (VOLATILE_FOLDER,), (FILE_LIST,)) or any(str(p) in names for p in pure.parents)
+        if not plain or taken or ".." in pure.parts:
             raise ArtifactError(
                 "A file name of the set is unsafe or taken",
                 where=where,
@@ -237,10 +238,6 @@ def _raise_mismatch(wrong: list[str], where: str) -> None:
             got=_shortened(wrong),
             next_step="pull again; if it stays, delete the published copy and push the set again",
         )
-
-
-def _is_at(file: PublishedFile, path: Path) -> bool:
-    return path.is_file() and path.stat().st_size == file.size and digest_file(path) == file.sha256
 
 
 @contextmanager
@@ -300,8 +297,10 @@ def _pieces(source: AnyPath, size: int) -> Iterator[bytes]:
 
 
 def _fetch(location: AnyPath, name: str, file: PublishedFile, folder: Path) -> bool:
-    """Copy a file below a folder of this machine; returns whether it has its size and digest."""
+    """Copy a file below a folder of this machine, unless it is there; returns whether it has its size and digest."""
     target = folder / name
+    if target.is_file() and target.stat().st_size == file.size and digest_file(target) == file.sha256:
+        return True
     target.parent.mkdir(parents=True, exist_ok=True)
 
     def copy() -> str:
