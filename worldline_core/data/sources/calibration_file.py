@@ -33,7 +33,6 @@ from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.geometry.cameras import CameraAxes, Extrinsics, ImageTransform
 from worldline_core.geometry.embodiment import load_embodiment
-from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 _ASPECT_TOLERANCE = 0.01
@@ -148,6 +147,8 @@ def mounted_camera(embodiment: str, state: np.ndarray, view: str, where: str) ->
 
     Raises: RejectedInputError (missing_calibration) where the description is not here, or mounts no camera for the view.
     """
+    from worldline_core.geometry.kinematics import ArmKinematics  # needs torch, which configurations do without
+
     try:
         poses = ArmKinematics(load_embodiment(embodiment)).wrist_camera_poses(state.astype(np.float64))
     except (ConfigError, UnavailableError) as error:
