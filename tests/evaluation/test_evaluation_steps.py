@@ -237,6 +237,11 @@ def test_planning_chooses_by_predicted_videos(sealed, tmp_path):
     assert budgets["6"]["gain"]["mean"] == pytest.approx(5 / 6)
     assert summary["methods"]["true"]["budgets"]["6"]["success"]["mean"] == 1.0
     assert summary["oracle"]["mean"] == 1.0
+    assert set(summary["methods"]) == {"true", "good", "copy"}
+    best = max(summary["shortcuts"].items(), key=lambda item: item[1]["6"]["mean"])
+    over = budgets["6"]["over_shortcut"]
+    assert summary["shortcuts"][over["shortcut"]]["6"]["mean"] == best[1]["6"]["mean"]
+    assert over["gain"]["mean"] == pytest.approx(1.0 - best[1]["6"]["mean"])
 
 
 def test_labels_are_opened_only_after_every_choice_is_on_disk(sealed, tmp_path, monkeypatch):
@@ -250,7 +255,8 @@ def test_labels_are_opened_only_after_every_choice_is_on_disk(sealed, tmp_path, 
 
     monkeypatch.setattr(outcomes, "read_outcomes", watched)
     evaluate_planning(PLANNING, sealed, tmp_path / "out")
-    assert opened == [{(method, budget) for method in ("true", "good", "copy") for budget in (2, 4, 6)}]
+    shortcuts = ("shortcut_medoid", "shortcut_nearest_hand", "shortcut_hand_rule")
+    assert opened == [{(method, budget) for method in ("true", "good", "copy", *shortcuts) for budget in (2, 4, 6)}]
 
 
 def test_choices_do_not_depend_on_labels(bank, sealed, tmp_path):

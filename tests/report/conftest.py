@@ -246,6 +246,7 @@ def write_planning_scores(folder: Path) -> None:
         banks = {"bank_0": 1.0, "bank_1": 0.0, "bank_2": 0.4}
         return {
             str(n): {"success": interval(m) | {"std_over_banks": 0.2}, "gain": interval(m - 0.45), "banks": banks}
+            | {"over_shortcut": {"shortcut": "medoid", "gain": interval(m - 0.5)}}
             for n, m in means.items()
         }
 
@@ -265,6 +266,7 @@ def write_planning_scores(folder: Path) -> None:
     }
     summary = {"selector": "measured", "banks": {f"bank_{i}": bank for i in range(3)}, "methods": methods}
     summary |= {"direct_execution": interval(0.45), "oracle": interval(1.0 - 0.1)}
+    summary["shortcuts"] = {"medoid": {str(n): interval(0.5) for n in (2, 4, 8, 16, 24, 32)}}
     write_json_atomic(folder / "summary.json", summary)
 
 

@@ -50,16 +50,20 @@ def context_of(
     if success is not None:
         result = {
             "success": {"mean": success, "low": success - 0.1, "high": min(1.0, success + 0.1)},
-            "gain": {"mean": 0.1, "low": gain[0], "high": gain[1]},
+            "gain": {"mean": 0.3, "low": 0.2, "high": 0.4},
+            "over_shortcut": {"shortcut": "hand_rule", "gain": {"mean": 0.1, "low": gain[0], "high": gain[1]}},
         }
         summaries["evaluate_planning"] = {
             "methods": {"banks_shipped_stage2": {"budgets": {"32": result}}},
-            "banks": {"a": {}}, "direct_execution": {"mean": 0.64},
+            "banks": {"a": {}}, "shortcuts": {"hand_rule": {"32": {"mean": 0.64}}},
         }  # fmt: skip
     for name, summary in summaries.items():
         (folder / name).mkdir(parents=True)
         (folder / name / "summary.json").write_text(json.dumps(summary))
     return ReportContext(ReportConfig(), {name: folder / name for name in summaries}, folder / "out")
+
+
+UNCLEAR = "does not clearly plan better than a rule that sees no video on 1 banks."
 
 
 def headline_of(context: ReportContext) -> str:
@@ -72,22 +76,28 @@ def headline_of(context: ReportContext) -> str:
     ("changes", "expected"),
     [
         ({}, "follows the controls."),
-        ({"success": 0.76}, "follows the controls but does not clearly plan better than chance on 1 banks."),
-        ({"success": 0.9, "gain": (0.1, 0.4)}, "follows the controls and plans better than chance."),
-        ({"success": 0.5, "gain": (-0.3, -0.1)}, "follows the controls but plans worse than chance."),
+        ({"success": 0.76}, f"follows the controls but {UNCLEAR}"),
+        (
+            {"success": 0.9, "gain": (0.1, 0.4)},
+            "follows the controls and plans better than any rule that sees no video.",
+        ),
+        (
+            {"success": 0.5, "gain": (-0.3, -0.1)},
+            "follows the controls but plans worse than a rule that sees no video.",
+        ),
         ({"over_copy": (-0.1, 0.4)}, "does not yet beat a copy of the first frame."),
         ({"iou": 0.4, "over_copy": (-0.2, -0.1)}, "does not yet beat a copy of the first frame."),
         ({"over_shuffled": (-0.1, 0.1)}, "does not yet follow the controls."),
         (
             {"over_shuffled": (-0.1, 0.1), "success": 0.6},
-            "does not yet follow the controls and does not clearly plan better than chance on 1 banks.",
+            f"does not yet follow the controls and {UNCLEAR}",
         ),
     ],
 )
 def test_the_headline_follows_the_numbers(tmp_path: Path, changes: dict, expected: str) -> None:
     found = headline_of(context_of(tmp_path, **changes))
     assert found == f"The shipped simulator {expected}"
-    assert len(found.split()) <= 21
+    assert len(found.split()) <= 25
 
 
 def test_this_run_s_own_model_stands_beside_the_copy(tmp_path: Path) -> None:
@@ -113,7 +123,7 @@ def test_a_perfect_score_of_few_cases_is_no_certainty(tmp_path: Path) -> None:
     summary = tmp_path / "evaluate_planning" / "summary.json"
     content = json.loads(summary.read_text())
     content["methods"]["banks_shipped_stage2"]["budgets"]["32"]["success"] |= certain
-    content["direct_execution"]["mean"] = 0.5
+    content["shortcuts"]["hand_rule"]["32"]["mean"] = 0.5
     summary.write_text(json.dumps(content))
     figure = planning_figure(context)
     assert (figure.rests_on, figure.verdict) == ("95\u202f%: 48\u202f% to 100\u202f%, 5 banks", "unclear")
@@ -145,7 +155,9 @@ def test_a_figure_within_chance_is_neutral_on_the_page(tmp_path: Path) -> None:
 
 def test_the_page_shows_the_headline_the_video_and_four_coloured_figures(full_report: Path) -> None:
     text = (full_report / "index.html").read_text()
-    assert "<h1>The shipped simulator follows the controls and plans better than chance.</h1>" in text
+    assert (
+        "<h1>The shipped simulator follows the controls and plans better than any rule that sees no video.</h1>" in text
+    )
     assert 'src="media/overview.mp4"' in text
     assert [text.count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")] == [4, 0, 0]
     assert (full_report / "media" / "overview.mp4").is_file()

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from worldline_core.evaluation.scores import TRUE_METHOD
-from worldline_core.pages.page import NARROW_SPACE, number, percent, render
+from worldline_core.pages.page import NARROW_SPACE, number, percent, render, words
 from worldline_core.progress import with_progress
 from worldline_core.report.context import (
     SPLIT_LABELS,
@@ -186,18 +186,20 @@ def video_figures(view: HeadView) -> tuple[Figure | None, Figure | None]:
 
 
 def planning_figure(context: ReportContext) -> Figure | None:
-    """Success of the choice among the most candidates beside a blind choice."""
+    """Success of the choice among the most candidates beside the best shortcut, which sees no video."""
     summary = next(iter(context.summaries("evaluate_planning")), None)
     order = predicting(summary["methods"]) if summary else []
     if summary is None or not order:
         return None
     values = summary["methods"][order[0].name]
-    found, direct = most_candidates(values), float(summary["direct_execution"]["mean"])
+    found, most = most_candidates(values), max(values["budgets"], key=int)
     success = {"count": len(summary["banks"]), **found["success"]}
     measured = share_interval(success) or success
+    over = found["over_shortcut"]
+    reference = float(summary["shortcuts"][over["shortcut"]][most]["mean"])
     # The bootstrap of the gain sees as little of a choice that never failed as that of the success.
-    bounds = found["gain"] if measured is success else {key: measured[key] - direct for key in ("low", "high")}
-    what = f"of plans succeed, chosen among {max(values['budgets'], key=int)} by their predicted videos"
+    bounds = over["gain"] if measured is success else {key: measured[key] - reference for key in ("low", "high")}
+    what = f"of plans succeed, chosen among {most} by their predicted videos"
     where = order[0].long_label + by_recorded_videos(
         summary["methods"].get(TRUE_METHOD), lambda v: most_candidates(v)["success"]
     )
@@ -205,8 +207,8 @@ def planning_figure(context: ReportContext) -> Figure | None:
         what,
         measured,
         "banks",
-        "a blind choice",
-        direct,
+        f"{words(over['shortcut'])}, the best rule without video",
+        reference,
         (float(bounds["low"]), float(bounds["high"])),
         where,
         shares=True,
@@ -245,8 +247,9 @@ def headline(context: ReportContext, view: HeadView | None, controls: Figure | N
         else:
             clauses.append((follows, "follows the controls" if follows else "does not yet follow the controls"))
     if planning is not None:
-        results = {"better": "plans better than chance", "worse": "plans worse than chance"}
-        unclear = f"does not clearly plan better than chance on {planning.measured['count']} {planning.cases}"
+        rule = "a rule that sees no video"
+        results = {"better": "plans better than any rule that sees no video", "worse": f"plans worse than {rule}"}
+        unclear = f"does not clearly plan better than {rule} on {planning.measured['count']} {planning.cases}"
         clause = results.get(planning.verdict, unclear)
         clauses.append((planning.verdict == "better", clause))
     if not clauses:

@@ -225,12 +225,17 @@ def planning_evaluation(summary: JsonObject) -> dict[str, object]:
     )  # fmt: skip
     families = sorted({bank["task_family"] for bank in summary["banks"].values()})
     most = f"N = {budgets[-1]}"
-    headings = [f"N = {n}" for n in budgets] + [f"Gain at {most}"] + [f"{words(family)}, {most}" for family in families]
+    headings = (
+        [f"N = {n}" for n in budgets]
+        + [f"Gain at {most}", "over the best shortcut"]
+        + [f"{words(family)}, {most}" for family in families]
+    )
     return {
         "summary": summary,
         "methods": order,
         "success": success,
         "gain": {m.name: most_candidates(methods[m.name])["gain"] for m in order},
+        "over_shortcut": {m.name: most_candidates(methods[m.name])["over_shortcut"]["gain"] for m in order},
         "families": families,
         "by_family": {
             m.name: {f: v[max(v, key=int)] for f, v in methods[m.name]["by_family"].items() if v} for m in order

@@ -1,14 +1,15 @@
 """The step evaluate_planning: is the candidate chosen by its predicted video better than one taken blindly?
 
 Every method's videos of the same banks go through the same brackets. Labels stay sealed until all choices of all methods are on disk.
-The recorded videos are chosen from too (method ``true``): that is the selector's own ceiling.
+The recorded videos are chosen from too (method ``true``): that is the selector's own ceiling. Beside the methods stand shortcuts,
+which see no video (`shortcuts`): what a model gains counts over the best of them.
 """
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
@@ -24,12 +25,21 @@ from worldline_core.errors import ArtifactError, DataError
 from worldline_core.evaluation.evaluation_config import PlanningConfig
 from worldline_core.evaluation.planning.bracket import (
     CandidateVideo,
+    Choice,
     MeasuredSelector,
     Selector,
     VLMSelector,
     choose,
     shown_order,
     shown_video,
+)
+from worldline_core.evaluation.planning.shortcuts import (
+    FEATURES,
+    RULES,
+    BankFacts,
+    bank_facts,
+    medoid,
+    tree_scores,
 )
 from worldline_core.evaluation.recordings import open_rollouts, open_tracks, trajectory_of
 from worldline_core.evaluation.scores import (
@@ -51,6 +61,8 @@ from worldline_core.store.atomic import write_json_atomic
 CHOICES_FILE = "choices.parquet"
 SEALED_FILE = "sealed_outcomes.parquet"
 DIRECT = "direct_execution"
+SHORTCUT = "shortcut_"
+"""Prefix of the shortcuts' names in the tables."""
 _CHOICE_COLUMNS = ("method", "bank", "run", "budget", "episode_id", "trace")
 
 
@@ -58,7 +70,7 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
     """Choose in every bank, for every method and budget; then open the labels.
 
     Inputs: banks, rollouts.<method>; tracks and segmenter where the selector uses them.
-    Output: choices.parquet, scores.parquet (metric ``success@N``), summary.json.
+    Output: choices.parquet, scores.parquet (metric ``success@N``), summary.json. Shortcuts are methods ``shortcut_<name>``.
     """
     episodes = EpisodeSet.open(inputs["banks"])
     rollouts = open_rollouts(inputs)
@@ -83,12 +95,22 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
             expected=f"at least {min(config.budgets)}, the smallest of evaluate_planning.budgets",
             got=f"{found} banks of up to {max(map(len, banks.values()), default=0)}",
         )  # fmt: skip
+    in_progress = with_progress(banks, "evaluate_planning shortcuts", "bank")
+    facts = {bank: bank_facts(episodes, tracks, banks[bank]) for bank in in_progress}
+    for bank, rows in banks.items():
+        choices += shortcut_choices(config, bank, rows, rule_choosers(facts[bank]))
     table = [choice | {"trace": json.dumps(choice["trace"], sort_keys=True)} for choice in choices]
     write_table(output / CHOICES_FILE, table, _CHOICE_COLUMNS)
     # Only now: nothing above has read, or could read, how any candidate ended.
     outcomes = read_outcomes(
         inputs.get("sealed", inputs["banks"]) / SEALED_FILE, [row.episode_id for rows in banks.values() for row in rows]
     )
+    scored = tree_scores_by_shortcut(
+        facts, {bank: [outcomes[row.episode_id] for row in rows] for bank, rows in banks.items()}
+    )
+    for bank, rows in banks.items():
+        choosers = {name: best_of(scores.get(bank)) for name, scores in scored.items() if scores}
+        choices += shortcut_choices(config, bank, rows, choosers)
     left_out = {"with fewer candidates than the smallest budget": found - kept}
     counts = write_results(config, selector.name, banks, choices, outcomes, output)
     return {"found": found, "kept": kept, "left_out": left_out, **counts}
@@ -136,15 +158,62 @@ def choices_of_bank(
     recorded order), which changes what the smaller budgets contain.
     """
     results = []
-    for run in range(config.runs):
-        numbers = list(range(len(rows)))
-        order = numbers if run == 0 else shown_order(numbers, f"{bank} run {run}", config.seed)
-        for budget in sorted({budget for budget in config.budgets if budget <= len(rows)}):
-            scene = f"{bank} {run} {budget}"
-            choice = choose(selector, rows[0].instruction, order[:budget], load, scene=scene, seed=config.seed)
-            episode_id = rows[choice.candidate].episode_id
-            results.append({"run": run, "budget": budget, "episode_id": episode_id, "trace": asdict(choice)})
+    for run, budget, shown in shown_candidates(config, bank, len(rows)):
+        scene = f"{bank} {run} {budget}"
+        choice = choose(selector, rows[0].instruction, shown, load, scene=scene, seed=config.seed)
+        episode_id = rows[choice.candidate].episode_id
+        results.append({"run": run, "budget": budget, "episode_id": episode_id, "trace": asdict(choice)})
     return results
+
+
+def shown_candidates(config: PlanningConfig, bank: str, count: int) -> Iterator[tuple[int, int, list[int]]]:
+    """Run, budget and the numbers of the candidates to choose among."""
+    numbers = list(range(count))
+    for run in range(config.runs):
+        order = numbers if run == 0 else shown_order(numbers, f"{bank} run {run}", config.seed)
+        for budget in sorted({budget for budget in config.budgets if budget <= count}):
+            yield run, budget, order[:budget]
+
+
+Chooser = Callable[[Sequence[int]], int]
+"""Chooses one of the candidates shown, by their numbers."""
+
+
+def best_of(scores: np.ndarray | None) -> Chooser:
+    """The highest score; of equals, or without scores in this bank, the one shown first."""
+    return lambda shown: shown[0] if scores is None else shown[int(np.argmax(scores[list(shown)]))]
+
+
+def rule_choosers(facts: BankFacts) -> dict[str, Chooser]:
+    """Shortcuts without labels."""
+    return {"medoid": medoid(facts)} | {name: best_of(rule(facts)) for name, rule in RULES.items()}
+
+
+def tree_scores_by_shortcut(
+    facts: Mapping[str, BankFacts], ends: Mapping[str, Sequence[bool]]
+) -> dict[str, dict[str, np.ndarray]]:
+    """Scores of the candidates of each bank by trees that learned from other banks, by the shortcut's name."""
+    known = {bank: np.array(own, dtype=bool) for bank, own in ends.items()}
+    features = {name: {bank: make(own) for bank, own in facts.items()} for name, make in FEATURES.items()}
+    return {
+        name: tree_scores({bank: own for bank, own in by_bank.items() if own is not None}, known)
+        for name, by_bank in features.items()
+    }
+
+
+def shortcut_choices(
+    config: PlanningConfig, bank: str, rows: Sequence[EpisodeRow], choosers: Mapping[str, Chooser]
+) -> list[dict[str, Any]]:
+    """Choices like `choices_of_bank`, of rules that see no video."""
+    found = []
+    for name, chooser in choosers.items():
+        for run, budget, shown in shown_candidates(config, bank, len(rows)):
+            trace = asdict(Choice(chooser(shown), {}, [], 0, 0))
+            found.append(
+                {"method": f"{SHORTCUT}{name}", "bank": bank, "run": run, "budget": budget, "trace": trace}
+                | {"episode_id": rows[trace["candidate"]].episode_id}
+            )
+    return found
 
 
 def candidate_loader(
@@ -212,7 +281,8 @@ def write_results(
     """Write scores.parquet and summary.json: success against the number of candidates, and the gain over direct execution.
 
     Direct execution of a policy takes one candidate blindly: its expected success in a bank is the mean over the bank's candidates, the
-    same reference for every budget.
+    same reference for every budget. ``over_shortcut`` of a method is its gain over the shortcut that succeeds most often at this budget,
+    bank by bank.
     """
     ends = {bank: [outcomes[row.episode_id] for row in rows] for bank, rows in banks.items()}
     direct = {bank: float(np.mean(own)) for bank, own in ends.items()}
@@ -240,7 +310,20 @@ def write_results(
         gain = interval([means[bank] - direct[bank] for bank in means])
         return {"success": interval(list(means.values())) | spread, "gain": gain, "banks": means}
 
-    def by_family(by_budget: Mapping[int, Mapping[str, Sequence[float]]]) -> dict[str, Any]:
+    means = {
+        name: {n: {bank: float(np.mean(runs)) for bank, runs in sorted(own.items())} for n, own in by_budget.items()}
+        for name, by_budget in success.items()
+    }
+
+    def over_shortcut(method: str, budget: int, members: Sequence[str]) -> dict[str, Any]:
+        """Gain in these banks over the shortcut that is best there."""
+        chosen = means[method][budget]
+        rivals = {name: own[budget] for name, own in means.items() if name.startswith(SHORTCUT)}
+        best = max(sorted(rivals), key=lambda name: np.mean([rivals[name][bank] for bank in members]))
+        gain = interval([chosen[bank] - rivals[best][bank] for bank in members])
+        return {"shortcut": best.removeprefix(SHORTCUT), "gain": gain}
+
+    def by_family(method: str, by_budget: Mapping[int, Mapping[str, Sequence[float]]]) -> dict[str, Any]:
         """Mean success and gain of each task family and budget."""
         found: dict[str, dict[str, Any]] = defaultdict(dict)
         for budget, values in sorted(by_budget.items()):
@@ -248,16 +331,33 @@ def write_results(
                 members = [bank for bank in values if banks[bank][0].task_family == family]
                 mean = float(np.mean([np.mean(values[bank]) for bank in members]))
                 gain = mean - float(np.mean([direct[bank] for bank in members]))
-                found[family][str(budget)] = {"success": mean, "gain": gain, "banks": len(members)}
+                over = over_shortcut(method, budget, members)
+                found[family][str(budget)] = {
+                    "success": mean,
+                    "gain": gain,
+                    "banks": len(members),
+                    "over_shortcut": over,
+                }
         return found
 
     methods = {
         method: {
-            "budgets": {str(budget): statistics(values) for budget, values in sorted(by_budget.items())},
-            "by_family": by_family(by_budget),
+            "budgets": {
+                str(budget): statistics(values) | {"over_shortcut": over_shortcut(method, budget, sorted(values))}
+                for budget, values in sorted(by_budget.items())
+            },
+            "by_family": by_family(method, by_budget),
             "malformed_answers": malformed[method],
         }
         for method, by_budget in sorted(success.items())
+        if not method.startswith(SHORTCUT)
+    }
+    shortcuts = {
+        name.removeprefix(SHORTCUT): {
+            str(budget): statistics(values)["success"] for budget, values in sorted(own.items())
+        }
+        for name, own in sorted(success.items())
+        if name.startswith(SHORTCUT)
     }
     shown = ("scene", "embodiment", "task_family", "instruction")
     summary = {
@@ -270,6 +370,7 @@ def write_results(
         DIRECT: interval(list(direct.values())),
         "oracle": interval([float(any(own)) for own in ends.values()]),
         "methods": methods,
+        "shortcuts": shortcuts,
         "interval": "95 % bootstrap over banks",
     }
     write_json_atomic(output / SUMMARY_FILE, summary)
