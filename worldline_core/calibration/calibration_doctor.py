@@ -219,14 +219,16 @@ class _Search:
         return [*found, *self.exchanged_wrist_cameras()]
 
     def lags_by_view(self, late: Reading) -> Iterator[Explanation]:
-        """A lag of all pictures, and of those views alone whose own pictures fit better with it."""
+        """A lag of all pictures, and of those views alone whose own pictures fit better with it while the others' fit worse."""
         terms, written = self.terms(late, self.recorded_poses), self.as_recorded.evidence
         yield self.explain(late, terms)
         views = [view for view in late.cameras if view in self.observation.gray]
         better = [view for view in views if _of_view(terms, view) > _of_view(written, view)]
         clearly = [view for view in better if _of_view(terms, view) > _of_view(written, view) + 1.0]
         for chosen in dict.fromkeys([*((view,) for view in better), tuple(clearly)]):
-            if not chosen or len(chosen) == len(views):
+            others = [view for view in views if view not in chosen]
+            lost = sum(_of_view(written, view) - _of_view(terms, view) for view in others)
+            if not chosen or lost < MIN_MARGIN:
                 continue
             own = tuple(f" {view}" for view in chosen)
             merged = {name: value for name, value in written.items() if not name.endswith(own)}

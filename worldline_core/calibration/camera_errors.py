@@ -177,6 +177,8 @@ class CameraError:
         best = min(left.values())
         if best <= LEFT_OVER:
             alike = [name for name in left if left[name] <= best + ALIKE]
+            if alike == ["translation"]:  # a turn does nearly the same to a robot at one distance
+                alike = ["rotation", "translation"]
             focal = next(each for each in self.kinds if each.kind == "focal length")
             # Where a turn and a shift look alike, the focal length that goes with them is known no better.
             beside = len(alike) > 1 and focal.half_interval > FOCAL_KNOWN
