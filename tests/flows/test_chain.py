@@ -114,8 +114,13 @@ def test_shipped_rollout_needs_a_shipped_model() -> None:
 )
 def test_views_of_distillation_are_checked_before_any_training(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        load_config(PipelineConfig, preset="smoke", overrides=[override])
+        load_config(
+            PipelineConfig, preset="smoke", overrides=[override, "distill.views=[head, left_wrist, right_wrist]"]
+        )
     load_config(PipelineConfig, preset="smoke", overrides=[override, "distill.views=[head]"])
+    # A run for one robot need not name them again.
+    views = ["head", "left_wrist"] if "left_wrist]" in override else ["head"]
+    assert load_config(PipelineConfig, preset="smoke", overrides=[override]).distill.views == views
 
 
 def test_a_run_of_recordings_without_cameras_draws_nothing() -> None:

@@ -17,9 +17,10 @@ from pydantic import ValidationError
 
 from tests.rollout.conftest import NAMES, SIZE, SPEC, N, digests, recorded, write_recordings
 from worldline_core.data.episodes.episode import VIEWS
-from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
+from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError, UnavailableError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
+from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TextConfig
 from worldline_core.rollout.predictions import shuffled_partners
@@ -33,6 +34,7 @@ from worldline_core.rollout.rollout_config import (
 )
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
 from worldline_core.store.artifact_files import digest_folder
+from worldline_core.training.processes import join_processes
 
 CONFIG = RolloutConfig(method="causal", batch_size=2, seeds=(42, 43))
 
@@ -239,6 +241,19 @@ def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text
             rollout(config, inputs | {"checkpoint": models / folder}, tmp_path / folder)
     with pytest.raises(ValidationError, match="text_to_video cannot be driven by zero ones"):
         RolloutConfig(sampler=TextToVideoConfig(), actions="zero")
+
+
+def test_a_gpu_that_is_not_there_is_named_before_work_begins(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for ask in (
+        lambda: rollout(CONFIG.model_copy(update={"device": "cuda:1"}), inputs, tmp_path),
+        lambda: load_tokenizer(inputs["tokenizer"], "cuda"),
+        lambda: join_processes("cuda"),
+    ):
+        with pytest.raises(UnavailableError, match=r"(?s)No GPU that torch can use.*device=cpu"):
+            ask()
 
 
 def test_another_frame_rate_or_an_empty_choice_is_refused(inputs: dict[str, Path], tmp_path: Path) -> None:

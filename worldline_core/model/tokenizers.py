@@ -613,6 +613,15 @@ def tokenizer_outline(folder: Path | None) -> WanTokenizer | PatchTokenizer:
     return WanTokenizer(vae.eval().requires_grad_(False), where=root)
 
 
+def require_device(device: str) -> None:
+    """Raises: UnavailableError: a GPU is asked for where torch can use none."""
+    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+        raise UnavailableError(
+            "No GPU that torch can use is here", where=f"device={device}", expected="a GPU and torch with CUDA",
+            got=f"torch {torch.__version__}", next_step="device=cpu, or `worldline doctor`",
+        )  # fmt: skip
+
+
 def load_tokenizer(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> VideoTokenizer:
     """Load whatever tokenizer ``folder`` holds: a patch tokenizer, or a diffusers Wan autoencoder.
 
@@ -621,7 +630,9 @@ def load_tokenizer(folder: Path, device: str = "cpu", dtype: torch.dtype = torch
 
     Raises:
         CheckpointError: the folder holds none, or a damaged one.
+        UnavailableError: there is no such device.
     """
+    require_device(device)
     if (folder / "config.json").is_file() or (folder / "vae" / "config.json").is_file():
         return WanTokenizer.load(folder, dtype).to(device)
     return PatchTokenizer.load(folder).to(device)

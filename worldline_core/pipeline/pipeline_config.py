@@ -84,7 +84,7 @@ class PipelineConfig(StrictModel):
     train_stage1: Stage1Config | None = Field(default=None, description="null: Stage II starts from models.base")
     train_stage2: Stage2Config
     distill: DistillConfig
-    rollouts: dict[str, RolloutRun]
+    rollouts: dict[str, RolloutRun] = Field(default={})
     evaluate_video: VideoEvaluationConfig | None = Field(default=None, description="none: predictions are judged only")
     evaluate_policy: PolicyEvaluationConfig | None = Field(
         default=None, description="none: predictions are not judged, where recordings say no outcome"
@@ -227,11 +227,16 @@ class PipelineConfig(StrictModel):
 
     @model_validator(mode="after")
     def _distilled_views_are_trained(self) -> PipelineConfig:
-        """What distillation would refuse after Stage II, and what latents lack."""
+        """Refuse what distillation would refuse after Stage II, and what latents lack; without `distill.views` take those they have."""
         wanted = self.distill.views
         known = {"train_stage2.clips.view_weights": self.train_stage2.clips.shown_views(wanted)}
         if not isinstance(self.distill.input, FrameInput):
             known["encode_latents.views"] = self.encode_latents.views
+        if "views" not in self.distill.model_fields_set:
+            fitting = [view for view in wanted if all(view in views for views in known.values())]
+            if fitting != wanted:
+                distill = self.distill.model_dump(exclude_unset=True) | {"views": fitting}
+                return self.model_copy(update={"distill": DistillConfig.model_validate(distill)})
         for key, views in known.items():
             if missing := [view for view in wanted if view not in views]:
                 raise ValueError(

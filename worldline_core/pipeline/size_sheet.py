@@ -27,11 +27,12 @@ class SizeSheet(StrictModel):
 
     @property
     def model(self) -> WorldModelConfig:
-        """Shape of Stage I's model: that of the base checkpoint, of the backbone to import, or the configured one."""
+        """Shape of Stage I's model: that of the base checkpoint, of the backbone to import as models.base, or the configured
+        one."""
         base = self.folder("base")
         if base is not None and (base / DESCRIPTION).is_file():
             return read_checkpoint_info(base).config
-        if self.config.import_backbone is not None:
+        if self.config.import_backbone is not None and self.config.models.base is not None:
             return cosmos3_nano_config(fps=self.config.import_backbone.fps, **self.config.import_backbone.changes)
         if self.config.train_stage1 is None:
             raise ConfigError(

@@ -23,7 +23,7 @@ from worldline_core.actions.episode_tracks import ActionTracks, open_controls
 from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.tokenizers import frames_to_video
+from worldline_core.model.tokenizers import frames_to_video, require_device
 from worldline_core.progress import Progress
 from worldline_core.rollout.baselines import FirstFrameCopy, TextToVideo
 from worldline_core.rollout.ge_sim import GeSim, RefusedPredictionError
@@ -63,6 +63,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         CheckpointError: the checkpoint is of the wrong kind for the sampler, or was trained on other action maps.
         DataError: no episode matches, or none can be predicted.
     """
+    require_device(config.device)
     sampler = config.sampler
     without_model = isinstance(sampler, CopyFirstFrameConfig | GeSimConfig)
     needed = {"episodes"} | (set() if without_model else {"tokenizer", "checkpoint"})

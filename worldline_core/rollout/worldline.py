@@ -14,13 +14,13 @@ from torch import Tensor
 
 from worldline_core.actions.action_maps import render_action_maps, stack_controls
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, native_vectors
-from worldline_core.errors import CheckpointError, DataError, UnavailableError
+from worldline_core.errors import CheckpointError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
 from worldline_core.model.pretrained import load_model_tokenizer, pretrained_folder
 from worldline_core.model.small_decoder import SmallDecoder
-from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video
+from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video, require_device
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import match_views
 from worldline_core.rollout.observation import (
@@ -120,11 +120,7 @@ class WorldLine:
             UnavailableError: the hub does not give it, or the device is not there.
             ConfigError: fewer than one step.
         """
-        if device.startswith("cuda") and not torch.cuda.is_available():
-            raise UnavailableError(
-                "No GPU that torch can use is here", where=f"device={device}", expected="a GPU and torch with CUDA",
-                got=f"torch {torch.__version__}", next_step="device=cpu, or `worldline doctor`",
-            )  # fmt: skip
+        require_device(device)
         folder = pretrained_folder(folder)
         kinds: tuple[CheckpointKind, ...] = ("stage2", "causal") if expect_kind is None else (expect_kind,)
         model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation", dtype=getattr(torch, weights))

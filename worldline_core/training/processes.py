@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from worldline_core.errors import ConfigError, TrainingError
 from worldline_core.model.layers import TextContext
+from worldline_core.model.tokenizers import require_device
 from worldline_core.model.world_model import WorldModel, WorldModelOutput
 from worldline_core.training.training_config import ShardingConfig
 
@@ -36,7 +37,10 @@ def join_processes(device: str) -> None:
 
     Call it before anything is moved to ``device``: on GPUs it makes "cuda" this process's own card. Tensors on GPUs go
     through NCCL; numbers to agree on, and states that are being written, go through gloo.
+
+    Raises: UnavailableError: there is no such device.
     """
+    require_device(device)
     if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not torch.distributed.is_initialized():
         on_gpu = torch.device(device).type == "cuda"
         if on_gpu:

@@ -44,16 +44,18 @@ class EpisodeSet:
         self._datasets: dict[str, tuple[LeRobotV3Dataset, Sidecar]] = {}
 
     @classmethod
-    def open(cls, root: Path, *, allow_linked: bool = True) -> EpisodeSet:
+    def open(cls, root: Path | str, *, allow_linked: bool = True) -> EpisodeSet:
         """Open a set.
 
         Args:
+            root: its folder.
             allow_linked: whether rows may point to datasets in another artifact (by a relative path).
 
         Raises:
             DataError: the index is missing or incomplete.
             ConfigError: the set carries the description of a robot whose name stands for another one here.
         """
+        root = Path(root) if isinstance(root, str) else root
         if not is_remote(root):
             carry_embodiments(sorted(root.glob(f"{EMBODIMENTS_FOLDER}/*.yaml")))
         return cls(root, read_index(root), allow_linked=allow_linked)
