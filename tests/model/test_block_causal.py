@@ -182,6 +182,8 @@ def test_the_window_keeps_the_sink_and_the_recent_blocks_and_never_leaves_the_tr
         sizes.append((cache.frames, cache.nbytes))
     assert max(frames for frames, _ in sizes) == 1 + 2 * BLOCK
     assert len(set(sizes[3:])) == 1
+    model.forward_block(latents, 0.5, cache)  # a step reads the window rotated and joined, and remembers it
+    assert cache.nbytes == 2 * sizes[-1][1]
     first = KVCache(1, 2)
     model.write_block(torch.zeros(1, 3, 4, 1, 4, 4), first)
     assert torch.equal(cache.window.blocks[0].layers[0][0], first.window.blocks[0].layers[0][0])

@@ -135,6 +135,11 @@ class CacheWindow:
         """Latent frames in the window: the temporal position of the next block's first frame."""
         return sum(block.frames for block in self.blocks)
 
+    @property
+    def joined(self) -> list[tuple[Tensor, Tensor]]:
+        """What `read` remembers of the layers, as large again as the blocks: every Euler step of a block reads it."""
+        return list(self._rotated.values())
+
     def read(self, layer: int, by: Rotation) -> tuple[Tensor, Tensor] | None:
         """Keys (rotated by the window's rotation) and values of ``layer``, ``(b heads n d)``; None while empty."""
         if not self.blocks:
@@ -183,9 +188,9 @@ class KVCache:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the stored keys and values."""
-        parts = (part for block in self.window.blocks for pair in block.layers.values() for part in pair)
-        return sum(part.numel() * part.element_size() for part in parts)
+        """Bytes of keys and values: those stored block by block, and the window's, rotated and joined, once it was read."""
+        stored = [pair for block in self.window.blocks for pair in block.layers.values()]
+        return sum(part.nbytes for pair in [*stored, *self.window.joined] for part in pair)
 
     def append(self, block: CachedBlock, clean: Tensor) -> None:
         """Take a finished block into the window and let go of what falls out of it.
