@@ -8,10 +8,7 @@ v2.1: meta/info.json, meta/tasks.jsonl, meta/episodes.jsonl, and per episode one
 
 from __future__ import annotations
 
-import codecs
-import io
 import math
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
@@ -20,7 +17,6 @@ from typing import Annotated, Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.json
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from worldline_core.data.guards.plain_files import (
@@ -32,7 +28,7 @@ from worldline_core.data.guards.plain_files import (
     read_table,
     validated,
 )
-from worldline_core.data.guards.rejection import RejectedInputError, check_columns, check_length, unreadable
+from worldline_core.data.guards.rejection import RejectedInputError, check_columns, check_length
 from worldline_core.data.guards.source_paths import (
     AnyPath,
     fill_template,
@@ -130,7 +126,6 @@ def check_files(root: AnyPath, cameras: Sequence[str]) -> None:
 
 INDEX = "episode_index"
 MAX_INDEX = 10**12
-_BLOCK_BYTES = 16 << 20
 
 
 class EpisodeTable:
@@ -510,12 +505,11 @@ class LeRobotV3Dataset(LeRobotDataset):
         return decode_frames(self.clip(episode_index, key), indices)
 
 
-_HALF_PAIR = re.compile(rb"\\(?:u[dD][89a-fA-F][0-9a-fA-F]{2}|.)", re.DOTALL)
-"""An escape of JSON. Arrow refuses a whole file for one half of a surrogate pair; of the episode list numbers alone are read."""
-
-
-def _kept_escape(found: re.Match[bytes]) -> bytes:
-    return found[0] if len(found[0]) == 2 else b"?"
+def _number_of(row: object, name: str) -> float | None:
+    """A row's number; None for anything else, which whoever needs the number then refuses."""
+    value = row.get(name) if isinstance(row, dict) else None
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_INDEX
+    return float(value) if usable else None
 
 
 class _Task(BaseModel):
@@ -533,17 +527,10 @@ class LeRobotV21Dataset(LeRobotDataset):
     @cached_property
     def episodes(self) -> EpisodeTable:
         path = self.root / "meta" / "episodes.jsonl"
-        schema = pa.schema([(INDEX, pa.float64()), ("length", pa.float64())])
-        with unreadable("File is not JSON lines", path, (pa.ArrowException, OSError, ValueError)):
-            table = pyarrow.json.read_json(
-                io.BytesIO(
-                    _HALF_PAIR.sub(
-                        _kept_escape, regular_file(path, "Episode list").read_bytes().removeprefix(codecs.BOM_UTF8)
-                    )
-                ),
-                read_options=pyarrow.json.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES),
-                parse_options=pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
-            )
+        rows = list(read_json_lines(path))
+        table = pa.table(
+            {name: pa.array([_number_of(row, name) for row in rows], pa.float64()) for name in (INDEX, "length")}
+        )
         return EpisodeTable(table, path)
 
     @cached_property

@@ -157,7 +157,7 @@ class Hdf5File:
         for arm in places:
             joints = self.columns(arm.joints, length, "length_mismatch", track)
             length = len(joints)
-            own = (joints != self._dataset(arm.joints.dataset.format(track=track)).fillvalue).any(axis=1)
+            own = np.not_equal(joints, self._dataset(arm.joints.dataset.format(track=track)).fillvalue).any(axis=1)
             written = written | own if blocks else own
             blocks.append(joints)
             names += joint_names({arm.name: joints.shape[1]}, gripper=arm.gripper is not None)
