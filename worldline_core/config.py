@@ -15,7 +15,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, TypeAliasType, Union, cast, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from yaml.constructor import ConstructorError
 
 from worldline_core.errors import ConfigError
@@ -29,8 +29,20 @@ CONFIG_ROOT = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACK
 MAX_VALUES = 200_000
 """Of one file, with what its aliases repeat: some lines of aliases can stand for more values than memory holds."""
 Side = Annotated[int, Field(ge=1, le=16_384)]
-ImageSize = tuple[Side, Side]
+MAX_PIXELS = 40_000_000
+"""One image; 8K video has 33 million pixels."""
+
+
+def _decodable(size: tuple[int, int]) -> tuple[int, int]:
+    if size[0] * size[1] > MAX_PIXELS:
+        raise ValueError(f"{size[0]} x {size[1]} pixels are more than {MAX_PIXELS:,}")
+    return size
+
+
+ImageSize = Annotated[tuple[Side, Side], AfterValidator(_decodable)]
 """(height, width) in pixels."""
+FrameRate = Annotated[float, Field(ge=0.01, le=10_000)]
+"""Frames per second; at others, times or numbers of frames are no usable numbers."""
 _LONGEST_INPUT = 200
 _MOST_MISTAKES = 30
 

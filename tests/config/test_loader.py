@@ -161,8 +161,20 @@ def test_null_takes_away_what_the_file_has() -> None:
         load("curate=null")
 
 
-@pytest.mark.parametrize("size", [[0, 0], [-64, 96], [1_000_000, 1_000_000], [64]])
+@pytest.mark.parametrize("size", [[0, 0], [-64, 96], [1_000_000, 1_000_000], [16_384, 16_384], [64]])
 def test_pictures_of_no_size_are_refused_before_anything_is_read(size: list[int]) -> None:
     for read in (CurateConfig, EncodeLatentsConfig, TokenizerConfig, SegmenterConfig, GeSimConfig):
         with pytest.raises(ValidationError, match="image_size"):
             read.model_validate({"image_size": size})
+
+
+@pytest.mark.parametrize("fps", [1e-320, 0, -1, 1e300, float("nan"), float("inf")])
+def test_rates_that_give_no_usable_times_are_refused_before_anything_is_read(fps: float) -> None:
+    robotwin = {"kind": "robotwin", "path": "a", "embodiment": "none", "fps": fps, "views": {"head": "head_camera"}}
+    for sources, changes, name in (
+        ([robotwin], {}, "fps"),
+        ([{"kind": "video_folder", "path": "a", "target_fps": fps}], {}, "target_fps"),
+        ([], {"fps": fps}, "fps"),
+    ):
+        with pytest.raises(ValidationError, match=rf"{name}\n"):
+            CurateConfig.model_validate({"sources": sources, **changes})

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from published_lerobot import FRAMES, picture, wave, write_droid, write_robocoin
-from test_lerobot_rows import DATA, EPISODES, edit, run, source
+from test_lerobot_rows import DATA, EPISODES, edit, run, source, with_values
 
 from worldline_core.data.sources.lerobot import flat_names
 from worldline_core.errors import ConfigError, DataError
@@ -105,6 +105,27 @@ def test_byte_order_marks_and_numbers_with_a_fraction_of_zero(tmp_path: Path) ->
     counts, curated = run(tmp_path, source(root, **V21))
     assert counts["kept"] == 2
     assert curated.rows[0].instruction == "move the bread"
+
+
+@pytest.mark.parametrize(
+    "line", ["null", "[]", "7", "{}", '"x"', '{"episode_index": true}', '{"episode_index": 1e400}']
+)
+def test_a_line_that_is_no_episode_is_one_message(tmp_path: Path, line: str) -> None:
+    """Arrow's reader of JSON crashes on some of them."""
+    write_robocoin(tmp_path / "raw", episodes=2)
+    with (tmp_path / "raw/meta/episodes.jsonl").open("a") as file:
+        file.write(f"\n{line}\n")
+    with pytest.raises(DataError, match=r"numbers no episodes[\s\S]*episodes\.jsonl"):
+        run(tmp_path, source(tmp_path / "raw", **V21))
+
+
+@pytest.mark.parametrize("index", [float("nan"), None, 1e300, -1.0, 0.5])
+def test_a_task_index_that_is_no_index_costs_its_episode(tmp_path: Path, index: float | None) -> None:
+    write_droid(tmp_path / "raw")
+    values = [index] * FRAMES + [0.0] * FRAMES
+    edit(tmp_path / "raw" / DATA, lambda table: with_values(table, task_index=values))
+    counts, _ = run(tmp_path, source(tmp_path / "raw"))
+    assert (counts["kept"], set(counts["reasons"]) <= {"missing_column", "nan_state"}) == (1, True)
 
 
 def test_lengths_in_version_3_may_be_floats_but_no_fractions(tmp_path: Path) -> None:

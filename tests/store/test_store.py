@@ -20,7 +20,7 @@ from tasks.execution.artifact_task import find_task
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.store import store as store_module
-from worldline_core.store.artifact_files import digest_file, digest_folder, digest_value
+from worldline_core.store.artifact_files import digest_file, digest_folder, digest_value, find_damage
 from worldline_core.store.atomic import atomic_path, write_arrays_atomic, write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import ArtifactStore, folder_lock
 
@@ -200,6 +200,30 @@ def test_killed_run_continues_to_the_same_digest(tmp_path: Path) -> None:
     ]
     assert digests[0] == digests[1]
     assert not list((tmp_path / "killed" / "slow").glob("*.partial"))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"files": ["a"]}, {"files": {"a": 7}}, {"digest": 7}, {"metrics": []}, {"inputs": {"a": "b"}}, {"config": None}],
+)
+def test_a_manifest_of_another_form_is_one_message(tmp_path: Path, changes: dict[str, Any]) -> None:
+    """As an earlier version, or somebody else, may have written it; its own digest fits."""
+    store = ArtifactStore(tmp_path)
+    artifact = store.run("count", 1, count, CountConfig(), {})
+    path = artifact.path / "manifest.json"
+    content = {**json.loads(path.read_text()), **changes}
+    del content["manifest_sha256"]
+    path.write_text(json.dumps({**content, "manifest_sha256": digest_value(content)}))
+    with pytest.raises(ArtifactError, match=rf"another form[\s\S]*{next(iter(changes))}[\s\S]*next step"):
+        store.run("count", 1, count, CountConfig(), {})
+    assert len(find_damage(artifact.path)) == 1
+
+
+def test_a_clock_that_is_set_back_gives_no_negative_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(10**9, 0, -1000))
+    monkeypatch.setattr(time, "time", lambda: next(clock))
+    artifact = ArtifactStore(tmp_path).run("count", 1, count, CountConfig(), {})
+    assert json.loads((artifact.path / "manifest.json").read_text())["wall_seconds"] >= 0
 
 
 def test_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:

@@ -16,6 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from worldline_core.errors import ArtifactError
 from worldline_core.store.atomic import write_json_atomic
 
@@ -245,11 +247,29 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> str:
     return content["digest"]
 
 
+class _ListedFile(BaseModel):
+    size: int
+    sha256: str
+
+
+class _Manifest(BaseModel):
+    """What readers of a manifest rely on."""
+
+    model_config = ConfigDict(strict=True)
+    digest: str
+    files: dict[str, _ListedFile]
+    step: str = ""
+    metrics: dict[str, Any] = {}
+    config: dict[str, Any] = {}
+    inputs: dict[str, dict[str, Any]] = {}
+    environment: dict[str, Any] = {}
+
+
 def read_manifest(folder: Path) -> JsonObject:
     """The manifest of a finished artifact; an empty object where there is none.
 
     Raises:
-        ArtifactError: it is damaged.
+        ArtifactError: it is damaged, or of another form.
     """
     path = folder / MANIFEST_NAME
     try:
@@ -265,6 +285,16 @@ def read_manifest(folder: Path) -> JsonObject:
             got=f"content of sha256 {found}",
             next_step=how_to_rebuild(folder),
         )
+    try:
+        _Manifest.model_validate(manifest or {"digest": "", "files": {}})
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise ArtifactError(
+            "A manifest is of another form, as an earlier version wrote it",
+            where=path,
+            expected=f"{'.'.join(map(str, first['loc']))}: {first['msg']}",
+            next_step=how_to_rebuild(folder),
+        ) from error
     return manifest
 
 
@@ -288,7 +318,7 @@ def find_damage(folder: Path, mode: VerifyMode = "full") -> list[str]:
     try:
         stated = read_manifest(folder)["files"]
     except ArtifactError as error:
-        return [f"{MANIFEST_NAME}: {error.got}"]
+        return [f"{MANIFEST_NAME}: {error.got or error.expected}"]
     present = {path.relative_to(folder).as_posix(): path for path in folder_files(folder)}
     damage = [f"{name}: missing" for name in sorted(stated.keys() - present.keys())]
     damage += [f"{name}: not listed" for name in sorted(present.keys() - stated.keys())]

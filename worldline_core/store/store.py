@@ -279,7 +279,9 @@ class ArtifactStore:
         digests = {name: self.input_digest(path) for name, path in sorted(inputs.items())}
         key = self.key(step, version, config, digests)
         if (found := self.find(step, key)) is not None:
-            logger.info("%s %s: cached%s; %s", step, key, _counts(read_manifest(found.path)["metrics"]), found.path)
+            logger.info(
+                "%s %s: cached%s; %s", step, key, _counts(read_manifest(found.path).get("metrics", {})), found.path
+            )
             return found
         folder = self.root / step / key
         if not folder.parent.resolve().is_relative_to(self.root):
@@ -320,7 +322,7 @@ class ArtifactStore:
                     pass
             remove_unfinished(partial)
             logger.info("%s %s: %s", step, key, "continuing" if resumed else "working")
-            started = time.time()
+            started = time.monotonic()
             with _announced(announcement):
                 metrics = function(config, sources, partial)
             facts = {
@@ -338,7 +340,7 @@ class ArtifactStore:
                     "threads": read_json(partial / VOLATILE_FOLDER / "threads.json").get("threads"),
                 },
                 "resumed": resumed,
-                "wall_seconds": round(time.time() - started, 3),
+                "wall_seconds": round(time.monotonic() - started, 3),
                 "finished_at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             }
             digest = write_manifest(partial, facts)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from worldline_core.config import ImageSize, StrictModel
+from worldline_core.config import FrameRate, ImageSize, StrictModel
 from worldline_core.data.episodes.episode import Split
 from worldline_core.data.episodes.view_recording import VideoMode
 from worldline_core.data.guards.reader_process import ReaderLimits
@@ -69,7 +69,7 @@ class CurateConfig(StrictModel):
         default=None, description="(height, width) of all images; null keeps each size"
     )
     fit: Fit = Field(default="stretch", description="how images come to that size; letterbox and crop keep the aspect")
-    fps: float | None = Field(default=None, gt=0, description="rate of all episodes; null keeps each rate")
+    fps: FrameRate | None = Field(default=None, description="rate of all episodes; null keeps each rate")
     stride: int | None = Field(default=None, ge=1, description="instead of fps: keep every so many frames")
     views: tuple[str, ...] | Literal["available"] | None = Field(
         default=None,

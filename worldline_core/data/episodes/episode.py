@@ -186,9 +186,9 @@ class Episode(EpisodeDescription):
     def __post_init__(self) -> None:
         where, shape = f"episode {self.episode_id}", self.state.shape
         frames = len(self.timestamps)
-        if not (np.isfinite(self.fps) and self.fps > 0):
+        if not 0.01 <= self.fps <= 10_000:  # as `FrameRate`; NaN too
             raise RejectedInputError(
-                "wrong_fps", "Frame rate is not positive", where=where, expected="frames per second", got=self.fps
+                "wrong_fps", "Frame rate is not usable", where=where, expected="0.01 to 10,000 fps", got=self.fps
             )
         if len(shape) != 2 or shape[0] != frames or frames == 0:
             raise DataError("State has a wrong shape", where=where, expected=f"({frames} > 0, J)", got=shape)

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Protocol
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from worldline_core.config import ImageSize, StrictModel
+from worldline_core.config import FrameRate, ImageSize, StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import NO_EMBODIMENT, TRAINING_SPLITS, Episode, Outcome, Split, TaskFamily
 from worldline_core.data.guards.rejection import RejectedInputError, check_texts, collect_faults
@@ -136,8 +136,8 @@ class SourceConfigBase(StrictModel):
         default=None, description="(height, width) of this source's images; null: curate.image_size"
     )
     fit: Fit | None = Field(default=None, description="how they come to that size; null: curate.fit")
-    target_fps: float | None = Field(
-        default=None, gt=0, description="rate of this source's episodes in the set; null: curate.fps"
+    target_fps: FrameRate | None = Field(
+        default=None, description="rate of this source's episodes in the set; null: curate.fps"
     )
     stride: int | None = Field(
         default=None, ge=1, description="instead of a rate: keep every so many frames of this source"

@@ -9,6 +9,7 @@ from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
+from worldline_core.config import MAX_PIXELS
 from worldline_core.errors import DataError
 from worldline_core.store.remote import is_transient
 from worldline_core.untrusted_text import unusable_text
@@ -61,8 +62,6 @@ REASONS: tuple[str, ...] = get_args(Reason)
 RATE_TOLERANCE = 1e-2
 """Largest deviation of a video's rate, as a share of the stated one: containers round times."""
 MAX_SIDE_PX = 16_384
-MAX_PIXELS = 40_000_000
-"""One image; 8K video has 33 million pixels."""
 MAX_COLUMNS = 1_000
 """Columns of one track of a robot, which has some hundreds at most."""
 MAX_CHUNK_BYTES = 256 << 20

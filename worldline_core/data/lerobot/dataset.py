@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from worldline_core.config import FrameRate
 from worldline_core.data.guards.plain_files import (
     column_names,
     decode_image,
@@ -59,7 +60,7 @@ class DatasetInfo(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True)
 
     codebase_version: str
-    fps: float = Field(gt=0, le=10_000)
+    fps: FrameRate
     features: dict[str, dict[str, Any]]
     data_path: str | None = None
     video_path: str | None = None

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from worldline_core.config import StrictModel
+from worldline_core.config import FrameRate, StrictModel
 from worldline_core.data.episodes.source import EmbodimentName, ForeignSourceConfig, GripperRange
 
 
@@ -133,7 +133,7 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
 
     kind: Literal["mcap_topics"] = "mcap_topics"
     embodiment: EmbodimentName
-    fps: float = Field(gt=0, description="rate to which everything is brought")
+    fps: FrameRate = Field(description="rate to which everything is brought")
     views: dict[str, ViewTopics] = Field(min_length=1)
     arms: tuple[ArmTopics, ...] = Field(min_length=1, max_length=2, description="left before right")
     without_commands: Literal["refuse", "repeat_state"] = Field(

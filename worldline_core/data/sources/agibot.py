@@ -26,6 +26,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from worldline_core.config import FrameRate
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
@@ -76,7 +77,7 @@ _STEP_OF_EPISODE = re.compile(r"(\d+)-(\d+)-(\d+)")
 
 
 class _ClipConfig(ForeignSourceConfig):
-    fps: float = Field(gt=0, description="stated in no file (AgiBot World records 30 Hz); a video must have it")
+    fps: FrameRate = Field(description="stated in no file (AgiBot World records 30 Hz); a video must have it")
     embodiment: EmbodimentName = "agibot_g1"
 
 
@@ -103,7 +104,7 @@ class AgibotWorldSourceConfig(ForeignSourceConfig):
     """
 
     kind: Literal["agibot_world"] = "agibot_world"
-    fps: float = Field(default=30.0, gt=0, description="rate that videos and timestamps must have")
+    fps: FrameRate = Field(default=30.0, description="rate that videos and timestamps must have")
     embodiment: EmbodimentName = "agibot_g1"
     views: tuple[View, ...] = Field(
         default=("head", "left_wrist", "right_wrist"), min_length=1, description="views that must be there"

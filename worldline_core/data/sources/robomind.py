@@ -23,6 +23,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from worldline_core.config import FrameRate
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.source import EmbodimentName, ForeignSourceConfig, GripperRange, LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -149,7 +150,7 @@ class RobomindSourceConfig(ForeignSourceConfig):
 
     kind: Literal["robomind"] = "robomind"
     layout: LayoutName = Field(description="the release's folder name (version 1), or v2_ and it (version 2)")
-    fps: float = Field(gt=0, description="of the images and states; stated in no file")
+    fps: FrameRate = Field(description="of the images and states; stated in no file")
     embodiment: EmbodimentName | None = Field(default=None, description="default: the layout's")
     views: dict[str, str] | None = Field(
         default=None, min_length=1, description="view -> camera; default: the layout's"

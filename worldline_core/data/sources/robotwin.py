@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from worldline_core.config import FrameRate
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
 from worldline_core.data.episodes.source import (
@@ -49,7 +50,7 @@ class RobotwinSourceConfig(EvaluationSourceConfig):
     """The files state no rate, so it is declared here (the simulation's rate divided by the setting's `save_freq`)."""
 
     kind: Literal["robotwin"] = "robotwin"
-    fps: float = Field(gt=0)
+    fps: FrameRate
     embodiment: EmbodimentName = NO_EMBODIMENT
     views: dict[str, str] = Field(
         default={"head": "head_camera", "left_wrist": "left_camera", "right_wrist": "right_camera"},

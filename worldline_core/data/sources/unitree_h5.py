@@ -23,6 +23,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from worldline_core.config import FrameRate
 from worldline_core.data.episodes.source import EmbodimentName, ForeignSourceConfig, GripperRange, LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
@@ -89,7 +90,7 @@ class UnitreeH5SourceConfig(ForeignSourceConfig):
         "its arm, or both last), ALOHA"
     )
     embodiment: EmbodimentName
-    fps: float = Field(gt=0, description="of the states; videos must have it (Unitree records 30 Hz)")
+    fps: FrameRate = Field(description="of the states; videos must have it (Unitree records 30 Hz)")
     views: dict[str, str] = Field(
         min_length=1, description="view -> camera: the name of its folder of videos, or of its images in the file"
     )
