@@ -149,7 +149,7 @@ class Hdf5File:
         Raises: RejectedInputError: length_mismatch or invalid_gripper for a dataset of another width; unreadable where no
             joint of a frame was written (HDF5 fills the gaps).
         """
-        written = np.zeros(0, bool)
+        written: np.ndarray = np.zeros(0, bool)
         blocks: list[np.ndarray] = []
         openings: list[np.ndarray] = []
         names: list[str] = []
@@ -157,7 +157,8 @@ class Hdf5File:
         for arm in places:
             joints = self.columns(arm.joints, length, "length_mismatch", track)
             length = len(joints)
-            own = np.not_equal(joints, self._dataset(arm.joints.dataset.format(track=track)).fillvalue).any(axis=1)
+            fill = self._dataset(arm.joints.dataset.format(track=track)).fillvalue
+            own = ~np.isclose(joints, float(fill), rtol=0, atol=0).all(axis=1)  # NaN is close to nothing
             written = written | own if blocks else own
             blocks.append(joints)
             names += joint_names({arm.name: joints.shape[1]}, gripper=arm.gripper is not None)
