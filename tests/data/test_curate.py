@@ -288,7 +288,7 @@ def test_half_the_rate_in_the_metadata_of_a_set_is_a_wrong_rate(tmp_path: Path, 
     info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": 4}))
     if index_too:
         write_index(raw, [replace(row, fps=4.0) for row in EpisodeSet.open(raw).rows])
-    with pytest.raises(DataError, match=r"2 (wrong_fps|length_mismatch)"):
+    with pytest.raises(DataError, match="2 wrong_fps"):
         curate(config(raw, fps=None), {}, tmp_path / "out")
     if not index_too:
         with pytest.raises(RejectedInputError, match="another frame rate"):

@@ -167,11 +167,11 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         return opened
 
     def label(self, source: int) -> str:
-        """What a source is called in quarantine rows."""
+        """Name of a source in quarantine rows."""
         return self.config.sources[source].label
 
     def listed_episodes(self) -> list[list[ListedEpisode]]:
-        """What each source lists, in its order, under ids that are unique in the set.
+        """Episodes that each source lists, in its order, under ids that are unique in the set.
 
         Raises: DataError for a source that lists nothing.
         """

@@ -1,4 +1,4 @@
-"""What to read, and what every curated episode looks like."""
+"""Configuration of curation: sources, and the form of every curated episode."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ Splits = Annotated[
 
 
 class LeakageConfig(StrictModel):
-    """What to do when a scene that is learnt from looks like a scene that is tested on."""
+    """Consequence when a scene that is learnt from looks like a scene that is tested on."""
 
     action: Literal["report", "quarantine", "off"] = Field(
         default="report",
@@ -62,7 +62,7 @@ class LeakageConfig(StrictModel):
 
 
 class CurateConfig(StrictModel):
-    """What to read and what every kept episode will look like."""
+    """Sources to read, and the form of every kept episode."""
 
     sources: tuple[SourceConfig, ...] = Field(min_length=1)
     image_size: ImageSize | None = Field(

@@ -1,4 +1,4 @@
-"""What a recorded episode must satisfy to enter a set. Each failed check has its reason code and its numbers."""
+"""Checks that a recorded episode must pass to enter a set. Each failed check has its reason code and its numbers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _GRIPPER_MARGIN = 0.05
 _MOVES_RAD, _APART_RAD, _MUCH_CLOSER = 0.1, 0.1, 0.25
 """Commands that are as far from the states of joints that move, and so much closer once they are read otherwise."""
 _POSE_FRAMES, _POSE_ERROR_M, _POSE_ERROR_DEG = 64, 0.05, 10.0
-"""How many frames of tool poses are compared with kinematics; descriptions and mounts that are a little off stay below."""
+"""Frames of tool poses compared with kinematics, and their largest errors: a mount that is a little off stays below."""
 _JOINT_TOLERANCE_RAD = 0.05
 _TIME_TOLERANCE_FRAMES = 0.25
 """Largest distance of a frame from its place on the grid of its rate."""

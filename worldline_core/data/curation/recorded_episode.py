@@ -29,7 +29,7 @@ _KEPT_SPLITS = ("ood_test", "bank")
 TRIMMED = "trimmed"
 """Noted in the conventions of an episode that `trim` shortened: how many frames states and videos had."""
 MAX_TRIMMED_FRAMES = 1
-"""What a recorder that stops at once leaves between the last state and the last picture."""
+"""Difference that a recorder which stops at once leaves between the last state and the last picture."""
 
 
 def trimmed(config: CurateConfig, loaded: LoadedEpisode) -> LoadedEpisode:
@@ -173,7 +173,7 @@ def _named_split(scene: str, splits: Mapping[str, Split] | DrawnSplits) -> Split
 
 
 def is_drawn(scene: str, split: str, conventions: Mapping[str, object], splits: DrawnSplits) -> bool:
-    """Whether the draw decides the split, not a pattern or the source."""
+    """True if the draw decides the split, not a pattern or the source."""
     kept = split in _KEPT_SPLITS or conventions.get("layout") in EVALUATION_LAYOUTS
     return not kept and _named_split(scene, splits) is None
 

@@ -209,7 +209,7 @@ def _leaking(parts: Sequence[Described], kept: Sequence[int], leaks: Sequence[Sc
 
 @dataclass(frozen=True)
 class SceneView:
-    """What the search sees of an episode. `first` is (4,) uint64, 256 bits of the primary view's first image."""
+    """An episode as the search sees it. `first` is (4,) uint64, 256 bits of the primary view's first image."""
 
     episode_id: str
     scene: str

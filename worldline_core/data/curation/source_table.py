@@ -1,4 +1,4 @@
-"""What a set was made from (sources.json), and how often each source is drawn in training (source_weights.json).
+"""Sources of a set (sources.json), and how often training draws each of them (source_weights.json).
 
 A weight per episode by source, as `ClipSampling.source_weights` takes it: sampling by hours alone lets the largest source
 drown the others; equal shares repeat the smallest ones too often. A power between them, share ~ hours ** alpha, is what

@@ -1,4 +1,4 @@
-"""How a source wrote its numbers where it departs from the contract, and how to undo that.
+"""Departures of a source from the contract, and their repair.
 
 The contract (`worldline_core.data.episodes.episode`): `T_base_camera` maps camera points to base, cameras have OpenCV axes,
 metres, radians, quaternions xyzw, state blocks left then right, tool poses between the fingertips, K at the image's own size,
@@ -61,7 +61,7 @@ _NEEDS: dict[str, tuple[str, Callable[[Episode], bool]]] = {
     "image_lag_frames": ("anything", lambda _: True),
     "gripper": ("state columns whose names end with gripper", lambda episode: bool(arm_blocks(episode))),
 }
-"""What an episode must have for a field of `RecordedConventions` to apply to it, in words and as a test."""
+"""Requirements of an episode for a field of `RecordedConventions` to apply to it, in words and as a test."""
 
 
 def applicable(episode: Episode, field: str) -> bool:
@@ -86,7 +86,7 @@ def check_applicable(episode: Episode, fields: Iterable[str]) -> None:
 
 
 class RecordedConventions(StrictModel):
-    """How a source wrote its numbers where it departs from the contract; the default says: as the contract.
+    """Departures of a source's numbers from the contract; the default says: as the contract.
 
     One field per common mistake; setting it is the configuration line that repairs it.
     """

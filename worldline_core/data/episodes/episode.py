@@ -28,7 +28,7 @@ TRAINING_SPLITS = ("train", "validation")
 """Splits that train or select a model."""
 StateKind = Literal["joints", "ee_pose", "none"]
 REPEATS_STATE = "repeats the state"
-"""How the note `action` in an episode's conventions begins where its source records no commands."""
+"""Beginning of the note `action` in an episode's conventions where its source records no commands."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class CameraTrack:
 
 @dataclass(frozen=True)
 class Stored:
-    """How an array of an episode is stored: its dtype, and its axes (N frames, J state columns, A arms, or a size)."""
+    """Storage of an array of an episode: its dtype, and its axes (N frames, J state columns, A arms, or a size)."""
 
     dtype: type[np.floating]
     axes: tuple[str | int, ...]
@@ -116,7 +116,7 @@ ARRAYS = {
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeLabels:
-    """What an episode is. Under these names it stands in the index of a set and in every file that holds an episode."""
+    """Labels of an episode. Under these names they are in the index of a set and in every file that holds an episode."""
 
     episode_id: str
     source: str

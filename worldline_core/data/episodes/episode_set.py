@@ -246,11 +246,11 @@ class ShardFilesWork[R: InputRow](EpisodeSetWork[R]):
         return () if done else episodes
 
     def summary(self, number: int) -> dict[str, Any]:
-        """What `finish_shard` wrote of a shard's episodes."""
+        """Outputs that `finish_shard` wrote for a shard's episodes."""
         return json.loads(self.summary_path(number).read_text(encoding="utf-8"))
 
     def summary_path(self, number: int) -> Path:
-        """Where `finish_shard` writes it."""
+        """File that `finish_shard` writes."""
         return self.output / "run" / f"shard-{number:05d}.json"
 
 

@@ -62,7 +62,7 @@ from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 VIDEOS_FILE = "videos.json"
 EMBODIMENTS_FOLDER = "embodiments"
 """Robots of the recordings that do not ship with the project."""
-"""How many of the set's videos were copied as they were recorded, how many encoded, and in which codecs they are."""
+"""Counts of the set's videos that were copied as recorded and that were encoded, and their codecs."""
 
 
 def part_name(episode_id: str) -> str:
@@ -267,7 +267,7 @@ class EpisodeSetWriter:
         write_json_atomic(self._rejected / f"{part_name(episode_id)}.json", asdict(row))
 
     def recorded(self, episode_id: str) -> Part | QuarantineRow | None:
-        """What became of an episode so far; None when it was neither added nor quarantined."""
+        """Outcome of an episode so far; None when it was neither added nor quarantined."""
         name = part_name(episode_id)
         if (self._parts / name).is_dir():
             return Part(self._parts / name)

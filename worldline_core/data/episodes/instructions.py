@@ -56,8 +56,7 @@ def _lowered(text: str) -> str:
 
 
 def one_annotation(annotations: Sequence[str]) -> str:
-    """Of several annotations of one episode the one that most annotators gave, as it was written; of equally frequent
-    ones the first. Annotations count as equal when their normalised texts are; "" where none says anything."""
+    """The annotation of an episode that most annotators gave, as it was written; of equally frequent ones the first. Annotations count as equal when their normalised texts are; "" where none says anything."""
     texts = [(text, raw) for raw in annotations if (text := normalised_text(raw))]
     if not texts:
         return ""

@@ -28,7 +28,7 @@ from worldline_core.geometry.transforms import (
 
 REPAIRED = "rotations_repaired"
 MAX_DISTANCE = 1e5
-"""Of a camera from its base, in metres, or in millimetres that are still to be converted."""
+"""Largest distance of a camera from its base, in metres, or in millimetres that are still to be converted."""
 
 
 @contextmanager
@@ -116,7 +116,7 @@ def check_intrinsics(camera: CameraTrack, where: str) -> None:
 
 
 def repair_notes(repairs: Mapping[str, RotationRepair]) -> dict[str, str | int | float]:
-    """What an episode's conventions say about repaired rotations of its views or poses; nothing when none was."""
+    """Notes for an episode's conventions on repaired rotations of its views or poses; nothing when none was."""
     touched = {name: repair for name, repair in repairs.items() if repair.count}
     if not touched:
         return {}

@@ -1,4 +1,4 @@
-"""What LeRobot has no place for, stored beside a dataset in meta/worldline/: cameras, tool poses, masks, conventions."""
+"""Facts that LeRobot has no place for, stored beside a dataset in meta/worldline/: cameras, tool poses, masks, conventions."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def contract(episode: Episode, sizes: Mapping[str, tuple[int, int]]) -> dict[str
 
 
 class Contract(BaseModel):
-    """What is read of a dataset's contract."""
+    """Parts of a dataset's contract that are read."""
 
     model_config = ConfigDict(frozen=True, strict=True)
 

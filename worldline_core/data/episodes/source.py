@@ -1,4 +1,4 @@
-"""What every source of episodes offers, and what the configurations of sources share."""
+"""Interface of all sources of episodes, and the common part of their configurations."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class LoadedEpisode:
 def sorted_views[T](
     views: Iterable[str], read: Callable[[str], T], faults: list[RejectedInputError]
 ) -> tuple[dict[str, T], dict[str, RejectedInputError]]:
-    """What `read` gives for each view; and the rejection of each whose pictures are not there. Others go to `faults`."""
+    """Results of `read` by view; and the rejection of each whose pictures are not there. Others go to `faults`."""
     found: dict[str, T] = {}
     absent: dict[str, RejectedInputError] = {}
     for view in views:
@@ -180,7 +180,7 @@ EmbodimentName = Annotated[str, AfterValidator(_described)]
 
 
 class ForeignSourceConfig(SourceConfigBase):
-    """What foreign recordings do not say about themselves and the user therefore declares."""
+    """Facts that foreign recordings do not state, so that the user declares them."""
 
     split: Split = Field(default="test", description="never train without saying so")
     scene: str | None = Field(default=None, description="scene of all episodes; default: one scene per episode folder")

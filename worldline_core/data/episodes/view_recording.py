@@ -46,7 +46,7 @@ VideoMode = Literal["auto", "encode"]
 
 @dataclass(frozen=True)
 class VideoSettings(Encoding):
-    """How images are stored. mode "auto" copies an encoded video in which nothing changes, "encode" never does."""
+    """Storage of images. Mode "auto" copies an encoded video in which nothing changes, "encode" never does."""
 
     mode: VideoMode = "auto"
 
@@ -74,7 +74,7 @@ class RecordedView:
 
     @classmethod
     def of(cls, frames: np.ndarray) -> RecordedView:
-        """Of pictures in memory, uint8 (N, H, W, 3), kept as they are."""
+        """A recording of pictures in memory, uint8 (N, H, W, 3), kept as they are."""
         return cls(lambda: iter(frames), len(frames))
 
 
@@ -128,7 +128,7 @@ def store_view(
 
 
 type _Format = tuple[ImageTransform, str, str]
-"""How pictures came to their stored size, codec and pixel format of the video."""
+"""Way of pictures to their stored size, codec and pixel format of the video."""
 
 
 def _copied(

@@ -34,7 +34,7 @@ _SIGN_EVERY_SECONDS = 1.0
 
 
 class ReaderLimits(StrictModel):
-    """What reading one recording may take; a recording that takes more is quarantined."""
+    """Limits of reading one recording; one that needs more is quarantined."""
 
     memory_gb: float = Field(default=8.0, gt=0, description="memory of the process that reads")
     seconds: float = Field(default=600.0, gt=0, description="time without a picture decoded or a file opened")

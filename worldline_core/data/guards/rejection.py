@@ -238,6 +238,8 @@ def check_length(what: str, where: object, *, states: int, unit: str, found: int
             where=where,
             expected=f"{states} {unit}",
             got=f"{found} {unit}",
+            next_step="copy the recording again, or drop it; videos one frame longer or shorter than the states are kept by "
+            "curate.trim: common",
             evidence={"states": states, unit: found},
         )
 

@@ -211,7 +211,7 @@ def _not_allowed(path: AnyPath) -> RejectedInputError:
 
 
 def find_files[P: AnyPath](root: P, pattern: str) -> list[P]:
-    """What `root.rglob(pattern)` finds, sorted; a remote folder is listed once.
+    """Files that match `root.rglob(pattern)`, sorted; a remote folder is listed once.
 
     Raises: UnreachableInputError when the store does not answer.
     """

@@ -29,7 +29,13 @@ from worldline_core.data.guards.plain_files import (
     read_table,
     validated,
 )
-from worldline_core.data.guards.rejection import RejectedInputError, check_columns, check_length
+from worldline_core.data.guards.rejection import (
+    RATE_TOLERANCE,
+    RejectedInputError,
+    check_columns,
+    check_length,
+    check_rate,
+)
 from worldline_core.data.guards.source_paths import (
     AnyPath,
     fill_template,
@@ -78,7 +84,7 @@ _NEXT_STEPS = {
 
 
 def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> DatasetInfo:
-    """What `info.json` says, of the wanted version and with these keys.
+    """Content of `info.json`, of the wanted version and with these keys.
 
     Raises: DataError when it is unreadable, of another version, lacks a key, or holds something senseless.
     """
@@ -415,7 +421,7 @@ class LeRobotV3Dataset(LeRobotDataset):
         return path, places
 
     def _load(self, path: AnyPath, episode_index: int) -> np.ndarray:
-        """Where an episode's rows are in a data file, which stays in memory: episodes are read in the order of files."""
+        """Places of an episode's rows in a data file, which stays in memory: episodes are read in the order of files."""
         if path not in self._data:
             table = read_table(path)
             for needed in (INDEX, "index"):
@@ -451,15 +457,19 @@ class LeRobotV3Dataset(LeRobotDataset):
                     "unreadable", f"Video has no usable {name}", where=f"{where}/{name}", got=repr(time)
                 )
         if end is not None:
-            self._check_window(where, key, episode_index, begin, end, length)
+            self._check_window(path, where, key, episode_index, begin, end, length)
         return VideoClip(path, length, self.fps, from_time=float(begin))
 
-    def _check_window(self, where: str, key: str, episode_index: int, begin: float, end: float, length: int) -> None:
+    def _check_window(
+        self, path: AnyPath, where: str, key: str, episode_index: int, begin: float, end: float, length: int
+    ) -> None:
         """Raises: RejectedInputError (length_mismatch) for a window of another length than the rows, or that shares
-        pictures with another episode's: one of the two then shows the other.
+        pictures with another episode's: one of the two then shows the other; (wrong_fps) where the video's own rate tells
+        that the stated one is the mistake.
         """
         frames = (end - begin) * self.fps
         if abs(frames - length) >= 0.5:
+            check_rate(video_size(path)[2], self.fps, where, tolerance=RATE_TOLERANCE * self.fps)
             raise RejectedInputError(
                 "length_mismatch",
                 "Video window and rows differ in length",

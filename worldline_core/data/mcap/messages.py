@@ -89,7 +89,7 @@ class EncodedImage:
 
     @property
     def picture(self) -> Literal["key", "other"] | None:
-        """Whether decoding can begin with this picture: an IDR picture (H.264), or any random access point (H.265).
+        """Tells if decoding can begin with this picture: an IDR picture (H.264), or any random access point (H.265).
 
         None for a message of parameter sets alone. The first picture's NAL unit decides, not what comes before it.
         """

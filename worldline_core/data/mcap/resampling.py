@@ -87,7 +87,7 @@ class Clocks:
 
 
 def _without_time(stream: Stream) -> int:
-    """How many messages state the time 0; of transforms those of one frame, as one that came once stays."""
+    """Number of messages that state the time 0; of transforms those of one frame, as one that came once stays."""
     if stream.kind == "transforms":
         children = Counter(each.child for transforms in stream.values for each in transforms if not each.stamp_ns)
         return max(children.values(), default=0)
@@ -299,7 +299,7 @@ class _Edge:
 
     @property
     def moving(self) -> bool:
-        """Whether the transform came more than once over a topic of moving ones; otherwise the last one counts."""
+        """True if the transform came more than once over a topic of moving ones; otherwise the last one counts."""
         return not self.static and len(self.times_ns) > 1
 
     @cached_property

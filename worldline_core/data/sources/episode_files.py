@@ -1,4 +1,4 @@
-"""What sources of foreign recordings share: episodes that are files below a folder, under ids that are unique and storable,
+"""Common parts of foreign sources: episodes that are files below a folder, under ids that are unique and storable,
 and what the configuration declares of them."""
 
 from __future__ import annotations

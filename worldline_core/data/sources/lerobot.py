@@ -200,7 +200,7 @@ class _Block:
 
 @dataclass(frozen=True)
 class StateColumns:
-    """Where a dataset keeps what the contract calls state and action; without `action` the action repeats the state."""
+    """Columns that hold state and action as the contract has them; without `action` the action repeats the state."""
 
     names: tuple[str, ...] | None
     state: Sequence[_Block]
@@ -355,7 +355,12 @@ class LeRobotSource:
             if key not in dataset.features:
                 known = ", ".join(dataset.camera_keys)
                 raise RejectedInputError(
-                    "missing_view", "Dataset has no such camera", where=self._root, expected=key, got=known
+                    "missing_view",
+                    "Dataset has no such camera",
+                    where=self._root,
+                    expected=key,
+                    got=known,
+                    next_step="correct the source's views, or keep what is there: curate.views: available",
                 )
             if not dataset.has_video(key):
                 dataset.image_size(index, key)

@@ -85,7 +85,7 @@ class McapSource:
 
 @dataclass(frozen=True)
 class _Recording:
-    """What one recorder wrote: a file, or the parts of a split bag of rosbag2 in their order.
+    """One recorder's output: a file, or the parts of a split bag of rosbag2 in their order.
 
     Attributes:
         name: of the file or the bag's folder, below the source's folder.

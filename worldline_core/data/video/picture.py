@@ -42,7 +42,7 @@ class Picture:
 
     @cached_property
     def orientation(self) -> int:
-        """How the frame must be turned to be shown, as EXIF counts (1: as it is)."""
+        """Turn by which the frame is shown, as EXIF counts (1: as it is)."""
         found = self._frame.side_data.get("DISPLAYMATRIX")
         if found is None:
             return UPRIGHT

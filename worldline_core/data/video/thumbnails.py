@@ -83,7 +83,7 @@ class ThumbnailMaker:
         self._gray.append(gray)
 
     def thumbnails(self) -> ViewThumbnails:
-        """Of all pictures added.
+        """Thumbnails of all pictures added.
 
         Raises: RejectedInputError (truncated_video) when there were none.
         """
@@ -140,7 +140,7 @@ _VERSION = "2"
 
 
 def cache_path(set_root: Path, video: Path) -> Path:
-    """Where the thumbnails of one of the set's videos lie."""
+    """File of the thumbnails of one of the set's videos."""
     return (set_root / "run" / "thumbnails" / video.relative_to(set_root)).with_suffix(".npz")
 
 
