@@ -519,8 +519,9 @@ class LeRobotV3Dataset(LeRobotDataset):
 def _number_of(row: object, name: str) -> float | None:
     """A row's number; None for anything else, which whoever needs the number then refuses."""
     value = row.get(name) if isinstance(row, dict) else None
-    usable = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_INDEX
-    return float(value) if usable else None
+    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= MAX_INDEX:
+        return None
+    return float(value)
 
 
 class _Task(BaseModel):
