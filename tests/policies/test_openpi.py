@@ -127,6 +127,7 @@ def _fails(_: dict[str, Any]) -> Any:
         (lambda _: {}, DataError, r"(?s)actions are no chunk.*NoneType"),
         (lambda _: {"actions": np.zeros(8)}, DataError, r"(?s)actions are no chunk.*float64 \(8,\)"),
         (lambda _: {"actions": np.zeros((0, 14))}, DataError, "actions are no chunk"),
+        (lambda _: {"actions": np.zeros((1025, 14))}, DataError, r"(?s)no chunk.*1 to 1024.*\(1025, 14\)"),
         (lambda _: {"actions": np.zeros((2, 0))}, DataError, "actions are no chunk"),
         (lambda _: {"actions": np.array([["a"]])}, DataError, r"(?s)actions are no chunk.*<U1"),
         (lambda _: {"actions": np.array([[0.0, np.nan]])}, DataError, r"not finite\n.*step 0, column 1"),

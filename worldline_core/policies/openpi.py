@@ -16,6 +16,9 @@ from worldline_core.errors import DataError
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
 from worldline_core.policies.message_socket import MessageSocket
 
+MAX_HORIZON = 1024
+"""Longest chunk of actions: policies of this field plan some ten to hundred steps ahead."""
+
 
 class OpenpiPolicy(MessageSocket):
     """A connected policy.
@@ -60,9 +63,11 @@ class OpenpiPolicy(MessageSocket):
         reply = self.request(observation, deadline_s=deadline_s)
         actions: Any = reply.get("actions")
         array = isinstance(actions, np.ndarray)
-        if not array or actions.dtype.kind not in "fiu" or actions.ndim != 2 or not actions.size:
+        numbers = array and actions.dtype.kind in "fiu" and actions.ndim == 2 and actions.size
+        if not numbers or len(actions) > MAX_HORIZON:
             raise DataError(
-                "The policy's actions are no chunk", where=self.url, expected="numbers (horizon >= 1, size >= 1)",
+                "The policy's actions are no chunk", where=self.url,
+                expected=f"numbers (horizon 1 to {MAX_HORIZON}, size >= 1)",
                 got=f"{actions.dtype} {actions.shape}" if array else type(actions).__name__,
             )  # fmt: skip
         actions = actions.astype(np.float64)
