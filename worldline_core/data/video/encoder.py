@@ -76,7 +76,7 @@ _RGB_TO_YUV = np.array(
 ) / np.float32(255.0)
 _YUV_OFFSET = (16.0, 128.0, 128.0)
 BITEXACT = {"fflags": "+bitexact", "movflags": "+faststart"}
-"""How an mp4 is opened for writing, so that its bytes hold no times and no versions."""
+"""Options of an mp4 that is written, so that its bytes hold no times and no versions."""
 X264_PARAMETERS = "cpu-independent=1"
 """Without this x264 chooses other algorithms on other processors, and with AVX-512 about one clip in a hundred came out
 differently from run to run."""
@@ -156,7 +156,7 @@ def _planar(frame: np.ndarray, pixel_format: PixelFormat) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Encoding:
-    """How pictures are encoded.
+    """Encoding of pictures.
 
     Attributes:
         crf: quality, 0 (exact up to the colour conversion) .. 51; 18 is visually exact, 28 small.
