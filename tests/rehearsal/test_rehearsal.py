@@ -116,13 +116,15 @@ def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project
     assert [manifest["metrics"]["lpips"] for manifest in manifests["distill"]] == ["on"]
     (ablations,) = (folder / "artifacts" / "ablation_table").glob("*/table.parquet")
     rows = {cell["variant"] for cell in pq.read_table(ablations).to_pylist() if cell["mean"] is not None}
-    assert rows == load_variants().keys()
-    assert len(manifests["train_stage2"]) == len(rows)
+    # LPIPS of one view does not compare, and a segmenter of random weights measures no robot.
+    variants = load_variants().keys()
+    assert rows == variants - {"head_only"}
+    assert len(manifests["train_stage2"]) == len(variants)
     whole = [rollout for rollout in manifests["rollout"] if rollout["config"]["num_frames"] == 129]
     assert {rollout["config"]["method"] for rollout in whole} == load_config(
         PipelineConfig, preset=PRESET
     ).rollouts.keys()
-    assert len(manifests["rollout"]) == len(whole) + len(rows)
+    assert len(manifests["rollout"]) == len(whole) + len(variants)
     videos = (folder / "artifacts" / "evaluate_video").glob("*/summary.json")
     (video,) = (path for path in videos if "backbone" in json.loads(path.read_text())["methods"])
     assert {"lpips", "robot_iou", "psnr"} <= set(json.dumps(json.loads(video.read_text())).replace('"', " ").split())
