@@ -69,26 +69,19 @@ def start(shipped: Path) -> HeldOut:
     )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def head(start: HeldOut) -> HeldOut:
-    return HeldOut(
-        {"head": start.frames["head"]}, {"head": start.cameras["head"]}, start.poses, start.controls, start.instruction
-    )
-
-
-def test_a_horizon_of_the_whole_episode_is_open_loop_best_of_n(world: WorldLine, head: HeldOut, shipped: Path) -> None:
-    candidates = np.stack([head.controls[1:], head.controls[1:] + 0.03, head.controls[1:][::-1]])
+def test_a_horizon_of_the_whole_episode_is_open_loop_best_of_n(world: WorldLine, start: HeldOut, shipped: Path) -> None:
+    candidates = np.stack([start.controls[1:], start.controls[1:] + 0.03, start.controls[1:][::-1]])
     selector = MeasuredSelector(LearnedSegmenter.load(shipped / "models" / "segmenter"))
-    planner = head.planner(
+    planner = start.planner(
         world, propose=recorded(candidates), score=judged(selector), candidates=3, batch=2, horizon=2, limits=False
     )
-    plan = planner.plan(head.now(), head.controls[0])
+    plan = planner.plan(start.now(), start.controls[0])
     scores = []
     for controls in candidates:
-        rows = np.concatenate((head.controls[:1], controls))
-        frames = world.predict(head.now(), rows, head.cameras, embodiment=ROBOT)
-        shown = shown_video(Trajectory(head.instruction, frames, world.contract.fps))
-        scores.append(selector.score(head.instruction, shown).score / 100)
+        rows = np.concatenate((start.controls[:1], controls))
+        frames = world.predict(start.now(), rows, start.cameras, embodiment=ROBOT)
+        shown = shown_video(Trajectory(start.instruction, frames, world.contract.fps))
+        scores.append(selector.score(start.instruction, shown).score / 100)
     assert np.array_equal(plan.scores, np.sort(scores)[::-1])
     assert np.array_equal(plan.sequence, candidates[int(np.argmax(scores))])
     assert np.array_equal(plan.controls, plan.sequence[:16])
@@ -123,24 +116,26 @@ def test_the_next_choice_begins_at_what_was_really_seen(world: WorldLine, start:
         assert moved > 0.1 or view != "right_wrist"
 
 
-def test_a_planner_stays_within_the_limits_of_the_robot(world: WorldLine, head: HeldOut) -> None:
+def test_a_planner_stays_within_the_limits_of_the_robot(world: WorldLine, start: HeldOut) -> None:
     def still(video: Trajectory) -> float:
         return -float(np.abs(np.diff(video.frames["head"][[0, 16]].astype(float), axis=0)).mean())
 
     def far(situation: Situation, count: int, random: np.random.Generator) -> np.ndarray:
         return situation.state + random.normal(0, 1.5, (count, situation.frames, len(situation.state)))
 
-    planner = head.planner(world, propose=far, score=still, candidates=6, batch=4)
-    plan = planner.plan(head.now(), head.controls[0])
+    planner = start.planner(world, propose=far, score=still, candidates=6, batch=4)
+    plan = planner.plan(start.now(), start.controls[0])
     assert plan.score == plan.scores.max() == plan.scores[0]
     assert len(plan.scores) == plan.model_calls == 6
-    robot = CommandedRobot(planner.kinematics, 8.0, head.controls[:1], limits=True)
+    robot = CommandedRobot(planner.kinematics, 8.0, start.controls[:1], limits=True)
     assert np.array_equal(robot.follow(plan.sequence[None])[1][0], plan.sequence)
-    assert not np.array_equal(robot.follow(head.controls[0] + np.full((1, 16, 14), 3.0))[1][0], head.controls[0] + 3.0)
+    assert not np.array_equal(
+        robot.follow(start.controls[0] + np.full((1, 16, 14), 3.0))[1][0], start.controls[0] + 3.0
+    )
 
 
 def test_a_planner_carries_on_what_it_chose_unless_something_is_better_by_the_margin(
-    world: WorldLine, head: HeldOut
+    world: WorldLine, start: HeldOut
 ) -> None:
     for margin, score in ((0.2, 0.5), (0.05, 0.6)):
         # The first choice looks for nothing that is kept: its third candidate wins by less than the margin. At the second
@@ -150,15 +145,15 @@ def test_a_planner_carries_on_what_it_chose_unless_something_is_better_by_the_ma
         def scored(video: Trajectory, scores: Iterator[float] = scores) -> float:
             return next(scores)
 
-        planner = head.planner(world, candidates=3, margin=margin, score=scored)
-        first = planner.plan(head.now(), head.controls[0], horizon=2)
+        planner = start.planner(world, candidates=3, margin=margin, score=scored)
+        first = planner.plan(start.now(), start.controls[0], horizon=2)
         assert first.score == 0.8
-        second = planner.plan(head.now(), first.controls[-1], horizon=1)
+        second = planner.plan(start.now(), first.controls[-1], horizon=1)
         assert second.score == second.scores[0] == score
         assert np.array_equal(second.sequence, first.sequence[16:]) == (score == 0.5)
 
 
-def test_what_a_planner_cannot_use_is_named(world: WorldLine, head: HeldOut) -> None:
+def test_what_a_planner_cannot_use_is_named(world: WorldLine, start: HeldOut) -> None:
     def proposing(*shape: int) -> Callable:
         return lambda situation, number, random: np.zeros((number, *shape))
 
@@ -167,14 +162,14 @@ def test_what_a_planner_cannot_use_is_named(world: WorldLine, head: HeldOut) -> 
         "Proposals do not fit": {"propose": proposing(15, 14)},
     }
     for message, options in cases.items():
-        planner = head.planner(world, **options)
+        planner = start.planner(world, **options)
         with pytest.raises(DataError, match=message):
-            planner.plan(head.now(), head.controls[0])
+            planner.plan(start.now(), start.controls[0])
         assert planner._past == {}
     with pytest.raises(ConfigError, match="horizon"):
-        head.planner(world, horizon=0)
+        start.planner(world, horizon=0)
     with pytest.raises(ConfigError, match="a margin of at least 0"):
-        head.planner(world, margin=float("nan"))
+        start.planner(world, margin=float("nan"))
 
 
 def test_proposals_from_recordings_go_on_where_the_episode_is() -> None:

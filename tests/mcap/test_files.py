@@ -310,7 +310,7 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path: Path, toy: Any) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fps": 0}, "greater than 0"),
+        ({"fps": 0}, r"fps\n  Input should be greater"),
         ({"arms": []}, "at least 1 item"),
         ({"primary_view": "top"}, "primary_view top is none of head, right_wrist"),
         ({"rate": 30}, "Extra inputs are not permitted"),

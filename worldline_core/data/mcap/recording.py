@@ -308,7 +308,8 @@ class _Recording:
             first, last = np.searchsorted(signal.times_ns, grid[[0, -1]]).tolist()
             used = slice(max(first - 1, 0), last + 1)
             times, values = signal.times_ns[used], signal.values[used]
-            if not (finite := np.isfinite(values).all(axis=1)).all():
+            finite: np.ndarray = np.all(np.isfinite(values), axis=1)
+            if not finite.all():
                 at_s = float((times[np.argmin(finite)] - grid[0]) / 1e9)
                 raise RejectedInputError(
                     "nan_state",
