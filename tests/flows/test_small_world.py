@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from flows.pipeline import pipeline
+from worldline_core.store.artifact_files import finished_artifacts, read_manifest
 
 SMALL = """
 extends: small_world
@@ -46,7 +47,7 @@ def test_the_small_world_is_recorded_trained_and_evaluated(
     with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
         report = pipeline(None, tmp_path / "small.yaml", (), tmp_path / "store")
     assert (report.folder / "index.html").is_file()
-    steps = [json.loads(path.read_text()) for path in (tmp_path / "store").glob("*/*/manifest.json")]
+    steps: list[Any] = [read_manifest(folder) for folder in finished_artifacts(tmp_path / "store")]
     count = {name: sum(step["step"] == name for step in steps) for name in {step["step"] for step in steps}}
     assert count["record"] == 4
     assert {
