@@ -207,7 +207,7 @@ def planning_figure(context: ReportContext) -> Figure | None:
         what,
         measured,
         "banks",
-        f"{words(over['shortcut'])}, the best rule without video",
+        f"the best rule without video ({words(over['shortcut'])})",
         reference,
         (float(bounds["low"]), float(bounds["high"])),
         where,
