@@ -48,21 +48,18 @@ def chain(c: PipelineConfig) -> None:
     clips = {**data, **c.clips_of(c.distill, models | trained), "tokenizer": models["tokenizer"]}
     trained["distill"] = distill.submit(c.distill, **clips, stage2=trained["train_stage2"])
     predicted = predict(c, data, banks, models, trained)
-    scores = evaluate(c, data, banks, models, predicted)
-    made = {"curate": curated, "filter": data["episodes"], "render_actions": data.get("tracks"), **trained, **scores}
-    report.submit(c.report, **made, rollout=predicted, models=models)
+    made = {"curate": curated, "filter": data["episodes"], "render_actions": data.get("tracks"), **trained}
+    report.submit(c.report, **made, **evaluate(c, data, banks, models, predicted), rollout=predicted, models=models)
 
 
 def prepare(c: PipelineConfig) -> tuple[TaskCall, Inputs, Inputs]:
     """Recordings → curated → filtered episodes → action tracks, where there are cameras. Banks are not filtered."""
     recorded: Inputs = {name: record.submit(config, f"record.{name}") for name, config in c.recordings()}
     curated = curate.submit(c.curate, source=c.sources_of(c.curate, recorded))
-    episodes = filter_episodes.submit(c.filter, episodes=curated)
-    data: Inputs = {"episodes": episodes}
-    if c.render_actions is None:
-        return curated, data, {}
-    data["tracks"] = render_actions.submit(c.render_actions, episodes=episodes)
-    if c.curate_banks is None:
+    data: Inputs = {"episodes": filter_episodes.submit(c.filter, episodes=curated)}
+    if c.render_actions is not None:
+        data["tracks"] = render_actions.submit(c.render_actions, episodes=data["episodes"])
+    if c.render_actions is None or c.curate_banks is None:
         return curated, data, {}
     source = c.sources_of(c.curate_banks, recorded)
     banks = curate.submit(c.curate_banks, "curate.banks", source=source)
