@@ -16,7 +16,6 @@ Recordings with an injected defect (injected_defects.json) are left out.
 from __future__ import annotations
 
 import json
-import pickle
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
@@ -191,10 +190,13 @@ def sources(items: Iterator[Healthy], foreign: Path | None) -> dict[str, list[He
     found: dict[str, list[Healthy]] = defaultdict(list)
     for item in items:
         found[item.joints.embodiment].append(item)
-    for path in sorted(foreign.glob("*.pickle")) if foreign is not None else ():
-        embodiment, episodes = pickle.loads(path.read_bytes())  # noqa: S301 the user's own file
-        robot = ArmKinematics(embodiment)
-        found[f"{embodiment.name} {path.stem[-1]}"] = [Healthy(e, e, gray, robot) for e, gray in episodes]
+    if foreign is not None:
+        from benchmarks.foreign_robots import read_source  # imports mujoco
+
+        for path in sorted(foreign.glob("*.json")):
+            embodiment, episodes = read_source(path)
+            robot = ArmKinematics(embodiment)
+            found[f"{embodiment.name} {path.stem[-1]}"] = [Healthy(e, e, gray, robot) for e, gray in episodes]
     return dict(found)
 
 
@@ -229,7 +231,7 @@ def spoiled(item: Healthy, view: str, theta: np.ndarray) -> tuple[Episode, dict[
 
 @dataclass
 class Row:
-    """What became of the injections of one kind and size."""
+    """Counts over the injected errors of one kind and size."""
 
     alone: list[bool] = field(default_factory=list)
     together: list[bool] = field(default_factory=list)

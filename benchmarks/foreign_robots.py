@@ -12,7 +12,7 @@ import os
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
-import pickle
+import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,18 +196,18 @@ def motion(robot: ForeignRobot, seconds: float, random: np.random.Generator) -> 
 
 
 def record(name: str, site: Path, output: Path, source: int, episodes: int) -> None:
-    """Writes one source: a pickle of its Embodiment and of (Episode, grey pictures by view) for each episode."""
+    """Writes one source, as `read_source` reads it."""
     robot, random = ROBOTS[name], np.random.default_rng([source, len(name), ord(name[0])])
     model, text = model_of(robot, site, output / f"{name}_{source}_table.png", random)
     description = output / f"{name}_{source}.xml"
     description.write_text(text)
-    embodiment = embodiment_of(name, robot, description)
     data, pose = mujoco.MjData(model), head_camera(robot, random)
     ours = model.camera("head_ours").id
     model.cam_pos[ours] = pose[:3, 3]
     mujoco.mju_mat2Quat(model.cam_quat[ours], (pose[:3, :3] @ OPENCV_AXES).flatten())
     views = {"head": ours} | {f"{a.name}_wrist": model.camera(a.camera).id for a in robot.arms if a.camera}
-    found, noise = [], float(random.uniform(0.5, 3.0))
+    arrays: dict[str, np.ndarray] = {}
+    noise = float(random.uniform(0.5, 3.0))
     option = mujoco.MjvOption()
     option.sitegroup[:] = 0
     option.geomgroup[:] = [0 if name not in ("aloha", "so101") else 1, 1, 1, 0, 0, 0]
@@ -226,25 +226,42 @@ def record(name: str, site: Path, output: Path, source: int, episodes: int) -> N
                     T[:3, :3] = data.cam_xmat[camera].reshape(3, 3) @ OPENCV_AXES
                     T[:3, 3] = data.cam_xpos[camera]
                     poses[view].append(T)
-            cameras = {}
+            arrays[f"{number}/state"] = state.astype(np.float32)
             for view, camera in views.items():
                 f = HEIGHT / 2 / np.tan(np.radians(model.cam_fovy[camera]) / 2)
                 K = np.array([[f, 0, (WIDTH - 1) / 2], [0, f, (HEIGHT - 1) / 2], [0, 0, 1]])
-                track = np.stack(poses[view][:1] if view == "head" else poses[view])
-                cameras[view] = CameraTrack(view, K, track, WIDTH, HEIGHT)
-            count = len(state)
-            episode = Episode(
-                episode_id=f"{name}-{source}-{number:02d}", source=f"{name}-{source}", embodiment=embodiment.name,
-                scene="foreign", task_family="unknown", instruction="move", outcome="success", split="test",
-                fps=robot.fps, state=state.astype(np.float32), action=state.astype(np.float32),
-                timestamps=np.arange(count) / robot.fps, cameras=cameras, T_base_ee=None, gripper=None,
-                state_names=embodiment.state_names, state_kind="joints",
-            )  # fmt: skip
-            found.append((episode, {view: small_gray(frames) for view, frames in images.items()}))
+                arrays[f"{number}/K/{view}"] = K
+                arrays[f"{number}/T/{view}"] = np.stack(poses[view][:1] if view == "head" else poses[view])
+                arrays[f"{number}/gray/{view}"] = small_gray(images[view])
             if number == 0:
                 for view, frames in images.items():
-                    cv2.imwrite(str(output / f"{name}_{source}_{view}.png"), frames[count // 2][..., ::-1])
-    (output / f"{name}_{source}.pickle").write_bytes(pickle.dumps((embodiment, found)))
+                    cv2.imwrite(str(output / f"{name}_{source}_{view}.png"), frames[len(state) // 2][..., ::-1])
+    np.savez(output / f"{name}_{source}.npz", **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle
+    facts = {"robot": name, "episodes": episodes, "views": list(views)}
+    (output / f"{name}_{source}.json").write_text(json.dumps(facts))
+
+
+def read_source(facts_file: Path) -> tuple[Embodiment, list[tuple[Episode, dict[str, np.ndarray]]]]:
+    """The robot, and (episode, grey pictures by view) of each recording."""
+    facts = json.loads(facts_file.read_text())
+    robot = ROBOTS[facts["robot"]]
+    embodiment = embodiment_of(facts["robot"], robot, facts_file.with_suffix(".xml"))
+    found = []
+    with np.load(facts_file.with_suffix(".npz"), allow_pickle=False) as arrays:
+        for number in range(facts["episodes"]):
+            state = arrays[f"{number}/state"]
+            cameras = {
+                view: CameraTrack(view, arrays[f"{number}/K/{view}"], arrays[f"{number}/T/{view}"], WIDTH, HEIGHT)
+                for view in facts["views"]
+            }
+            episode = Episode(
+                episode_id=f"{facts_file.stem}-{number:02d}", source=facts_file.stem, embodiment=embodiment.name,
+                scene="foreign", task_family="unknown", instruction="move", outcome="success", split="test",
+                fps=robot.fps, state=state, action=state, timestamps=np.arange(len(state)) / robot.fps, cameras=cameras,
+                T_base_ee=None, gripper=None, state_names=embodiment.state_names, state_kind="joints",
+            )  # fmt: skip
+            found.append((episode, {view: arrays[f"{number}/gray/{view}"] for view in facts["views"]}))
+    return embodiment, found
 
 
 def _set(model: mujoco.MjModel, data: mujoco.MjData, robot: ForeignRobot, row: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""What lasts in long rollouts: outcomes undone after they happened, and IoU by block, for several anchors of a causal model.
+"""Long rollouts of a causal model with several anchors: how many outcomes are undone later, and the IoU of each block.
 
     worldline record --config configs/recording/long.yaml --output RECORDINGS
     python benchmarks/long_rollouts.py RECORDINGS [--model FOLDER] [--anchors 0 2] [--limit 60]
@@ -43,7 +43,7 @@ Video = dict[str, np.ndarray]
 
 
 def successes(segmenter: LearnedSegmenter, instruction: str, video: Video, cuts: list[int]) -> list[bool]:
-    """Whether the judge sees success at each of ``cuts``, in a clip of the first frames and the last ones before the cut."""
+    """The judge's verdict at each of ``cuts``, on a clip of the first frames and the last ones before the cut."""
     family = route(instruction)
     seen = []
     for cut in cuts:

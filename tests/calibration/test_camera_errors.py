@@ -163,7 +163,7 @@ def test_sources_are_judged_together(healthy: list, tmp_path: Path) -> None:
 
 
 def camera_error(value: float, shared: float = 0.1) -> CameraError:
-    """Of focal length alone [%]."""
+    """An error of the focal length alone, in percent."""
     solved, information = np.zeros(PARAMETERS), np.eye(PARAMETERS) / 9
     solved[6] = value
     return CameraError("head", solved, information, shared)
