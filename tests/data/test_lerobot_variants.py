@@ -143,7 +143,6 @@ def test_lengths_in_version_3_may_be_floats_but_no_fractions(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ({"codebase_version": "v2.0"}, r"got: v2\.0.*next step: convert .*v21"),
         ({"codebase_version": "v1.6"}, r"got: v1\.6.*next step: convert"),
         ({"codebase_version": "v3.0"}, r"got: v3\.0.*next step: set kind: lerobot_v3"),
         ({"storage_format": "lance"}, r"storage_format: parquet.*got: lance.*next step: export"),
@@ -154,6 +153,14 @@ def test_other_formats_name_the_next_step(tmp_path: Path, keys: dict[str, Any], 
     with_features(tmp_path / "raw", lambda features: None, **keys)
     with pytest.raises(DataError, match=f"(?s){said}"):
         run(tmp_path, source(tmp_path / "raw", **V21))
+
+
+def test_version_2_0_differs_in_its_statistics_alone(tmp_path: Path) -> None:
+    write_robocoin(tmp_path / "raw")
+    with_features(tmp_path / "raw", lambda features: None, codebase_version="v2.0")
+    counts, curated = run(tmp_path, source(tmp_path / "raw", **V21))
+    assert counts["kept"] == 1
+    assert curated.episode(0).conventions["layout"] == "lerobot v2.0"
 
 
 def test_a_dataset_that_does_not_fit_never_stops_the_collection(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.sources.lerobot import LeRobotSourceConfig, state_columns
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -111,6 +112,61 @@ def test_columns_may_be_chosen_by_place_and_an_action_may_be_missing(tmp_path: P
     assert np.allclose(episode.state[:, 2], 1 - state[:, 19], atol=1e-6)
     assert np.array_equal(episode.state, episode.action)
     assert episode.conventions["action"] == "repeats the state"
+
+
+LIMITS = [[-2.0, 2.0], [-1.0, 3.0]]
+
+
+@pytest.mark.parametrize(
+    ("unit", "joints", "expected"),
+    [
+        ("deg", {}, lambda v: np.deg2rad(v)),
+        ("deg", {"signs": [-1, 1], "zeros": [90, 0]}, lambda v: np.deg2rad(v) * [-1, 1] + [np.pi / 2, 0]),
+        ("rad", {"signs": [1, -1]}, lambda v: v * [1, -1]),
+        ("range_m100_100", {"ranges": LIMITS}, lambda v: v / 100 * 2 + [0, 1]),
+        ("range_m100_100", {"ranges": LIMITS, "signs": [1, -1]}, lambda v: v / 100 * [2, -2] + [0, 1]),
+        ("range_m100_100", {"ranges": [[2.0, -2.0], [-1.0, 3.0]]}, lambda v: v / 100 * [-2, 2] + [0, 1]),
+    ],
+)
+def test_joints_in_lerobots_own_units(
+    tmp_path: Path, preset: Any, unit: str, joints: dict[str, Any], expected: Any
+) -> None:
+    state = write_robocoin(tmp_path / "raw")
+    gripper = {"feature": "observation.state", "indices": [19], "closed": 0, "open": 1}
+    track = {"joints": {"feature": "observation.state", "indices": [13, 15], **joints}, "gripper": gripper}
+    arms = [{"name": "right", "state": track, "action": track}]
+    _, curated = run(tmp_path, preset("robocoin", tmp_path / "raw", collection=False, arms=arms, angle_unit=unit))
+    found = curated.episode(0)
+    assert np.allclose(found.state[:, :2], expected(state[:, [13, 15]]), atol=1e-6)
+    assert np.array_equal(found.action, found.state)
+
+
+def test_the_range_of_a_described_robot_is_its_limits() -> None:
+    features = {"observation.state": {"shape": [6], "names": [f"j{i}" for i in range(6)]}}
+    joints = {"feature": "observation.state", "indices": [0, 1, 2, 3, 4]}
+    gripper = {"feature": "observation.state", "indices": [5], "closed": 0, "open": 100}
+    common = {"kind": "lerobot_v21", "path": "x", "views": {}, "angle_unit": "range_m100_100"}
+    arms = [{"name": "right", "state": {"joints": joints, "gripper": gripper}}]
+    config = LeRobotSourceConfig.model_validate({**common, "embodiment": "so101", "arms": arms})
+    limits = np.array(load_embodiment("so101").arms[0].limits)
+    for reading, angles in ((-100, limits[:, 0]), (100, limits[:, 1]), (0, limits.mean(axis=1))):
+        values = np.full((1, 6), reading, np.float64) * [1, 1, 1, 1, 1, 0]
+        state, _, _ = state_columns(config, features, "x").read(lambda _, values=values: values)
+        assert np.allclose(state[0, :5], angles, atol=1e-6)
+    for changes, message in (
+        ({"embodiment": "none", "arms": arms}, "declare ranges"),
+        ({"embodiment": "so101", "arms": None}, "declare arms"),
+        ({"embodiment": "so101", "arms": right(zeros=[0])}, "takes ranges"),
+        ({"embodiment": "so101", "arms": right(ranges=[[0, 0]])}, "must differ"),
+        ({"embodiment": "so101", "arms": right(ranges=[[0, 1]]), "angle_unit": "deg"}, "angle_unit is deg"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            LeRobotSourceConfig.model_validate({**common, **changes})
+    short = LeRobotSourceConfig.model_validate(
+        {**common, "embodiment": "so101", "arms": right(indices=[0, 1], signs=[1])}
+    )
+    with pytest.raises(ConfigError, match=r"(?s)One of `signs`|One of `ranges`"):
+        state_columns(short, features, "x")
 
 
 def right(**joints: Any) -> list[dict[str, Any]]:

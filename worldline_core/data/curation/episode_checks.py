@@ -29,7 +29,8 @@ _MOVES_RAD, _APART_RAD, _MUCH_CLOSER = 0.1, 0.1, 0.25
 """Commands that are as far from the states of joints that move, and so much closer once they are read otherwise."""
 _POSE_FRAMES, _POSE_ERROR_M, _POSE_ERROR_DEG = 64, 0.05, 10.0
 """Frames of tool poses compared with kinematics, and their largest errors: a mount that is a little off stays below."""
-_JOINT_TOLERANCE_RAD = 0.05
+_JOINT_TOLERANCE_RAD, _DEGREES_TOLERANCE_RAD = 0.05, 0.2
+"""Beyond a limit; more for degrees, whose zero is where a person calibrated it (LeRobot: the middle of what was moved through)."""
 _TIME_TOLERANCE_FRAMES = 0.25
 """Largest distance of a frame from its place on the grid of its rate."""
 
@@ -140,7 +141,8 @@ def check_joints(episode: Episode) -> None:
             expected=embodiment.state_size,
             got=episode.state.shape[1],
         )
-    outside = embodiment.outside_limits(episode.state, _JOINT_TOLERANCE_RAD)
+    degrees = episode.conventions.get("declared_angle_unit") == "deg"
+    outside = embodiment.outside_limits(episode.state, _DEGREES_TOLERANCE_RAD if degrees else _JOINT_TOLERANCE_RAD)
     if outside.any():
         frame, column = (int(value) for value in np.argwhere(outside)[0])
         raise RejectedInputError(

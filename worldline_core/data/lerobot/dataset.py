@@ -3,7 +3,8 @@
 v3.0 (LeRobot 0.6): meta/info.json, meta/stats.json, meta/tasks.parquet, meta/episodes/chunk-*/file-*.parquet,
 data/chunk-*/file-*.parquet (one row group per episode), videos/<key>/chunk-*/file-*.mp4 (episodes joined; each
 episode's place is given by from_timestamp and to_timestamp in the episodes table).
-v2.1: meta/info.json, meta/tasks.jsonl, meta/episodes.jsonl, and per episode one Parquet file and one mp4 per view.
+v2.1: meta/info.json, meta/tasks.jsonl, meta/episodes.jsonl, and per episode one Parquet file and one mp4 per view; v2.0
+differs in its statistics alone, which nobody reads here.
 """
 
 from __future__ import annotations
@@ -79,22 +80,22 @@ class DatasetInfo(BaseModel):
 _NEXT_STEPS = {
     "v3.0": "set kind: lerobot_v3",
     "v2.1": "set kind: lerobot_v21",
-    "v2.0": "convert it with LeRobot 0.3.3's lerobot.datasets.v21.convert_dataset_v20_to_v21, and set kind: lerobot_v21",
+    "v2.0": "set kind: lerobot_v21",
 }
 
 
-def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> DatasetInfo:
-    """Content of `info.json`, of the wanted version and with these keys.
+def read_info(root: AnyPath, versions: Sequence[str] = (), keys: Sequence[str] = ()) -> DatasetInfo:
+    """Content of `info.json`, of a wanted version (any, where none is given) and with these keys.
 
     Raises: DataError when it is unreadable, of another version, lacks a key, or holds something senseless.
     """
     where = f"{root}, meta/info.json"
     info = validated(DatasetInfo, read_json(root / "meta" / "info.json"), where, "meta/info.json")
-    if info.codebase_version != version:
+    if versions and info.codebase_version not in versions:
         raise DataError(
             "Dataset has another version",
             where=str(root),
-            expected=version,
+            expected=" or ".join(versions),
             got=info.codebase_version,
             next_step=_NEXT_STEPS.get(
                 info.codebase_version, "convert it with LeRobot's own converters to v2.1 or v3.0"
@@ -116,7 +117,7 @@ def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> DatasetI
 
 def check_files(root: AnyPath, cameras: Sequence[str]) -> None:
     """Raises: DataError naming all files that a dataset of version 3 needs and that are not there, those of videos too."""
-    features = read_info(root, VERSION).features if is_file(root / "meta" / "info.json") else None
+    features = read_info(root, [VERSION]).features if is_file(root / "meta" / "info.json") else None
     missing = ["meta/info.json"] if features is None else []
     missing += [] if is_file(root / "meta" / "tasks.parquet") else ["meta/tasks.parquet"]
     missing += [f"{name}/*/*.parquet" for name in ("meta/episodes", "data") if not find_files(root / name, "*.parquet")]
@@ -218,12 +219,12 @@ class LeRobotDataset(ABC):
     Raises: DataError on opening when the folder is not a LeRobotDataset of this version.
     """
 
-    version: str
+    versions: tuple[str, ...]
     needed_keys: tuple[str, ...] = ()
 
     def __init__(self, root: AnyPath) -> None:
         self.root = root
-        self.info = read_info(root, self.version, self.needed_keys)
+        self.info = read_info(root, self.versions, self.needed_keys)
         self.fps = self.info.fps
         self.features = self.info.features
 
@@ -324,7 +325,7 @@ class LeRobotDataset(ABC):
 class LeRobotV3Dataset(LeRobotDataset):
     """LeRobotDataset v3.0."""
 
-    version = VERSION
+    versions = (VERSION,)
 
     def __init__(self, root: AnyPath) -> None:
         super().__init__(root)
@@ -530,9 +531,9 @@ class _Task(BaseModel):
 
 
 class LeRobotV21Dataset(LeRobotDataset):
-    """LeRobotDataset v2.1."""
+    """LeRobotDataset v2.1 or v2.0."""
 
-    version = "v2.1"
+    versions = ("v2.1", "v2.0")
     needed_keys = ("data_path", "video_path", "chunks_size")
     _checked: int | None = None
 

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.conventions import is_gripper
-from worldline_core.data.episodes.episode import REPEATS_STATE, TRAINING_SPLITS, Episode
+from worldline_core.data.episodes.episode import NO_EMBODIMENT, REPEATS_STATE, TRAINING_SPLITS, Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import (
     EVALUATION_ONLY,
@@ -44,9 +44,13 @@ from worldline_core.data.lerobot.dataset import DatasetInfo, LeRobotV3Dataset, L
 from worldline_core.data.sources.calibration_file import add_calibrated_view, mounted_camera, read_calibration
 from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.embodiment import load_embodiment
 
 ReadFeature = Callable[[str], np.ndarray]
 Features = Mapping[str, Mapping[str, Any]]
+
+
+AngleUnit = Literal["rad", "deg", "range_m100_100"]
 
 
 class ColumnChoice(StrictModel):
@@ -65,6 +69,32 @@ class ColumnChoice(StrictModel):
         return self
 
 
+Bounds = tuple[float, float]
+
+
+class JointColumns(ColumnChoice):
+    """The joint columns of an arm in the robot's order, and how their readings become its angles [rad]:
+    ``sign * (reading - zero)`` in the source's ``angle_unit``; ``range_m100_100`` goes from the lower to the upper bound.
+    """
+
+    signs: tuple[Literal[-1, 1], ...] | None = Field(
+        default=None, description="of each joint; -1 for one that counts the other way, as on a mirrored arm"
+    )
+    zeros: tuple[float, ...] | None = Field(
+        default=None, description="reading of each joint where the description has zero; for angles"
+    )
+    ranges: tuple[Bounds, ...] | None = Field(
+        default=None,
+        description="angles [rad] of each joint at -100 and 100, for range_m100_100; null: the limits of the description",
+    )
+
+    @model_validator(mode="after")
+    def _two_ends(self) -> JointColumns:
+        if any(low == high for low, high in self.ranges or ()):
+            raise ValueError("ranges: the angles at -100 and at 100 must differ")
+        return self
+
+
 class GripperColumn(ColumnChoice):
     """The one column of a gripper, and its readings when it is closed and open."""
 
@@ -75,7 +105,7 @@ class GripperColumn(ColumnChoice):
 class ArmTrack(StrictModel):
     """Joints and gripper of one arm in one track."""
 
-    joints: ColumnChoice
+    joints: JointColumns
     gripper: GripperColumn | None = None
 
 
@@ -97,7 +127,9 @@ class LeRobotSourceConfig(ForeignSourceConfig):
 
     kind: Literal["lerobot_v21", "lerobot_v3"]
     embodiment: EmbodimentName = Field(description="a robot of `worldline embodiment list`, or none: Stage I")
-    angle_unit: Literal["rad", "deg"] = Field(description="unit of the joint columns")
+    angle_unit: AngleUnit = Field(
+        description="unit of the joint columns; range_m100_100: LeRobot's -100..100 of a calibrated range, with `arms`"
+    )
     views: dict[str, str] = Field(description="camera of the dataset -> view, for example {...cam_high: head}")
     grippers: dict[str, GripperRange] = Field(
         default={}, description="state column -> its readings when closed and open; without `arms`"
@@ -128,6 +160,16 @@ class LeRobotSourceConfig(ForeignSourceConfig):
             )
         if self.arms is not None and self.grippers:
             raise ValueError("give arms (which name their grippers) or grippers, not both")
+        tracks = [track for arm in self.arms or () for track in (arm.state, arm.action) if track is not None]
+        if self.angle_unit == "range_m100_100":
+            if self.arms is None:
+                raise ValueError("range_m100_100 says where in its range a joint is: declare arms")
+            if self.embodiment == NO_EMBODIMENT and any(track.joints.ranges is None for track in tracks):
+                raise ValueError("range_m100_100 of a robot without a description: declare ranges of the joints")
+            if any(track.joints.zeros is not None for track in tracks):
+                raise ValueError("zeros are of angles: range_m100_100 takes ranges")
+        elif any(track.joints.ranges is not None for track in tracks):
+            raise ValueError(f"ranges are those of range_m100_100, and angle_unit is {self.angle_unit}")
         if len(set(self.views.values())) != len(self.views):
             raise ValueError("two video keys are given the same view")
         return self
@@ -191,11 +233,15 @@ def places(choice: ColumnChoice, features: Features, where: str) -> list[int]:
 
 @dataclass(frozen=True)
 class _Block:
-    """Columns of one feature, in the order of the state; all of them where `indices` is None."""
+    """Columns of one feature, in the order of the state; all of them where `indices` is None. Joints are
+    ``scale * reading + offset`` [rad].
+    """
 
     feature: str
     indices: Sequence[int] | None = None
     gripper: GripperRange | None = None
+    scale: np.ndarray | float = 1.0
+    offset: np.ndarray | float = 0.0
 
 
 @dataclass(frozen=True)
@@ -206,7 +252,7 @@ class StateColumns:
     state: Sequence[_Block]
     action: Sequence[_Block]
 
-    def read(self, read_feature: ReadFeature, *, degrees: bool) -> tuple[np.ndarray, np.ndarray, int]:
+    def read(self, read_feature: ReadFeature) -> tuple[np.ndarray, np.ndarray, int]:
         """State and action (N, J) float32, and how many gripper readings were clipped.
 
         Raises: RejectedInputError (length_mismatch) where a feature has fewer columns than the dataset says.
@@ -232,13 +278,45 @@ class StateColumns:
                 if block.gripper is not None:
                     values, outside = block.gripper.opening(values)
                     overshoot += outside
-                elif degrees:
-                    values = np.deg2rad(values)
+                else:
+                    values = values * block.scale + block.offset
                 parts.append(values)
             if parts:
                 with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
                     tracks.append(np.concatenate(parts, axis=1).astype(np.float32))
         return tracks[0], tracks[-1].copy(), overshoot
+
+
+_SCALES = {"rad": 1.0, "deg": np.pi / 180, "range_m100_100": 1 / 200}
+"""Radians, or the share of the joint's range, for each unit of a reading."""
+
+
+def _linear(
+    config: LeRobotSourceConfig, arm: str, joints: JointColumns, count: int, where: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scale and offset of the joints of one arm: ``angle = scale * reading + offset``.
+
+    Raises: ConfigError for signs, zeros or ranges of another number of joints, or a joint without limits.
+    """
+    ranges = joints.ranges
+    if config.angle_unit == "range_m100_100" and ranges is None:
+        described = {each.name: each.limits for each in load_embodiment(config.embodiment).arms}
+        ranges = described.get(arm, ())
+    for name, given in (("signs", joints.signs), ("zeros", joints.zeros), ("ranges", ranges)):
+        if given is not None and len(given) != count:
+            raise ConfigError(
+                f"One of `{name}` belongs to each joint", where=where, expected=f"{count} numbers", got=len(given)
+            )
+    scale = np.array(joints.signs or [1] * count) * _SCALES[config.angle_unit]
+    if ranges is None:
+        return scale, -scale * np.array(joints.zeros or [0.0] * count)
+    low, high = np.array(ranges, dtype=np.float64).T
+    if not np.isfinite([low, high]).all():
+        raise ConfigError(
+            "A joint without limits has no range that -100..100 could be of", where=where, got=ranges,
+            next_step="declare `ranges`: its angles [rad] at -100 and at 100",
+        )  # fmt: skip
+    return scale * (high - low), (low + high) / 2
 
 
 def state_columns(config: LeRobotSourceConfig, features: Features, where: str) -> StateColumns:
@@ -258,10 +336,11 @@ def state_columns(config: LeRobotSourceConfig, features: Features, where: str) -
                 got=", ".join(undeclared),
                 next_step="declare their readings: grippers: {" + undeclared[0] + ": {closed: ..., open: ...}}",
             )
+        scale = _SCALES[config.angle_unit]
         state, action = (
-            [_Block(feature, [i], config.grippers.get(name)) for i, name in enumerate(names)]
+            [_Block(feature, [i], config.grippers.get(name), scale) for i, name in enumerate(names)]
             if config.grippers
-            else [_Block(feature)]
+            else [_Block(feature, scale=scale)]
             for feature in ("observation.state", "action")
         )
         return StateColumns(tuple(names) or None, state, action)
@@ -279,7 +358,8 @@ def state_columns(config: LeRobotSourceConfig, features: Features, where: str) -
                 continue
             at = f"{where}, {arm.name} arm, {name}"
             joints = places(track.joints, features, at)
-            blocks[name].append(_Block(track.joints.feature, joints))
+            scale, offset = _linear(config, arm.name, track.joints, len(joints), at)
+            blocks[name].append(_Block(track.joints.feature, joints, scale=scale, offset=offset))
             widths[name] = [len(joints)]
             if track.gripper is not None:
                 gripper = places(track.gripper, features, f"{at}, gripper")
@@ -416,8 +496,7 @@ class LeRobotSource:
         )
 
     def _read_columns(self, index: int) -> tuple[np.ndarray, np.ndarray, int]:
-        degrees = self._config.angle_unit == "deg"
-        return self._columns.read(lambda feature: self._dataset.column(index, feature), degrees=degrees)
+        return self._columns.read(lambda feature: self._dataset.column(index, feature))
 
     def _instruction(self, index: int) -> tuple[str, int]:
         """The first frame's task, and how many different ones the episode has."""
