@@ -308,14 +308,15 @@ def load_config[Model: BaseModel](
 
     ``section`` picks one top-level mapping of the file (a single step's config out of a whole preset); overrides are
     still written from the top (``train_stage2.steps=10``). An override with null takes away what the file has (one of its
-    rollouts), as in a file that extends it, where null is no value of its own.
+    rollouts), as in a file that extends it, where null is no value of its own. A value that begins with TODO is refused,
+    whichever section is asked for.
 
     Raises:
         ConfigError: anything that is not right with it.
     """
     given = read_config(preset, path)
     source = preset_path(preset) if preset is not None else path
-    values = apply_overrides(given, overrides)
+    values = _answered(given, apply_overrides(given, overrides), source)
     for override in overrides:
         keys = override.partition("=")[0].strip().split(".")
         within = keys if section is None else keys[1:]
@@ -327,6 +328,50 @@ def load_config[Model: BaseModel](
             raise ConfigError("A section is a mapping", where=f"{source}: {section}", got=type(values).__name__)
     places = [str(source) if section is None else f"{source}: {section}", *(f"--set {text}" for text in overrides)]
     return validate(model, values, where=", ".join(places))
+
+
+TODO = "TODO"
+"""Beginning of a value that somebody has to fill in; the rest says what with."""
+QUESTIONS = "todo"
+"""Section with such values, to which the others refer as YAML aliases: `fps: &fps TODO ...`, and `fps: *fps` where it belongs."""
+
+
+def _answered(given: Mapping[str, Any], values: dict[str, Any], source: object) -> dict[str, Any]:
+    """The values without the section of questions; overrides of it (`--set todo.fps=30`) answer where it is referred to.
+
+    Raises: ConfigError naming everything that is still to be filled in.
+    """
+    asked, answers = given.get(QUESTIONS) or {}, values.pop(QUESTIONS, None) or {}
+    if not isinstance(asked, Mapping) or not isinstance(answers, Mapping):
+        raise ConfigError("A section is a mapping", where=f"{source}: {QUESTIONS}", got=type(answers).__name__)
+    names = {text: f"{QUESTIONS}.{name}" for name, text in asked.items() if _is_todo(text)}
+    replaced = {text: answers[name] for name, text in asked.items() if _is_todo(text) and not _is_todo(answers[name])}
+    values, open_places = _filled_in(values, replaced, "")
+    if open_places:
+        lines = dict.fromkeys(f"{names.get(text, place)}: {text}" for place, text in open_places)
+        raise ConfigError(
+            "The configuration is not filled in yet",
+            where=source,
+            got="\n    " + "\n    ".join(lines),
+            next_step="write each value into the file (or --set NAME=VALUE)",
+        )
+    return values
+
+
+def _is_todo(value: object) -> bool:
+    return isinstance(value, str) and (value == TODO or value.startswith(f"{TODO} "))
+
+
+def _filled_in(value: Any, answers: Mapping[str, Any], place: str) -> tuple[Any, list[tuple[str, str]]]:
+    """A value with the answers in it, and the places and texts of what is still open."""
+    if isinstance(value, Mapping | list):
+        pairs = list(value.items() if isinstance(value, Mapping) else enumerate(value))
+        parts = [(key, *_filled_in(part, answers, f"{place}.{key}" if place else str(key))) for key, part in pairs]
+        still = [each for _, _, found in parts for each in found]
+        return ({k: v for k, v, _ in parts} if isinstance(value, Mapping) else [v for _, v, _ in parts]), still
+    if not _is_todo(value):
+        return value, []
+    return (answers[value], []) if value in answers else (value, [(place, value)])
 
 
 def read_config(preset: str | None, path: Path | None) -> dict[str, Any]:

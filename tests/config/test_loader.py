@@ -18,8 +18,10 @@ from worldline_core.config import (
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.errors import ConfigError
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
+from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 from worldline_core.rollout.rollout_config import GeSimConfig
+from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.training_config import TokenizerConfig
 
@@ -140,6 +142,44 @@ def test_a_file_that_extends_a_preset_states_only_what_differs(tmp_path: Path) -
     assert mine.train_stage1.trainer.batch_size == smoke.train_stage1.trainer.batch_size
     assert set(smoke.rollouts) - set(mine.rollouts) == {"copy_first_frame"}
     assert mine.curate == smoke.curate
+
+
+STEPS = ("teacher_forcing", "trajectory_regression", "distribution_matching")
+QUESTIONS = """extends: smoke
+todo:
+  fps: &fps TODO frames a second
+  tool: &tool TODO length of the tool
+curate:
+  sources:
+    - {kind: agibot_gesim, path: x, fps: *fps, license: *tool, embodiment: TODO}
+"""
+
+
+@pytest.mark.parametrize("section", [None, "curate", "filter", "runner"])
+def test_what_is_not_filled_in_is_refused_by_name_all_at_once_by_every_step(
+    tmp_path: Path, section: str | None
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(QUESTIONS)
+    model: Any = {None: PipelineConfig, "curate": CurateConfig, "filter": FilterConfig, "runner": RunnerConfig}[section]
+    said = r"(?s)not filled in.*mine\.yaml.*todo\.fps: TODO frames a second.*todo\.tool.*curate\.sources\.0\.embodiment: TODO"
+    with pytest.raises(ConfigError, match=said):
+        load_config(model, path=path, section=section)
+    with pytest.raises(ConfigError, match=r"(?s)(?!.*todo\.fps)not filled in.*todo\.tool"):
+        load_config(model, path=path, section=section, overrides=["todo.fps=30"])
+    path.write_text(QUESTIONS.replace("TODO frames a second", "30").replace("embodiment: TODO", "name: TODOS"))
+    filled = load_config(PipelineConfig, path=path, overrides=["todo.tool=MIT"]).curate.sources[0]
+    assert (filled.fps, filled.license, filled.name) == (30, "MIT", "TODOS")  # type: ignore[union-attr]
+
+
+def test_the_preset_for_ones_own_robot_asks_for_recordings_alone() -> None:
+    with pytest.raises(ConfigError, match=r"(?s)curate\.sources: TODO .*worldline init"):
+        load_config(PipelineConfig, preset="my_robot")
+    sources = "curate.sources=[{kind: video_folder, path: x}]"
+    config = load_config(PipelineConfig, preset="my_robot", overrides=[sources])
+    assert {run.checkpoint for run in config.rollouts.values()} == {None, "stage2", "causal"}
+    stages = (config.train_stage1, config.train_stage2, *(getattr(config.distill, n) for n in STEPS))
+    assert sum(stage.trainer.minutes or 0 for stage in stages if stage) == 20
 
 
 def test_null_takes_away_what_the_file_has() -> None:
