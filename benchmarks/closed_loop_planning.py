@@ -41,8 +41,9 @@ from worldline_core.recorder.controllers import (
     sample_waypoints,
     tool_rotation,
 )
+from worldline_core.recorder.looks import TEST_SCENES, look_of
 from worldline_core.recorder.record import SPLIT_STREAM
-from worldline_core.recorder.rendering import TEST_SCENES, prepare_rendering
+from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene import FRAME_RATE, Layout, sample_layout
 from worldline_core.recorder.simulate import REACH_TOLERANCE_M, EpisodeRecorder, ExecutedMotion
 
@@ -174,7 +175,8 @@ class PlanningStart:
         """The first initial state that all of the first proposals can reach."""
         for trial in range(20):
             entropy = (SEED, recorder.scene.robot.stream, SPLIT_STREAM["test"], self.spec.layout, trial)
-            layout = sample_layout(recorder.scene.robot, self.spec.family, np.random.default_rng(entropy))
+            random = np.random.default_rng(entropy)
+            layout = sample_layout(recorder.scene.robot, self.spec.family, random, look_of(self.spec.scene))
             try:
                 world = World(recorder, self.kinematics, layout, self.spec)
                 self.first_proposals(world)

@@ -12,6 +12,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import read_clip
 from worldline_core.recorder.attempts import BankGrid, RecordPoliciesConfig, record_policies
 from worldline_core.recorder.controllers import ScriptedPolicy, plan_waypoints
+from worldline_core.recorder.looks import SCENES
 from worldline_core.recorder.record import RecordConfig, Variety, plan_jobs
 from worldline_core.recorder.scene import sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder
@@ -46,7 +47,7 @@ def test_every_policy_tries_the_same_start(recorder):
 
 
 def test_a_late_policy_does_the_same_later_and_a_late_gripper_alone(recorder):
-    layout = sample_layout(recorder.scene.robot, "lift", np.random.default_rng(2))
+    layout = sample_layout(recorder.scene.robot, "lift", np.random.default_rng(2), SCENES["scene_12"])
     on_time, late, gripper = (
         recorder.move(layout, np.random.default_rng(9), 33, policy).action
         for policy in (ScriptedPolicy(), ScriptedPolicy(delay_frames=5), ScriptedPolicy(gripper_delay_frames=-3))
@@ -59,7 +60,7 @@ def test_a_late_policy_does_the_same_later_and_a_late_gripper_alone(recorder):
 
 
 def test_mistakes_set_the_share_of_wrong_plans(recorder):
-    layout = sample_layout(recorder.scene.robot, "press", np.random.default_rng(0))
+    layout = sample_layout(recorder.scene.robot, "press", np.random.default_rng(0), SCENES["scene_12"])
 
     def aims(mistakes):
         plans = [

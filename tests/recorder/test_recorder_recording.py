@@ -17,6 +17,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.recorder.attempts import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
+from worldline_core.recorder.looks import SCENES
 from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, record
 from worldline_core.recorder.scene import sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, Job, Recording
@@ -52,7 +53,10 @@ def test_an_episode_is_a_function_of_its_entropy(recorder: EpisodeRecorder, reco
 
 def test_cameras_are_exact(recorder: EpisodeRecorder) -> None:
     """A block's corners, projected with K and T_base_camera, enclose exactly the block's pixels."""
-    layouts = (sample_layout(recorder.scene.robot, "lift", np.random.default_rng(seed)) for seed in range(20))
+    layouts = (
+        sample_layout(recorder.scene.robot, "lift", np.random.default_rng(seed), SCENES["scene_12"])
+        for seed in range(20)
+    )
     layout = next(layout for layout in layouts if layout.target.kind == "block" and not layout.others)
     motion = recorder.move(layout, np.random.default_rng(4), 17)
     still = ExecutedMotion(motion.state[:1], motion.action[:1], motion.qpos[:1], motion.outcome)

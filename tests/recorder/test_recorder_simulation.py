@@ -14,6 +14,7 @@ from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.recorder.bodies import BODIES, REACH_X
 from worldline_core.recorder.controllers import ArmSolver, Waypoint, plan_waypoints, sample_waypoints, tool_rotation
+from worldline_core.recorder.looks import SCENES
 from worldline_core.recorder.scene import SceneModel, build_scene, sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder
 
@@ -62,10 +63,12 @@ def test_inverse_kinematics_reaches_the_table(scene: SceneModel) -> None:
 
 def test_recorded_actions_alone_reproduce_the_motion() -> None:
     recorder = EpisodeRecorder("viperx_graphite")
-    layout = sample_layout(recorder.scene.robot, "lift", np.random.default_rng(5))
+    layout = sample_layout(recorder.scene.robot, "lift", np.random.default_rng(5), SCENES["scene_12"])
     motion = recorder.move(layout, np.random.default_rng(6), 33)
     other = recorder.move(
-        sample_layout(recorder.scene.robot, "place", np.random.default_rng(7)), np.random.default_rng(8), 33
+        sample_layout(recorder.scene.robot, "place", np.random.default_rng(7), SCENES["scene_12"]),
+        np.random.default_rng(8),
+        33,
     )
     again = recorder.replay(layout, motion.action)
     np.testing.assert_array_equal(again.qpos, motion.qpos)
@@ -75,7 +78,7 @@ def test_recorded_actions_alone_reproduce_the_motion() -> None:
 
 def test_a_single_arm_uses_the_whole_table_and_pads_never_touch_what_is_placed() -> None:
     random = np.random.default_rng(2)
-    layouts = [sample_layout(BODIES["xarm7_single"], "place", random) for _ in range(60)]
+    layouts = [sample_layout(BODIES["xarm7_single"], "place", random, SCENES["scene_12"]) for _ in range(60)]
     assert {np.sign(layout.target.y) for layout in layouts} == {-1.0, 1.0}
     for layout in layouts:
         assert np.linalg.norm(layout.target.xy - layout.goal.xy) > 0.1
@@ -83,7 +86,7 @@ def test_a_single_arm_uses_the_whole_table_and_pads_never_touch_what_is_placed()
 
 def test_candidates_of_a_layout_start_at_the_same_pose() -> None:
     robot = BODIES["viperx_graphite"]
-    layout = sample_layout(robot, "place", np.random.default_rng(0))
+    layout = sample_layout(robot, "place", np.random.default_rng(0), SCENES["scene_12"])
     first = [plan_waypoints(robot, layout, np.random.default_rng(seed), 4.0) for seed in range(6)]
     starts = {tuple((w[0].position, w[0].yaw, w[0].opening) for w in plan) for plan in first}
     assert len(starts) == 1

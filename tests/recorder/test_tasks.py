@@ -13,6 +13,7 @@ mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra:
 from worldline_core.errors import DataError
 from worldline_core.recorder.attempts import BankSpec, RecordBanksConfig
 from worldline_core.recorder.bodies import BODIES
+from worldline_core.recorder.looks import SCENES
 from worldline_core.recorder.outcomes import LIFTED, outcome
 from worldline_core.recorder.record import RecordGroup
 from worldline_core.recorder.scene import (
@@ -33,7 +34,7 @@ def recorder() -> EpisodeRecorder:
 
 
 def layout_of(recorder: EpisodeRecorder, task: str, random: np.random.Generator) -> Layout:
-    return sample_layout(recorder.scene.robot, task, random)
+    return sample_layout(recorder.scene.robot, task, random, SCENES["scene_12"])
 
 
 def judged(recorder: EpisodeRecorder, layout: Layout, qpos: np.ndarray) -> tuple[str, str]:

@@ -24,6 +24,7 @@ from worldline_core.errors import DataError
 from worldline_core.progress import Progress
 from worldline_core.recorder.bodies import Robot
 from worldline_core.recorder.controllers import ScriptedPolicy
+from worldline_core.recorder.looks import SCENE_PATTERN, look_of
 from worldline_core.recorder.record import SPLIT_STREAM, Embodiment, check_recorded, run_in_processes
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene import Family, Layout, sample_layout
@@ -40,7 +41,7 @@ class BankSpec(StrictModel):
     name: str = Field(min_length=1)
     embodiment: Embodiment
     family: Family
-    scene: str = Field(pattern="^scene_[0-9]{2}$")
+    scene: str = Field(pattern=SCENE_PATTERN)
     layout: int = Field(ge=0)
 
 
@@ -88,7 +89,7 @@ class _AttemptsConfig(StrictModel):
         """Twenty initial states to try, each with the seed of its attempts."""
         for trial in range(20):
             entropy = (self.seed, robot.stream, SPLIT_STREAM[split], start.layout, trial)
-            yield entropy, sample_layout(robot, start.family, np.random.default_rng(entropy))
+            yield entropy, sample_layout(robot, start.family, np.random.default_rng(entropy), look_of(start.scene))
 
     def camera_draws(self, start: BankSpec) -> np.random.Generator:
         """Draws of the same small camera shift for all attempts: they share the first picture."""

@@ -152,4 +152,5 @@ _BODIES = (
     _body("xarm7_single", 12, _XARM7_HOME, (-0.06, 0.0), 0.0, 0.042, (((1.0, 1.0, 1.0), (0.60, 0.64, 0.70)),)),
     _body("panda_ivory", 11, _PANDA_HOME, (-0.08, 0.32), 0.0, 0.040, (((1.0, 1.0, 1.0), (0.84, 0.80, 0.72)),)),
 )  # fmt: skip
+HELD_OUT_BODY = "panda_ivory"
 BODIES: dict[str, Robot] = {body.name: body for body in _BODIES}

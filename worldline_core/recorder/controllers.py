@@ -7,7 +7,7 @@ is drawn; whether it went wrong is measured afterwards (``outcomes.outcome``).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -20,7 +20,6 @@ from worldline_core.recorder.scene import (
     DRAWER_TRAVEL,
     HANDLE_APART,
     PLATE_TOP,
-    STANDING,
     Layout,
     SceneModel,
     free_tool,
@@ -58,6 +57,26 @@ class Waypoint:
 
 
 Bias = Annotated[float, Field(ge=-0.5, le=0.5)]
+MISSES: dict[str, dict[str, float]] = {
+    "lift": {"beside": 0.10, "low": 0.14},
+    "place": {"beside": 0.10, "release_off": 0.12},
+    "close": {"left_open": 0.8, "beside": 0.16},
+    "press": {"short": 0.08, "beside": 0.10},
+    "carry": {"beside": 0.10, "low": 0.14},
+}
+"""Largest sizes of each task's misses, well beyond where the outcome turns [m; share of a drawer's travel]."""
+
+
+class Miss(StrictModel):
+    """One deviation from the right plan, of any size.
+
+    Attributes:
+        kind: aims beside the thing (of two hands, one does) or releases it beside its goal (in a drawn direction), ends a press above
+            the table, leaves a drawer open, or raises a thing only by ``size``.
+    """
+
+    kind: Literal["beside", "release_off", "short", "left_open", "low"]
+    size: float = Field(ge=0, le=1)
 
 
 class ScriptedPolicy(StrictModel):
@@ -70,6 +89,7 @@ class ScriptedPolicy(StrictModel):
         bias_m: error of aim of all episodes, along x and along y of the robot's base.
         delay_frames: everything happens this many frames late.
         gripper_delay_frames: the gripper moves this many frames after the arm; below zero before it.
+        miss: one more deviation.
     """
 
     mistakes: float | None = Field(default=0.0, ge=0, le=1)
@@ -77,6 +97,13 @@ class ScriptedPolicy(StrictModel):
     bias_m: tuple[Bias, Bias] = (0.0, 0.0)
     delay_frames: int = Field(default=0, ge=0, le=32)
     gripper_delay_frames: int = Field(default=0, ge=-32, le=32)
+    miss: Miss | None = None
+
+
+def draw_miss(family: str, random: np.random.Generator) -> ScriptedPolicy:
+    """Draw the right plan with one miss of the task, its size even from nothing to the largest."""
+    kind = str(random.choice(list(MISSES[family])))
+    return ScriptedPolicy(miss=Miss.model_validate({"kind": kind, "size": random.uniform(0, MISSES[family][kind])}))
 
 
 def _draw(plans: dict[str, float], random: np.random.Generator, mistakes: float | None) -> str:
@@ -114,7 +141,7 @@ def _grasp(
     """Waypoints up to the closed gripper; where it closed (2,), its height, turn and opening."""
     target = layout.target
     xy = target.xy + random.normal(0, 0.004, 2) + (_beside(robot, layout, random) if plan == "beside" else 0.0)
-    height = GRASP_HEIGHT if plan != "high" else 2 * STANDING[target.kind] + random.uniform(0.045, 0.07)
+    height = GRASP_HEIGHT * target.size if plan != "high" else 2 * target.standing + random.uniform(0.045, 0.07)
     yaw, opened = target.yaw + random.normal(0, 0.06), random.uniform(*WIDE)
     closed = random.uniform(0.9, 1.0) if plan == "open" else 0.0
     points = [
@@ -317,6 +344,31 @@ def shifted(points: list[Waypoint], offset: np.ndarray) -> list[Waypoint]:
         first,
         *(replace(point, position=(*(np.array(point.position[:2]) + offset), point.position[2])) for point in others),
     ]
+
+
+def missing(robot: Robot, layout: Layout, plans: list[list[Waypoint]], miss: Miss, random: np.random.Generator) -> None:
+    """Spoil the right plans of the arms that act by a miss."""
+    angle = random.uniform(0, 2 * np.pi)
+    offset, arms = miss.size * np.array([np.cos(angle), np.sin(angle), 0.0]), list(layout.acting())
+    if miss.kind == "low":
+        # The last waypoint of the task, above where the gripper closed; afterwards arms stay there.
+        first, offset = 4, np.array([0.0, 0.0, miss.size])
+    else:
+        first = {"beside": 1, "release_off": 5, "short": 2, "left_open": 3}[miss.kind]
+        arms = [int(random.choice(arms))]
+    last = 5 if (layout.family, miss.kind) == ("place", "beside") else None
+    if miss.kind == "short":
+        last, offset = 4, np.array([0.0, 0.0, miss.size])
+    if layout.family == "close":
+        outwards = [0.0, robot.side(arms[0]) * miss.size, 0.0]
+        offset = np.array(outwards if miss.kind == "beside" else [-miss.size * DRAWER_TRAVEL, 0.0, 0.0])
+    for arm in arms:
+        for number in range(len(plans[arm]))[first:last]:
+            point = plans[arm][number]
+            at = np.array(point.position)
+            if miss.kind == "low":
+                at[2] = plans[arm][3].position[2]
+            plans[arm][number] = replace(point, position=tuple(at + offset))
 
 
 def late(action: np.ndarray, frames: int) -> np.ndarray:

@@ -12,7 +12,6 @@ from worldline_core.recorder.scene import (
     BUTTON_TRAVEL,
     DRAWER_TRAVEL,
     HANDLES,
-    STANDING,
     Layout,
     SceneModel,
 )
@@ -29,7 +28,7 @@ def outcome(scene: SceneModel, data: Any, layout: Layout, qpos: np.ndarray, tool
     """(``success`` or ``failure``, what went wrong: ``missed``, ``dropped``, ``slipped``, ``wrong place``, ``incomplete``).
 
     lift: in the last half second the thing is 7 cm above where it stood. place: it stands on the pad, its centre within
-    5 cm of the pad's, and no finger touches it. close: the drawer is at most a quarter open. press: the cap is down.
+    5 cm of the pad's (less on a small one), and no finger touches it. close: the drawer is at most a quarter open. press: the cap is down.
     carry: in the last half second both ends of the tray are 7 cm above the table.
 
     Args:
@@ -53,7 +52,7 @@ def outcome(scene: SceneModel, data: Any, layout: Layout, qpos: np.ndarray, tool
     if layout.family == "carry":
         return _carried(scene, layout, qpos, address)
     position = qpos[:, address : address + 3]
-    height = position[:, 2] - STANDING[layout.target.kind]
+    height = position[:, 2] - layout.target.standing
     touched = _touched(scene, data, f"{layout.target.kind}_0")
     if layout.family == "lift":
         if height[-4:].min() > LIFTED:
@@ -66,7 +65,7 @@ def outcome(scene: SceneModel, data: Any, layout: Layout, qpos: np.ndarray, tool
     if layout.goal is None:
         raise DataError("The layout does not fit the task", where=layout.family, expected="a pad")
     distance = float(np.linalg.norm(position[-1, :2] - layout.goal.xy))
-    if abs(height[-1]) < 0.012 and distance < ON_PAD and not touched:
+    if abs(height[-1]) < 0.012 and distance < ON_PAD * layout.goal.size and not touched:
         return "success", ""
     if height.max() < 0.015:
         return "failure", "missed"
@@ -81,7 +80,7 @@ def outcome(scene: SceneModel, data: Any, layout: Layout, qpos: np.ndarray, tool
 def _carried(scene: SceneModel, layout: Layout, qpos: np.ndarray, address: int) -> tuple[str, str]:
     """Outcome of a carry from the heights of the tray's ends; ``address`` is that of its positions."""
     w, x, y, z = qpos[:, address + 3 : address + 7].T
-    middle = qpos[:, address + 2] - STANDING["tray"]
+    middle = qpos[:, address + 2] - layout.target.standing
     ends = middle[:, None] + np.outer(2 * (y * z + w * x), list(HANDLES.values()))
     lower, higher = ends.min(axis=1), ends.max(axis=1)
     if lower[-4:].min() > LIFTED:
@@ -109,7 +108,7 @@ def _released_at(
 ) -> int | None:
     """The frame at which a raised thing left the hand because the gripper opened wide; None when it left otherwise."""
     opening = scene.robot.opening(qpos[:, scene.arms[layout.arm].finger_qpos])
-    raised = int(np.argmax(position[:, 2] - STANDING[layout.target.kind] > 0.015))
+    raised = int(np.argmax(position[:, 2] - layout.target.standing > 0.015))
     away = np.linalg.norm(position - tool, axis=1)
     left = np.flatnonzero(away[raised:] > away[raised] + 0.02)
     if len(left) == 0:

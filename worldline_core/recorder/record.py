@@ -21,8 +21,9 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.errors import DataError
 from worldline_core.progress import Progress
 from worldline_core.recorder.bodies import BODIES
-from worldline_core.recorder.controllers import ScriptedPolicy
+from worldline_core.recorder.controllers import ScriptedPolicy, draw_miss
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
+from worldline_core.recorder.looks import LookName
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene import TASKS, Family
 from worldline_core.recorder.simulate import EpisodeRecorder, Job
@@ -46,12 +47,16 @@ SPLIT_STREAM = {"train": 0, "validation": 1, "test": 2, "ood_test": 3, "bank": 4
 
 # What went wrong in each failed episode; for evaluation, never read by a judge.
 FAILURES_FILE = "failures.json"
+# By how much which episodes miss; likewise.
+MISSES_FILE = "misses.json"
 
 
 class RecordGroup(StrictModel):
     """``count`` episodes of one embodiment in one split; families take turns.
 
-    With ``held_out_camera`` the head camera stands where it never stands otherwise.
+    With ``held_out_camera`` the head camera stands where it never stands otherwise. ``look``: the fixed scenes, or scenes drawn from a wide
+    range, or from one outside of it (``looks.py``). What was held out is noted in the conventions of drawn looks, ``shift``: look, body,
+    camera, or several with a plus.
     """
 
     embodiment: Embodiment
@@ -59,11 +64,14 @@ class RecordGroup(StrictModel):
     count: int = Field(ge=1, le=1_000_000)
     families: tuple[Family, ...] = TASKS
     held_out_camera: bool = False
+    look: LookName = "plain"
 
     @model_validator(mode="after")
     def _enough_arms(self) -> RecordGroup:
         if "carry" in self.families and len(BODIES[self.embodiment].arms) < 2:
             raise ValueError(f"carry needs two arms; {self.embodiment} has one")
+        if self.look == "unseen" and self.split in ("train", "validation"):
+            raise ValueError("unseen looks are for tests: split test or ood_test wanted, got " + self.split)
         return self
 
 
@@ -118,6 +126,8 @@ class RecordConfig(StrictModel):
         defects: per embodiment, how many of the first training recordings are spoiled in which way (see
             ``defects.py``); what was done to which episode is written to ``injected_defects.json``.
         variety: carry some episodes out worse than planned.
+        misses: share of the episodes that miss by any amount, from nothing to well beyond where the outcome turns; by how much
+            is written to ``misses.json``.
     """
 
     groups: tuple[RecordGroup, ...] = Field(min_length=1)
@@ -127,6 +137,14 @@ class RecordConfig(StrictModel):
     video_crf: int = Field(default=18, ge=0, le=51)
     defects: dict[Embodiment, dict[Defect, int]] = Field(default_factory=dict)
     variety: Variety | None = None
+    misses: float = Field(default=0.0, ge=0, le=1)
+
+    def policy(self, family: str, entropy: tuple[int, ...]) -> ScriptedPolicy | None:
+        """How one episode is carried out; None: as planned."""
+        random = np.random.default_rng((*entropy, 3))
+        if random.uniform() < self.misses:
+            return draw_miss(family, random)
+        return self.variety and self.variety.draw(np.random.default_rng((*entropy, 2)))
 
     @model_validator(mode="after")
     def _enough_to_spoil(self) -> RecordConfig:
@@ -150,16 +168,18 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
             number = recorded[group.embodiment, group.split]
             recorded[group.embodiment, group.split] += 1
             entropy = (config.seed, BODIES[group.embodiment].stream, SPLIT_STREAM[group.split], number)
+            family = group.families[position % len(group.families)]
             left = defects.get(group.embodiment, []) if group.split == "train" else []
             job = Job(
                 episode_id=f"{group.embodiment}-{group.split}-s{config.seed}-{number:05d}",
                 embodiment=group.embodiment,
                 split=group.split,
-                family=group.families[position % len(group.families)],
+                family=family,
                 entropy=entropy,
                 defect=left.pop(0) if left else None,
                 held_out_camera=group.held_out_camera,
-                policy=config.variety and config.variety.draw(np.random.default_rng((*entropy, 2))),
+                look=group.look,
+                policy=config.policy(family, entropy),
             )
             jobs.append((round(10 * position / group.count), job))
     # A tenth of every group in turn, so that a worker keeps its compiled model for a while.
@@ -230,6 +250,9 @@ def record(config: RecordConfig, output: Path) -> dict[str, Any]:
     defects = {job.episode_id: job.defect for job in sorted(jobs, key=lambda job: job.episode_id) if job.defect}
     if defects:
         write_json_atomic(output / DEFECTS_FILE, defects)
+    missed = {job.episode_id: job.policy.miss.model_dump() for job in jobs if job.policy and job.policy.miss}
+    if missed:
+        write_json_atomic(output / MISSES_FILE, dict(sorted(missed.items())))
     counts = {"episodes": len(jobs), "outcomes": table}
     failures = {
         path.stem: json.loads(path.read_text()) for path in sorted((output / "run" / "failures").glob("*.json"))

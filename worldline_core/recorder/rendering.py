@@ -1,18 +1,15 @@
-"""Scenes, and what their cameras see: frames, exact robot masks and exact camera poses of recorded positions.
+"""Views of a scene's cameras: frames, exact robot masks and exact camera poses of recorded positions.
 
 Frames are rendered at twice the recorded size and averaged down: better looking and cheaper than multisampling.
-Cameras are given in OpenCV axes (x right, y down, z forward), pixel centres at integer coordinates. Training and test
-scenes share no id and no colours.
+Cameras are given in OpenCV axes (x right, y down, z forward), pixel centres at integer coordinates.
 """
 
 from __future__ import annotations
 
-import colorsys
 import importlib
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -20,72 +17,12 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import UnavailableError, installing
-from worldline_core.recorder.bodies import Colour
+from worldline_core.recorder.looks import TEXTURES, Look
 from worldline_core.recorder.scene import SceneModel
 
 FRAME_SIZE = (128, 192)
 # MuJoCo cameras look along -z with y up.
 OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Colours and light of a room."""
-
-    scene_id: str
-    table: Colour
-    floor: Colour
-    wall: Colour
-    light_direction: tuple[float, float, float]
-    light: float
-    ambient: float
-
-
-def _hsv(hue: float, saturation: float, value: float) -> Colour:
-    red, green, blue = colorsys.hsv_to_rgb(hue % 1.0, saturation, value)
-    return (red, green, blue)
-
-
-def _scene(number: int, table: Colour, floor: Colour, wall: Colour) -> Scene:
-    random = np.random.default_rng(7000 + number)
-    direction = (float(random.uniform(-0.5, 0.5)), float(random.uniform(-0.5, 0.5)), -1.0)
-    # Six draws had another use once: without them the light of every scene would change.
-    random.uniform(size=6)
-    return Scene(
-        scene_id=f"scene_{number:02d}",
-        table=table,
-        floor=floor,
-        wall=wall,
-        light_direction=direction,
-        light=float(random.uniform(0.42, 0.62)),
-        ambient=float(random.uniform(0.30, 0.42)),
-    )
-
-
-# Tables are of middle brightness and weak saturation: robots are dark or white, objects saturated.
-_TABLES: tuple[tuple[Colour, Colour, Colour], ...] = (
-    (_hsv(0.08, 0.38, 0.62), _hsv(0.60, 0.10, 0.32), _hsv(0.12, 0.08, 0.70)),
-    (_hsv(0.58, 0.18, 0.58), _hsv(0.09, 0.20, 0.40), _hsv(0.58, 0.05, 0.75)),
-    (_hsv(0.35, 0.16, 0.56), _hsv(0.00, 0.00, 0.30), _hsv(0.33, 0.06, 0.72)),
-    (_hsv(0.10, 0.16, 0.70), _hsv(0.62, 0.25, 0.35), _hsv(0.55, 0.12, 0.60)),
-    (_hsv(0.02, 0.26, 0.55), _hsv(0.10, 0.10, 0.50), _hsv(0.08, 0.10, 0.68)),
-    (_hsv(0.00, 0.00, 0.55), _hsv(0.58, 0.20, 0.25), _hsv(0.00, 0.00, 0.70)),
-    (_hsv(0.52, 0.24, 0.52), _hsv(0.52, 0.10, 0.30), _hsv(0.15, 0.10, 0.66)),
-    (_hsv(0.13, 0.30, 0.60), _hsv(0.30, 0.12, 0.33), _hsv(0.60, 0.08, 0.62)),
-    (_hsv(0.75, 0.12, 0.58), _hsv(0.75, 0.08, 0.34), _hsv(0.12, 0.05, 0.72)),
-    (_hsv(0.62, 0.26, 0.48), _hsv(0.08, 0.18, 0.45), _hsv(0.60, 0.10, 0.70)),
-    (_hsv(0.06, 0.30, 0.48), _hsv(0.55, 0.14, 0.40), _hsv(0.06, 0.08, 0.60)),
-    (_hsv(0.25, 0.14, 0.64), _hsv(0.65, 0.10, 0.38), _hsv(0.25, 0.05, 0.74)),
-    (_hsv(0.45, 0.20, 0.54), _hsv(0.05, 0.20, 0.35), _hsv(0.45, 0.05, 0.70)),
-    (_hsv(0.09, 0.34, 0.54), _hsv(0.58, 0.16, 0.42), _hsv(0.70, 0.06, 0.66)),
-    (_hsv(0.66, 0.16, 0.62), _hsv(0.66, 0.08, 0.28), _hsv(0.10, 0.10, 0.70)),
-    (_hsv(0.95, 0.14, 0.60), _hsv(0.40, 0.10, 0.36), _hsv(0.95, 0.05, 0.70)),
-)
-SCENES: dict[str, Scene] = {
-    scene.scene_id: scene for scene in (_scene(number, *colours) for number, colours in enumerate(_TABLES))
-}
-TRAIN_SCENES: tuple[str, ...] = tuple(f"scene_{n:02d}" for n in range(12))
-TEST_SCENES: tuple[str, ...] = tuple(f"scene_{n:02d}" for n in range(12, 16))
 
 
 def prepare_rendering() -> None:
@@ -158,19 +95,24 @@ class SceneRenderer:
         self._colour.close()
         self._masks.close()
 
-    def set_look(self, look: Scene) -> None:
-        """Colours and light."""
-        model = self.scene.model
+    def set_look(self, look: Look) -> None:
+        """Set colours, the table's texture, light and the lens of the head camera."""
+        model, tint = self.scene.model, np.array(look.tint)
+        table = model.geom("table").id
+        model.geom_matid[table] = -1 if look.texture is None else model.material(look.texture).id
+        for name in TEXTURES:
+            model.mat_texrepeat[model.material(name).id] = look.repeats
         for name, colour in (("table", look.table), ("floor", look.floor), ("wall", look.wall)):
             model.geom_rgba[model.geom(name).id] = [*colour, 1.0]
         direction = np.asarray(look.light_direction)
         model.light_dir[0] = direction / np.linalg.norm(direction)
-        model.light_diffuse[0] = look.light
+        model.light_diffuse[0] = look.light * tint
         model.light_ambient[0] = 0.0
         model.light_specular[0] = 0.15
-        model.vis.headlight.ambient[:] = look.ambient
-        model.vis.headlight.diffuse[:] = 0.28
+        model.vis.headlight.ambient[:] = look.ambient * tint
+        model.vis.headlight.diffuse[:] = look.headlight * tint
         model.vis.headlight.specular[:] = 0.05
+        model.cam_fovy[model.camera("head").id] = look.fovy_deg
 
     def place_cameras(self, eye: np.ndarray, target: np.ndarray) -> None:
         """The head camera at ``eye`` (3,) looking at ``target`` (3,), the wrist cameras at their mounts."""

@@ -6,7 +6,7 @@ episode, unused objects are parked far below the table. Metres, base frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from worldline_core.errors import DataError
 from worldline_core.recorder.bodies import HEAD_FOVY_DEG, REACH_X, ROBOTS_FOLDER, Robot
+from worldline_core.recorder.looks import TEXTURES, Look, texture
 
 # Frames per second, and physics steps per frame.
 FRAME_RATE = 8
@@ -42,12 +43,13 @@ class ArmIndices:
 
 @dataclass(frozen=True)
 class SceneModel:
-    """The compiled model, its arms in the order of ``robot.arms``, and which geoms belong to the robot."""
+    """The compiled model, its arms in the order of ``robot.arms``, which geoms belong to the robot, and the full size of each geom."""
 
     robot: Robot
     model: Any
     arms: tuple[ArmIndices, ...]
     robot_geoms: np.ndarray
+    sizes: np.ndarray
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -137,8 +139,15 @@ def scene_spec() -> Any:
 
 
 def add_room(spec: Any) -> None:
-    """Floor, wall and table; only the table is solid."""
+    """Floor, wall and table, with what tables may be covered with; only the table is solid."""
     import mujoco
+
+    for name in TEXTURES:
+        image = texture(name)
+        made = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=128, height=128, nchannel=3)
+        made.data = image.tobytes()
+        material = spec.add_material(name=name, texuniform=True)
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
     box, seen_only = mujoco.mjtGeom.mjGEOM_BOX, {"contype": 0, "conaffinity": 0}
     world = spec.worldbody
@@ -173,7 +182,8 @@ def compile_scene(spec: Any, robot: Robot) -> SceneModel:
     prefixes = tuple(f"{arm.name}/" for arm in robot.arms)
     of_robot = [model.body(int(body)).name.startswith(prefixes) for body in model.geom_bodyid]
     arms = tuple(_arm_indices(model, prefix) for prefix in prefixes)
-    return SceneModel(robot=robot, model=model, arms=arms, robot_geoms=np.array(of_robot, dtype=bool))
+    of_robot = np.array(of_robot, dtype=bool)
+    return SceneModel(robot=robot, model=model, arms=arms, robot_geoms=of_robot, sizes=model.geom_size.copy())
 
 
 def _arm_indices(model: Any, prefix: str) -> ArmIndices:
@@ -212,6 +222,8 @@ KINDS = {"block": 2, "can": 2, "pad": 2, "button": 2, "drawer": 1, "tray": 1}
 # Height of a free thing's origin where it stands.
 STANDING = {"block": BLOCK_HALF[2], "can": CAN_HALF, "tray": TRAY_HALF[2]}
 UNLIT = (0.17, 0.17, 0.18)
+# What a look makes smaller, and along which of a geom's sizes: all three, or all but the height. Drawers and trays fit the hands.
+_SIZED = {"block": (1, 1, 1), "can": (1, 1, 1), "pad": (1, 0, 0), "button": (1, 0, 0)}
 OBJECT_COLOURS: dict[str, tuple[float, float, float]] = {
     "red": (0.90, 0.06, 0.06),
     "green": (0.05, 0.72, 0.12),
@@ -224,17 +236,23 @@ OBJECT_COLOURS: dict[str, tuple[float, float, float]] = {
 
 @dataclass(frozen=True)
 class Thing:
-    """A thing on the table; a drawer's place is that of its front when closed."""
+    """A thing on the table; a drawer's place is that of its front when closed. ``size``: its scale, 1 or smaller."""
 
     kind: str
     colour: str
     x: float
     y: float
     yaw: float = 0.0
+    size: float = 1.0
 
     @property
     def xy(self) -> np.ndarray:
         return np.array([self.x, self.y])
+
+    @property
+    def standing(self) -> float:
+        """Height of a free thing's origin where it stands."""
+        return STANDING[self.kind] * self.size
 
 
 @dataclass(frozen=True)
@@ -248,6 +266,7 @@ class Layout:
         target: what is lifted, placed, closed, pressed or carried.
         goal: the pad of a place.
         others: distractors.
+        look: what colours and sizes things have.
     """
 
     family: str
@@ -257,6 +276,7 @@ class Layout:
     target: Thing
     goal: Thing | None
     others: tuple[Thing, ...]
+    look: Look
 
     def acting(self) -> tuple[int, ...]:
         """Numbers of the arms that act."""
@@ -272,6 +292,10 @@ class Layout:
             counted[thing.kind] = number + 1
             names.append((f"{thing.kind}_{number}", thing))
         return names
+
+    def rgba(self, thing: Thing) -> list[float]:
+        """Colour of a thing in this look."""
+        return [*self.look.paint(OBJECT_COLOURS[thing.colour]), 1.0]
 
 
 def build_scene(robot: Robot) -> SceneModel:
@@ -348,8 +372,8 @@ def _spot(
     return best
 
 
-def sample_layout(robot: Robot, family: str, random: np.random.Generator) -> Layout:
-    """Draw an initial state for a task."""
+def sample_layout(robot: Robot, family: str, random: np.random.Generator, look: Look) -> Layout:
+    """Draw an initial state for a task, with things of the look's size."""
     arm = int(random.integers(len(robot.arms)))
     colours = [str(colour) for colour in random.permutation(sorted(OBJECT_COLOURS))]
     start = np.stack([[*free_tool(robot, a, random), random.uniform(0.0, 1.0)] for a in range(len(robot.arms))])
@@ -394,7 +418,11 @@ def sample_layout(robot: Robot, family: str, random: np.random.Generator) -> Lay
         if sum(thing.kind == other.kind for other in (target, goal, *others) if other is not None) < KINDS[thing.kind]:
             others.append(thing)
             taken.append(spot)
-    return Layout(family, instruction, arm, start, target, goal, tuple(others))
+
+    def sized(thing: Thing) -> Thing:
+        return replace(thing, size=look.size) if thing.kind in _SIZED else thing
+
+    return Layout(family, instruction, arm, start, sized(target), goal and sized(goal), tuple(map(sized, others)), look)
 
 
 def free_tool(robot: Robot, arm: int, random: np.random.Generator) -> np.ndarray:
@@ -421,14 +449,17 @@ def apply_layout(scene: SceneModel, data: Any, layout: Layout) -> None:
                 place = PARKED + np.array([0.3 * number, 0.3 * list(STANDING).index(kind), 0.0])
                 angle = 0.0
                 if thing is not None:
-                    place, angle = np.array([thing.x, thing.y, STANDING[kind] + 0.0005]), thing.yaw / 2
+                    place, angle = np.array([thing.x, thing.y, thing.standing + 0.0005]), thing.yaw / 2
                 data.qpos[address : address + 7] = [*place, np.cos(angle), 0, 0, np.sin(angle)]
             else:
                 height = 0.0015 if kind == "pad" else 0.0
                 model.body_pos[body] = PARKED if thing is None else [thing.x, thing.y, height]
             if thing is not None:
                 for part in (name, *(f"{name}_{end}" for end in HANDLES if kind == "tray")):
-                    model.geom_rgba[model.geom(part).id] = [*OBJECT_COLOURS[thing.colour], 1.0]
+                    geom = model.geom(part).id
+                    model.geom_rgba[geom] = layout.rgba(thing)
+                    along = np.array(_SIZED.get(kind, (0, 0, 0)))
+                    model.geom_size[geom] = scene.sizes[geom] * np.where(along, thing.size, 1.0)
     opened = DRAWER_TRAVEL if "drawer_0" in used else 0.0
     data.qpos[int(model.joint("drawer_0").qposadr[0])] = opened
 
@@ -455,4 +486,4 @@ def light_buttons(scene: SceneModel, layout: Layout, qpos: np.ndarray) -> None:
     for name, thing in layout.named():
         if thing.kind == "button":
             down = qpos[int(model.joint(name).qposadr[0])] > BUTTON_DOWN * BUTTON_TRAVEL
-            model.geom_rgba[model.geom(f"{name}_plate").id] = [*(OBJECT_COLOURS[thing.colour] if down else UNLIT), 1.0]
+            model.geom_rgba[model.geom(f"{name}_plate").id] = layout.rgba(thing) if down else [*UNLIT, 1.0]

@@ -18,19 +18,21 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
-from worldline_core.recorder.bodies import BODIES, CENTRE
+from worldline_core.recorder.bodies import BODIES, CENTRE, HELD_OUT_BODY
 from worldline_core.recorder.controllers import (
     ArmSolver,
     ScriptedPolicy,
     Waypoint,
     late,
+    missing,
     plan_waypoints,
     sample_waypoints,
     shifted,
     tool_rotation,
 )
+from worldline_core.recorder.looks import HELD_OUT_CAMERA, SCENES, LookName, look_of, scenes, trains
 from worldline_core.recorder.outcomes import outcome
-from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES, SceneRenderer
+from worldline_core.recorder.rendering import SceneRenderer
 from worldline_core.recorder.scene import (
     FRAME_RATE,
     SUBSTEPS,
@@ -47,13 +49,6 @@ from worldline_core.recorder.scene import (
 REACH_TOLERANCE_M = 0.012
 # What a recorded episode calls a task: what changes a thing's state is one family, whatever is lifted another.
 _TASK_FAMILIES = {"close": "state_change", "press": "state_change", "carry": "lift"}
-
-# Where head cameras stand, across the table, so that arms do not hide what they work on: how far aside from facing the
-# robot [deg], elevation [deg], distance to the workspace [m].
-HEAD_CAMERAS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
-    "training": ((-25.0, 25.0), (50.0, 64.0), (0.80, 0.92)),
-    "held_out": ((40.0, 55.0), (38.0, 45.0), (0.80, 0.92)),
-}
 # Share of the training episodes in which a body's links have drawn colours instead of its own.
 REPAINTED = 0.4
 
@@ -69,6 +64,7 @@ class Job:
     entropy: tuple[int, ...]
     defect: str | None = None
     held_out_camera: bool = False
+    look: LookName = "plain"
     policy: ScriptedPolicy | None = None
 
 
@@ -198,6 +194,8 @@ class EpisodeRecorder:
         duration, mistakes = (num_frames - 1) / FRAME_RATE, None if policy is None else policy.mistakes
         plans = plan_waypoints(self.scene.robot, layout, random, duration, mistakes=mistakes)
         if policy is not None:
+            if policy.miss is not None:
+                missing(self.scene.robot, layout, plans, policy.miss, random)
             for arm in layout.acting():
                 plans[arm] = shifted(plans[arm], np.array(policy.bias_m) + random.normal(0, policy.noise_m, 2))
         action = self.follow(plans, num_frames)
@@ -253,6 +251,13 @@ class EpisodeRecorder:
         frames, masks, things, cameras = self._renderer.render(
             motion.qpos, lambda qpos: light_buttons(self.scene, layout, qpos), thing_labels(self.scene, layout)
         )
+        drawn = scene_id not in SCENES
+        held_out = {
+            "look": scene_id.startswith("unseen"),
+            "body": self.scene.robot.name == HELD_OUT_BODY,
+            "camera": self.held_out_camera,
+        }
+        shift = "+".join(name for name, holds in held_out.items() if holds and drawn)
         episode = Episode(
             episode_id=episode_id,
             source="worldline_recorder",
@@ -271,6 +276,7 @@ class EpisodeRecorder:
             candidate=candidate,
             primary_view="head",
             state_names=self.scene.state_names,
+            conventions={"shift": shift} if shift else {},
         )
         return Recording(episode, frames, masks, motion.failure, things)
 
@@ -280,10 +286,9 @@ class EpisodeRecorder:
         Raises: DataError when no reachable plan is found in 50 draws.
         """
         random = np.random.default_rng(job.entropy)
-        scenes = TRAIN_SCENES if job.split in ("train", "validation") else TEST_SCENES
-        scene_id = str(random.choice(scenes))
+        scene_id = str(random.choice(scenes(job.look, job.split in ("train", "validation"))))
         for _ in range(50):
-            layout = sample_layout(self.scene.robot, job.family, random)
+            layout = sample_layout(self.scene.robot, job.family, random, look_of(scene_id))
             motion = self.move(layout, random, num_frames, job.policy)
             if motion is not None:
                 return layout, motion, scene_id, random
@@ -310,14 +315,16 @@ class EpisodeRecorder:
 
     def _set_scene(self, renderer: SceneRenderer, scene_id: str, jitter: np.random.Generator) -> None:
         """Colours, light and cameras of an episode."""
+        look = look_of(scene_id)
+        place = HELD_OUT_CAMERA if self.held_out_camera else look.head
         azimuth, elevation, distance = (
-            jitter.uniform(*limits) for limits in HEAD_CAMERAS["held_out" if self.held_out_camera else "training"]
+            jitter.uniform(*limits) for limits in (place.aside_deg, place.elevation_deg, place.distance)
         )
         turn, rise = np.deg2rad(azimuth * jitter.choice([-1.0, 1.0])), np.deg2rad(elevation)
         target = np.array(CENTRE) + jitter.normal(0, 0.01, 3)
         back = np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
-        renderer.set_look(SCENES[scene_id])
-        self._paint_body(jitter, repaint=scene_id in TRAIN_SCENES and jitter.uniform() < REPAINTED)
+        renderer.set_look(look)
+        self._paint_body(jitter, repaint=trains(scene_id) and jitter.uniform() < REPAINTED)
         renderer.place_cameras(target + distance * back, target)
 
     def _paint_body(self, random: np.random.Generator, repaint: bool) -> None:

@@ -1,0 +1,123 @@
+"""Drawn looks, shifts, and misses of any size."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
+
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import DataError
+from worldline_core.recorder.controllers import MISSES, Miss, ScriptedPolicy, draw_miss
+from worldline_core.recorder.looks import RANGES, UNSEEN, WIDE, look_of, scenes, texture, trains
+from worldline_core.recorder.record import RecordConfig, RecordGroup, plan_jobs, record
+from worldline_core.recorder.scene import sample_layout
+from worldline_core.recorder.simulate import EpisodeRecorder
+
+
+def test_unseen_looks_lie_outside_of_the_training_range() -> None:
+    for name in ("tilt", "light", "ambient", "size", "hue_deg", "saturation", "value"):
+        (low, high), (other_low, other_high) = getattr(WIDE, name), getattr(UNSEEN, name)
+        assert other_high < low or other_low > high, name
+    assert not set(WIDE.textures) & set(UNSEEN.textures)
+    for saturation, value in UNSEEN.table:
+        (trained_saturation, trained_value) = WIDE.table[0]
+        assert saturation[0] > trained_saturation[1] or value[0] > trained_value[1] or value[1] < trained_value[0]
+    assert UNSEEN.head.elevation_deg[1] < WIDE.head.elevation_deg[0]
+    assert UNSEEN.head.distance[0] > WIDE.head.distance[1]
+
+
+@pytest.mark.parametrize("name", sorted(RANGES))
+def test_a_look_is_a_function_of_its_name(name: str) -> None:
+    looks = [look_of(f"{name}_{number:04d}") for number in range(20)]
+    again = RANGES[name].draw(np.random.default_rng((7100, sorted(RANGES, reverse=True).index(name), 3)))
+    assert again == looks[3]
+    assert len({look.table for look in looks}) == 20
+    low, high = RANGES[name].size
+    assert all(low <= look.size <= high for look in looks)
+    for field in fields(looks[0]):
+        values = np.ravel([v for v in (getattr(look, field.name) for look in looks) if isinstance(v, float | tuple)])
+        assert np.isfinite(values.astype(float)).all()
+
+
+def test_training_and_test_scenes_are_apart() -> None:
+    for look in ("plain", "wide"):
+        training, test = scenes(look, True), scenes(look, False)
+        assert not set(training) & set(test)
+        assert all(map(trains, training)) and not any(map(trains, test))
+    with pytest.raises(DataError, match="not for training"):
+        scenes("unseen", True)
+    with pytest.raises(ValidationError, match="unseen looks are for tests"):
+        RecordGroup(embodiment="viperx_pearl", count=1, look="unseen")
+    for name in ("scene_16", "wide_1", "unseen_00000", "wide_0001\n"):
+        with pytest.raises(DataError, match="Unknown scene"):
+            look_of(name)
+    assert all(texture(name).shape == (128, 128, 3) for name in UNSEEN.textures if name)
+
+
+@pytest.fixture(scope="module")
+def recorder() -> EpisodeRecorder:
+    return EpisodeRecorder("xarm7_white")
+
+
+# Where the outcome turns lies between the two sizes.
+@pytest.mark.parametrize(
+    ("family", "kind", "hit", "miss"),
+    [
+        ("lift", "beside", 0.005, 0.095),
+        ("lift", "low", 0.11, 0.05),
+        ("place", "release_off", 0.01, 0.11),
+        ("close", "left_open", 0.12, 0.6),
+        ("press", "short", 0.004, 0.07),
+        ("carry", "beside", 0.005, 0.09),
+    ],
+)
+def test_the_size_of_a_miss_decides(recorder: EpisodeRecorder, family: str, kind: str, hit: float, miss: float) -> None:
+    assert hit < MISSES[family][kind] and miss < MISSES[family][kind]
+    for size, outcome in ((hit, "success"), (miss, "failure")):
+        random = np.random.default_rng(1)
+        layout = sample_layout(recorder.scene.robot, family, random, look_of("wide_8001"))
+        policy = ScriptedPolicy(miss=Miss.model_validate({"kind": kind, "size": size}))
+        motion = recorder.move(layout, random, 33, policy)
+        assert motion is not None
+        assert motion.outcome == outcome, (size, motion.failure)
+
+
+def test_misses_are_drawn_evenly_and_apart_from_everything_else() -> None:
+    group = RecordGroup(embodiment="viperx_pearl", count=200, look="wide")
+    jobs = plan_jobs(RecordConfig(groups=(group,), misses=0.5))
+    missing = [job.policy.miss for job in jobs if job.policy and job.policy.miss]
+    assert 70 < len(missing) < 130
+    assert {miss.kind for miss in missing} == {kind for kinds in MISSES.values() for kind in kinds}
+    assert draw_miss("lift", np.random.default_rng(0)) == draw_miss("lift", np.random.default_rng(0))
+    plain = plan_jobs(RecordConfig(groups=(group,)))
+    assert [job.entropy for job in jobs] == [job.entropy for job in plain]
+    assert all(job.policy is None for job in plain)
+
+
+@pytest.mark.slow
+def test_shifts_are_named_in_the_index(rendering: None, tmp_path: Path) -> None:
+    groups = [
+        {"embodiment": "xarm7_white", "look": "unseen", "held_out_camera": True},
+        {"embodiment": "panda_ivory", "look": "wide"},
+        {"embodiment": "viperx_pearl", "look": "wide"},
+        {"embodiment": "viperx_graphite", "held_out_camera": True},
+    ]
+    config = RecordConfig.model_validate(
+        {"groups": [{**group, "split": "ood_test", "count": 1} for group in groups], "num_frames": 17, "misses": 1.0}
+    )
+    record(config, tmp_path)
+    episodes = EpisodeSet.open(tmp_path)
+    shifts = {row.embodiment: episodes.episode(i).conventions.get("shift") for i, row in enumerate(episodes.rows)}
+    assert shifts == {
+        "xarm7_white": "look+camera",
+        "panda_ivory": "body",
+        "viperx_pearl": None,
+        "viperx_graphite": None,
+    }
+    assert (tmp_path / "misses.json").read_text().count('"size"') == 4
