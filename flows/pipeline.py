@@ -85,8 +85,8 @@ def train(c: PipelineConfig, data: Inputs, models: Inputs) -> Inputs:
     if c.train_stage1 is not None:
         clips = {"episodes": episodes, **c.clips_of(c.train_stage1, models | trained)}
         start = trained["train_stage1"] = train_stage1.submit(c.train_stage1, **clips, base=start)
-    clips = {**data, **c.clips_of(c.train_stage2, models | trained), "teacher": models.get("teacher")}
-    trained["train_stage2"] = train_stage2.submit(c.train_stage2, **clips, stage1=start)
+    clips = {**data, **c.clips_of(c.train_stage2, models | trained), "tokenizer": tokenizer}
+    trained["train_stage2"] = train_stage2.submit(c.train_stage2, **clips, stage1=start, teacher=models.get("teacher"))
     return trained
 
 

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from worldline_core.actions.tool_error import end_effector_error
 from worldline_core.errors import DataError
-from worldline_core.evaluation.metrics import end_effector_error, frame_iou
+from worldline_core.evaluation.metrics import frame_iou
 
 EMPTY = np.zeros((4, 6), dtype=bool)
 LEFT = EMPTY.copy()

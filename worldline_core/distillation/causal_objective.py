@@ -136,6 +136,10 @@ class CausalObjective[BatchT: Batch](Objective[BatchT], ABC):
             for name, value in predictions.items()
         }
 
+    def predict(self, batch: Batch, action_maps: Tensor, noise: Tensor) -> Tensor:
+        """Complete rollouts, as `validation_losses` makes them."""
+        return self.rollout(batch, action_maps, noise, self.spec.steps - 1, with_gradient=False)
+
     def rollout(self, batch: Batch, maps: Tensor, noise: Tensor, exit_step: int, *, with_gradient: bool) -> Tensor:
         """The model's own rollout from the observed frame of each clip."""
         first = batch.latents[..., :1, :, :]

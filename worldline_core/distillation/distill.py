@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import open_controls
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance, PerceptualLoss
@@ -46,6 +47,7 @@ from worldline_core.model.tokenizers import WanTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import match_views
 from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.training.action_following import ActionFollowing
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler
@@ -127,7 +129,8 @@ class DistillationRun:
             action_frames=info.config.action_frames, frame_rates={row.episode_id: row.fps for row in episodes.rows},
             native_size=native, device=device,
         )  # fmt: skip
-        self.perceptual = _perceptual(config, Path(inputs["tokenizer"]), device)
+        self.tokenizer = Path(inputs["tokenizer"])
+        self.perceptual = _perceptual(config, self.tokenizer, device)
         self.lpips = "on" if self.perceptual is not None else LPIPS_OFF
 
     def folder(self, step: str) -> Path:
@@ -237,6 +240,24 @@ class DistillationRun:
         plan = batch_plan(trainer, self._work(step))
         return TrajectoryLoader(store, self.loader, trainer, plan, kept_latents=kept_latents).load
 
+    def _probe[BatchT: Batch](
+        self, trainer: TrainerConfig, objective: CausalObjective[BatchT]
+    ) -> ActionFollowing | None:
+        config = self.config
+        if config.action_following is None:
+            return None
+        return ActionFollowing(
+            config.action_following,
+            objective,
+            self.loader,
+            [row for row in self.rows if row.split in config.validation_splits],
+            self.episodes,
+            self.tokenizer,
+            view_sets=self._sampler(trainer, config.clips, ALONE).view_sets(self.info.config.views),
+            frames_per_unit=TEMPORAL_FACTOR * config.spec.block_size,
+            trainer=trainer,
+        )
+
     def _train[BatchT: Batch](
         self,
         step: str,
@@ -259,6 +280,7 @@ class DistillationRun:
             validate=validation_function(
                 self.loader, config.clips, config.validation_splits, trainer, self.rows, objective, config.input
             ),
+            probe=self._probe(trainer, objective),
             output=work,
             identity={
                 "step": step,

@@ -12,7 +12,13 @@ from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.training.clip_config import ClipInput, ClipSampling, LatentInput
-from worldline_core.training.training_config import LossWeighting, OptimizerConfig, SigmaSampling, TrainerConfig
+from worldline_core.training.training_config import (
+    ActionFollowingConfig,
+    LossWeighting,
+    OptimizerConfig,
+    SigmaSampling,
+    TrainerConfig,
+)
 
 CYCLE = 6
 """Iterations of one cycle of distribution matching: five updates of the fake score, then one of the student."""
@@ -134,6 +140,7 @@ class DistillConfig(StrictModel):
     ``block_size`` counts latent frames (4 in the paper: 16 video frames). ``sigmas``: nodes of the few-step sampler.
     ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` the recordings' frames, which
     are encoded when the teacher sees them; the trajectories keep the latents of their clips.
+    ``action_following``: measured in each of the three steps; null measures nothing.
     """
 
     input: ClipInput = LatentInput()
@@ -144,6 +151,7 @@ class DistillConfig(StrictModel):
     block_size: int = Field(default=4, ge=1)
     window: WindowConfig = WindowConfig()
     sigmas: tuple[float, ...] = CAUSAL_SIGMAS
+    action_following: ActionFollowingConfig | None = None
     teacher_forcing: TeacherForcingConfig = TeacherForcingConfig()
     trajectory_regression: TrajectoryRegressionConfig = TrajectoryRegressionConfig()
     distribution_matching: DistributionMatchingConfig = DistributionMatchingConfig()

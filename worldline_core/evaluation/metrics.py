@@ -4,20 +4,12 @@ Full frame: PSNR and SSIM (appendix "Full-frame metrics" of the paper). The cond
 
 Robot-mask IoU, head view only (appendix "Robot-mask IoU"). A frame in which both masks are empty is left out; one in
 which only one is empty counts 0. A video whose masks are empty in every frame is left out.
-
-End-effector error: how far from the commanded place the gripper appears. The paper has no such metric. Around the
-projected tool centre of a frame a patch of the *true* frame is taken, and the place where it fits the *predicted* frame
-best (normalised correlation) is searched within a radius. The distance from that place to the projected point is the
-error [px of the recording's frame]. A gripper that correlates with nothing within reach counts with the search radius.
-True videos score 0 by construction; a video in which the robot does not move scores about the distance it should have
-moved, at most the radius.
 """
 
 from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 import torch
 from einops import rearrange, reduce
@@ -32,10 +24,6 @@ from worldline_core.errors import DataError
 QUANTISATION_MSE = 1.0 / (12.0 * 255.0**2)
 MAX_PSNR_DB = -10.0 * math.log10(QUANTISATION_MSE)
 
-PATCH_FRACTION = 0.15  # half side of the patch, of the frame height: the gripper and some of what is behind it
-MIN_CONTRAST = 8.0  # standard deviation of a patch [grey levels]; flatter ones fit everywhere and say nothing
-SEARCH_FRACTION = 0.25  # search radius, of the frame height
-MIN_CORRELATION = 0.4
 SSIM_WINDOW = 11
 _WINDOW_SIGMA = 1.5
 _K1, _K2 = 0.01, 0.03
@@ -121,31 +109,3 @@ def frame_iou(true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     intersection = np.count_nonzero(true & predicted, axis=(1, 2)).astype(np.float64)
     union = np.count_nonzero(true | predicted, axis=(1, 2)).astype(np.float64)
     return np.divide(intersection, union, out=np.full_like(union, np.nan), where=union > 0)
-
-
-def end_effector_error(true: np.ndarray, predicted: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Error of each frame and point (n, p) float64 [px]; NaN where a point is invalid or its patch leaves the frame.
-
-    Args:
-        true, predicted: uint8 (n, h, w, 3), same size.
-        points: (n, p, 2) projected tool centres u, v [px]; NaN where invalid.
-    """
-    height, width = true.shape[1:3]
-    half = max(2, round(PATCH_FRACTION * height))
-    radius = max(2, round(SEARCH_FRACTION * height))
-    errors = np.full(points.shape[:2], np.nan)
-    for frame, arm in np.argwhere(np.isfinite(points).all(axis=-1)):
-        u, v = (round(float(x)) for x in points[frame, arm])
-        if not (half <= u < width - half and half <= v < height - half):
-            continue
-        patch = true[frame, v - half : v + half + 1, u - half : u + half + 1]
-        if patch.std(axis=(0, 1)).max() < MIN_CONTRAST:
-            continue
-        top, left = max(0, v - half - radius), max(0, u - half - radius)
-        region = predicted[frame, top : v + half + radius + 1, left : u + half + radius + 1]
-        correlation = cv2.matchTemplate(region, patch, cv2.TM_CCOEFF_NORMED)
-        row, column = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
-        distance = float(np.hypot(left + half + column - u, top + half + row - v))
-        found = correlation[row, column] >= MIN_CORRELATION
-        errors[frame, arm] = min(distance, radius) if found else radius
-    return errors

@@ -19,6 +19,7 @@ from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.model_figures import measurements
 from worldline_core.store.artifact_files import JsonObject, read_json, read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.training.training_state import PROBE_LOG
 
 STAGES = {
     "train_tokenizer": "Video tokenizer",
@@ -41,6 +42,12 @@ CONDITIONS = (
     ("_copy", "held-out, copy first frame", "c5"),
 )
 
+TOOL_ERRORS = {
+    "tool_error_px": ("true controls", "c1"),
+    "tool_error_px_shuffled": ("another clip's controls", "c3"),
+    "tool_error_px_copy": ("copy first frame", "c5"),
+}
+
 Curve = tuple[list[float], list[float]]
 """Steps and values."""
 
@@ -57,13 +64,16 @@ def training_section(context: ReportContext) -> Section:
             for phase, logged in read_phases(folder).items():
                 name = ", ".join(part for part in (title, variant, words(phase)) if part)
                 charts += stage_charts(name, read_curves(logged))
+                if (following := action_following_chart(name, folder / "run" / phase if phase else folder)) is not None:
+                    charts.append(context.slot(f"following-{step}-{variant}-{phase}", following, "See run/run.js."))
     if not charts:
         return Section(
             "training", "Training", missing="no training stage was given (inputs train_stage1, train_stage2, ...)."
         )
     lead = (
         "This run's own training, from the base model on. Training loss: a running mean. Held-out losses always use"
-        " the same clips, noise and noise levels, with the averaged weights."
+        " the same clips, noise and noise levels, with the averaged weights. Tool error: how far the tools are from where the"
+        " controls put them; a model that follows its controls is worse under another clip's."
     )
     return context.section("training", "Training", lead, missing=missing, charts=charts)
 
@@ -99,6 +109,19 @@ def stage_charts(title: str, curves: Mapping[str, Curve]) -> list[Markup]:
             positive = all(value > 0 for item in series for value in item.y)
             charts.append(line_chart(series, title=f"{title}: {label}", x_label="step", y_label=label, log_y=positive))
     return charts
+
+
+def action_following_chart(title: str, work: Path) -> Markup | None:
+    """Distance of the tools from their true places on held-out clips, as it was measured during training."""
+    curves = read_curves(read_json_lines(work / PROBE_LOG))
+    series = [
+        Series(condition, *curves[name], colour=colour, markers=True)
+        for name, (condition, colour) in TOOL_ERRORS.items()
+        if name in curves
+    ]
+    if not series:
+        return None
+    return line_chart(series, title=f"{title}: tool error after a second", x_label="step", y_label="px")
 
 
 def smooth(steps: Sequence[float], values: Sequence[float]) -> Curve:

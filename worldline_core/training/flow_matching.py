@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from worldline_core.model.world_model import TextContext, WorldModel
+from worldline_core.rollout.samplers import integrate, shifted_sigmas
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.processes import any_process
 from worldline_core.training.relational import RelationalTerm
@@ -113,6 +114,7 @@ class FlowMatchingObjective(Objective[Batch]):
         text_dropout: float = 0.0,
         action_dropout: float = 0.0,
         relational: RelationalTerm | None = None,
+        sampler_steps: int = 4,
     ) -> None:
         self.model = model
         self.sigma = sigma
@@ -120,6 +122,7 @@ class FlowMatchingObjective(Objective[Batch]):
         self.text_dropout = text_dropout
         self.action_dropout = action_dropout
         self.relational = relational
+        self.sampler_steps = sampler_steps
 
     def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """Loss of one micro-batch and its parts."""
@@ -170,6 +173,19 @@ class FlowMatchingObjective(Objective[Batch]):
         """Continue from saved scales."""
         if self.relational is not None:
             self.relational.scales.ratios = dict(state)
+
+    def predict(self, batch: Batch, action_maps: Tensor, noise: Tensor) -> Tensor:
+        """Whole clips from their first latent frames, in ``sampler_steps`` Euler steps."""
+        first = rearrange(first_frame(batch.latents), "b t -> b 1 1 t 1 1")
+        text = self._text(batch)
+
+        def velocity(state: Tensor, sigma: float) -> Tensor:
+            levels = torch.full((len(state),), sigma, device=state.device)
+            return self.model(
+                state, levels, action_maps=action_maps, text=text, views=batch.views, fps=batch.fps
+            ).velocity
+
+        return integrate(velocity, torch.where(first, batch.latents, noise), shifted_sigmas(self.sampler_steps))
 
     def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]:
         """Unweighted velocity loss, and the squared error of the clean latents, on a held-out batch.

@@ -25,7 +25,7 @@ from worldline_core.training.clip_source import ClipSource, open_source, trainin
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.processes import BatchPlan, gathered, join_processes, place_model, processes
-from worldline_core.training.trainer import ParameterGroup, TrainingResult, batch_plan, held_out_losses, train
+from worldline_core.training.trainer import ParameterGroup, Probe, TrainingResult, batch_plan, held_out_losses, train
 from worldline_core.training.training_config import LossWeighting, StageConfig, TrainerConfig
 
 logger = logging.getLogger(__name__)
@@ -122,7 +122,11 @@ class Stage:
         )
 
     def train(
-        self, objective: FlowMatchingObjective, groups: Sequence[ParameterGroup], loader: ClipLoader
+        self,
+        objective: FlowMatchingObjective,
+        groups: Sequence[ParameterGroup],
+        loader: ClipLoader,
+        probe: Probe | None = None,
     ) -> TrainingResult:
         """Train, or continue a killed run.
 
@@ -140,6 +144,7 @@ class Stage:
             validate=validation_function(
                 loader, config.clips, config.validation_splits, trainer, self.rows, objective, config.input
             ),
+            probe=probe,
             output=self.output,
             identity={
                 "config": config.model_dump(mode="json"),

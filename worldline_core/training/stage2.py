@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import open_controls
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError
@@ -18,6 +19,7 @@ from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, rea
 from worldline_core.model.layers import new_action_branch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, WorldModelConfig
+from worldline_core.training.action_following import ActionFollowing
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
 from worldline_core.training.relational import RelationalTerm, TeacherSimilarities
@@ -117,8 +119,22 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         action_dropout=config.action_dropout,
         relational=_relational(config, inputs, model),
     )
+    probe = None
+    if config.action_following is not None:
+        objective.sampler_steps = config.action_following.steps
+        probe = ActionFollowing(
+            config.action_following,
+            objective,
+            loader,
+            [row for row in stage.rows if row.split in config.validation_splits],
+            stage.episodes,
+            inputs.get("tokenizer"),
+            view_sets=stage.sampler.view_sets(model.config.views),
+            frames_per_unit=TEMPORAL_FACTOR,
+            trainer=config.trainer,
+        )
     groups = stage2_groups(model, config.action_multiplier)
-    result = stage.train(objective, groups, loader)
+    result = stage.train(objective, groups, loader, probe)
     facts = {
         "start": {"kind": stage.parent_kind, "weights_sha256": stage.start},
         "embodiments": dict(sorted(seen.items())),

@@ -35,6 +35,7 @@ from worldline_core.training.processes import (
 )
 from worldline_core.training.training_config import OptimizerConfig, TrainerConfig
 from worldline_core.training.training_state import (
+    PROBE_LOG,
     ExponentialAverage,
     MetricsLog,
     RunningMeans,
@@ -86,6 +87,18 @@ class Objective[BatchT: NamedBatch](Protocol):
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue from saved values."""
         del state
+
+
+class Probe(Protocol):
+    """A measurement of the averaged weights that takes its share of the run's time, and is always made after the last step."""
+
+    def due(self, seconds: float) -> bool:
+        """True when it is to be made, so many seconds after the run began or continued."""
+        ...
+
+    def measure(self, step: int) -> dict[str, float]:
+        """Values to log. Raises: TrainingError: the run is to end."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -167,6 +180,7 @@ def train[BatchT: NamedBatch](
     objective: Objective[BatchT],
     load: Callable[[int], BatchT],
     validate: Callable[[], dict[str, float]] | None = None,
+    probe: Probe | None = None,
     output: Path,
     identity: Mapping[str, Any],
     title: str,
@@ -182,6 +196,8 @@ def train[BatchT: NamedBatch](
     Args:
         load: number of this process's micro-step to batch (a pure function; `BatchPlan` says which clips it has).
         validate: measures held-out losses; called with the averaged weights in the model.
+        probe: measures the averaged weights; when, the clock decides, so its values are logged under ``run/``, and those after
+            the last step among the metrics.
         output: ``metrics.jsonl`` is written here, the state to continue from and timings under ``run/``.
         identity: JSON values that name this run (config, start, clips); a state of another run is refused.
         schedule: factor on the base learning rate per step (0-based); by default `learning_rate_factor`.
@@ -207,6 +223,7 @@ def train[BatchT: NamedBatch](
     rank, world_size = processes()
     log = MetricsLog(output / "metrics.jsonl", done) if rank == 0 else None
     timings = MetricsLog(output / "run" / "timings.jsonl", done) if rank == 0 else None
+    probed = MetricsLog(output / PROBE_LOG, done) if rank == 0 and probe is not None else None
     began = saved_at = time.monotonic()
     seen = 0
     length = config.steps or round(60 * (config.minutes or 0))
@@ -240,6 +257,13 @@ def train[BatchT: NamedBatch](
                 run.require_finite_scores(scores, done)
                 last = {**last, **scores}
                 score = scores.get(f"validation/{config.saving.best}", math.inf)
+            if probe is not None and (ended or average_values({"due": probe.due(time.monotonic() - began)})["due"]):
+                with average.swapped(), torch.no_grad():
+                    found = probe.measure(done)
+                if probed is not None:
+                    probed.add({"step": done, **found})
+                if ended:
+                    last = {**last, **found}
             advanced = 1 if config.steps else round(min(seconds, length)) - progress.done
             progress.advance(advanced, clips=size * world_size, loss=last.get("loss", values["loss"]))
             better, best = score < best, min(best, score)

@@ -156,6 +156,21 @@ class RelationalConfig(StrictModel):
     cached_clips: int = Field(default=20000, ge=0, description="clips whose similarity matrices stay in memory")
 
 
+class ActionFollowingConfig(StrictModel):
+    """Measurement while a model trains: how far its tools are from where held-out controls put them.
+
+    ``clips``: held-out clips in which a tool moves. ``seconds``: after which the picture is looked at. ``steps``: Euler steps of a
+    Stage II model. ``share``: of the run's time that measuring may take; the last step is always measured.
+    ``stop_when_ignored``: steps from which on a model whose controls make no difference ends the run.
+    """
+
+    clips: int = Field(default=16, ge=4)
+    seconds: float = Field(default=1.0, gt=0)
+    steps: int = Field(default=4, ge=1)
+    share: float = Field(default=0.05, gt=0, le=1)
+    stop_when_ignored: int | None = Field(default=None, ge=1)
+
+
 class StageConfig(StrictModel):
     """Settings that both stages share: clips, loss and run.
 
@@ -195,6 +210,7 @@ class Stage2Config(StageConfig):
     for grippers that close faster than a latent frame. Those that the start does not know begin with weights of zero.
     ``relational``: null trains without these terms. How wide the maps' Gaussian is, the action tracks say.
     ``native_size``: the paper's ablation: control vectors, padded to this size, by FiLM in every layer instead of maps.
+    ``action_following``: needs the input tokenizer; null measures nothing.
     """
 
     action_multiplier: float = Field(default=66.0, gt=0)
@@ -202,6 +218,7 @@ class Stage2Config(StageConfig):
     action_frames: Literal[1, 4] = 1
     relational: RelationalConfig | None = RelationalConfig()
     native_size: int | None = Field(default=None, ge=1)
+    action_following: ActionFollowingConfig | None = None
 
     @model_validator(mode="after")
     def _one_frame_of_vectors(self) -> Self:

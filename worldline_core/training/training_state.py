@@ -35,6 +35,7 @@ from worldline_core.training.training_config import SavingConfig
 logger = logging.getLogger(__name__)
 
 STATES = Path("run") / "training_state"
+PROBE_LOG = Path("run") / "action_following.jsonl"
 INDEX = "state.json"
 _FILE_BYTES = 2**31
 """Tensors are put together into files of about this size: a file is held in memory a second time while it is written."""

@@ -15,12 +15,13 @@ import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.actions.robot_masks import project_capsules
+from worldline_core.actions.tool_error import end_effector_error
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames, pieces
 from worldline_core.errors import DataError
 from worldline_core.evaluation.metric_registry import Metric
-from worldline_core.evaluation.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
+from worldline_core.evaluation.metrics import frame_iou, frames_to_unit, psnr, ssim
 from worldline_core.evaluation.recordings import HEAD, stride_of, tool_points
 from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.evaluation.segmenters.coloured_things import (

@@ -1,0 +1,47 @@
+"""Places of the tools in predicted pictures.
+
+End-effector error: how far from the commanded place the gripper appears. The paper has no such metric. Around the
+projected tool centre of a frame a patch of the *true* frame is taken, and the place where it fits the *predicted* frame
+best (normalised correlation) is searched within a radius. The distance from that place to the projected point is the
+error [px of the recording's frame]. A gripper that correlates with nothing within reach counts with the search radius.
+True videos score 0 by construction; a video in which the robot does not move scores about the distance it should have
+moved, at most the radius.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+PATCH_FRACTION = 0.15  # half side of the patch, of the frame height: the gripper and some of what is behind it
+MIN_CONTRAST = 8.0  # standard deviation of a patch [grey levels]; flatter ones fit everywhere and say nothing
+SEARCH_FRACTION = 0.25  # search radius, of the frame height
+MIN_CORRELATION = 0.4
+
+
+def end_effector_error(true: np.ndarray, predicted: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Error of each frame and point (n, p) float64 [px]; NaN where a point is invalid or its patch leaves the frame.
+
+    Args:
+        true, predicted: uint8 (n, h, w, 3), same size.
+        points: (n, p, 2) projected tool centres u, v [px]; NaN where invalid.
+    """
+    height, width = true.shape[1:3]
+    half = max(2, round(PATCH_FRACTION * height))
+    radius = max(2, round(SEARCH_FRACTION * height))
+    errors = np.full(points.shape[:2], np.nan)
+    for frame, arm in np.argwhere(np.isfinite(points).all(axis=-1)):
+        u, v = (round(float(x)) for x in points[frame, arm])
+        if not (half <= u < width - half and half <= v < height - half):
+            continue
+        patch = true[frame, v - half : v + half + 1, u - half : u + half + 1]
+        if patch.std(axis=(0, 1)).max() < MIN_CONTRAST:
+            continue
+        top, left = max(0, v - half - radius), max(0, u - half - radius)
+        region = predicted[frame, top : v + half + radius + 1, left : u + half + radius + 1]
+        correlation = cv2.matchTemplate(region, patch, cv2.TM_CCOEFF_NORMED)
+        row, column = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
+        distance = float(np.hypot(left + half + column - u, top + half + row - v))
+        found = correlation[row, column] >= MIN_CORRELATION
+        errors[frame, arm] = min(distance, radius) if found else radius
+    return errors
