@@ -166,9 +166,15 @@ def test_what_the_cameras_may_follow_is_printed(shared_data: Path, tmp_path: Pat
     assert json.loads((tmp_path / "out" / "diagnoses.json").read_text())["episodes"][0]["nearest"] == []
 
 
-@pytest.mark.parametrize("first", [{"camera_axes": "opengl"}, {"extrinsics_unit": "mm"}, {"angle_unit": "deg"}])
+AXES, UNIT, ANGLES = {"camera_axes": "opengl"}, {"extrinsics_unit": "mm"}, {"angle_unit": "deg"}
+
+
 @pytest.mark.parametrize(
-    "second", [INVERSE, RecordedConventions(extrinsics_unit="mm"), RecordedConventions(angle_unit="deg"), None]
+    ("first", "second"),
+    [
+        *((first, second) for first in (AXES, UNIT, ANGLES) for second in (INVERSE, None)),
+        *((first, RecordedConventions(**second)) for first, second in ((AXES, UNIT), (AXES, ANGLES), (UNIT, ANGLES))),
+    ],
 )
 def test_two_errors_at_once_are_judged(healthy: list, first: dict, second: RecordedConventions | None) -> None:
     """Under some readings of these nothing of the robot is before the head camera (None: exchanged wrist extrinsics)."""
@@ -204,9 +210,17 @@ def test_a_lag_at_the_edge_of_the_search_explains_nothing(healthy: list) -> None
     assert any("at the edge of what is tried" in note for note in diagnosis.notes)
 
 
-@pytest.mark.parametrize("kind", ["head", "wrist"])
-@pytest.mark.parametrize("begins", [0, 10])
-@pytest.mark.parametrize("quick", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "begins", "quick"),
+    [
+        ("head", 0, False),
+        ("head", 10, False),
+        ("wrist", 0, False),
+        ("wrist", 10, False),
+        ("head", 10, True),
+        ("wrist", 0, True),
+    ],
+)
 def test_a_frozen_video_is_no_consistent_one(healthy: list, kind: str, begins: int, quick: bool) -> None:
     item = of_robot(healthy, "ur5e")
     view = lively(item, kind)

@@ -93,6 +93,7 @@ def test_the_set_has_no_empty_columns_and_opens_in_lerobots_terms(tmp_path: Path
     assert (contract["state_kind"], contract["action"]) == ("none", "none")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # importing LeRobot alone takes minutes on a busy machine
 def test_lerobots_own_class_reads_a_set_without_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")

@@ -27,6 +27,8 @@ SMALL = (
     "train_tokenizer={channels: 8, steps: 2, fit_clips: 2, refinement_width: 8, refinement_depth: 1, batch_size: 2}",
     "train_stage1.model={latent_channels: 8, hidden_size: 32, num_heads: 2, num_layers: 2}", "train_stage2.relational=null",
     "distill.clips={lengths: [17]}",
+    "curate.sources=[{kind: episode_set, path: artifacts/shipped/recordings, name: shipped, include: ["
+    "ur5e_silver-test-s1-00000, ur5e_silver-train-s1-00000, ur5e_silver-train-s1-00001]}]",
 )  # fmt: skip
 WANTED = [
     "curate",
@@ -115,6 +117,7 @@ def command(verb: str, *settings: str) -> Iterator[str]:
             process.terminate()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["serve", "play"])
 def test_an_own_model_is_served(store: Path, verb: str) -> None:
     pytest.importorskip("msgpack")

@@ -45,7 +45,22 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any
     return write_one_of_each(tmp_path_factory.mktemp("layouts"))
 
 
-@pytest.mark.parametrize("attack", ATTACKS, ids=[f"{attack.layout}: {attack.name}" for attack in ATTACKS])
+HEAVY = (
+    "400 MB of int8 that become 3 GB of float64", "a megabyte of fixed length, 6,400 times", "a heap without end", "3,000 tracks",
+    "an entry of 4 GB",
+)  # fmt: skip
+"""Attacks of the same kinds as others here, which take seconds to run out of memory."""
+
+
+@pytest.mark.parametrize(
+    "attack",
+    [
+        pytest.param(
+            attack, id=f"{attack.layout}: {attack.name}", marks=[pytest.mark.slow] if attack.name in HEAVY else []
+        )
+        for attack in ATTACKS
+    ],
+)
 def test_an_attack_ends_in_time_in_a_recording_or_its_true_reason(
     sources: dict[str, dict[str, Any]], tmp_path: Path, attack: Attack
 ) -> None:
