@@ -76,7 +76,8 @@ class PipelineConfig(StrictModel):
     curate_banks: CurateConfig | None = None
     filter: FilterConfig
     render_actions: RenderActionsConfig | None = Field(
-        description="null: recordings without cameras; models take control vectors (train_stage2.native_size)"
+        default=None,
+        description="null: recordings without cameras; models take control vectors (train_stage2.native_size)",
     )
     encode_latents: EncodeLatentsConfig
     train_tokenizer: TokenizerConfig | None = Field(default=None, description="null: models.tokenizer is used")

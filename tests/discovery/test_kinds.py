@@ -1,0 +1,270 @@
+"""`worldline init` on every other kind of recordings, on folders that hold nothing, on the hub, and as a command."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from published_robomind import write_franka
+from recorded_sets import motion, pictures, write_so101, write_video
+from test_source_agibot_world import write_episode as write_agibot
+from test_source_enerverse_ac import write_clip
+from test_source_robotwin import write_episode as write_robotwin
+from test_source_unitree_h5 import write_hdf5, write_transitions
+
+from flows.command_line import main
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.discovery.configuration import write_config
+from worldline_core.discovery.findings import Discovery
+from worldline_core.discovery.look import discover, look
+from worldline_core.errors import DataError, UnavailableError
+from worldline_core.exports.export import export
+from worldline_core.filters.filter import filter_episodes
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+
+
+def init(root: Path, tmp_path: Path, **answers: object) -> tuple[Discovery, PipelineConfig, dict[str, Any]]:
+    """Look, write, answer what is asked, and curate."""
+    found = look(root)
+    path = tmp_path / "my.yaml"
+    write_config(found, path, str(root))
+    assert {question.name for question in found.questions} == set(answers)
+    answered = [f"todo.{name}={value}" for name, value in answers.items()]
+    # What tests write looks alike.
+    config = PipelineConfig.load(None, path, [*answered, "curate.near_duplicates=false"])
+    counts = curate(config.curate, {}, tmp_path / "curated")
+    assert counts["kept"] + counts["quarantined"] == counts["found"]
+    return found, config, counts
+
+
+def test_a_folder_of_videos(tmp_path: Path) -> None:
+    for n in range(3):
+        write_video(tmp_path / f"raw/{n}/clip.mp4", pictures(motion(5, 40, n), "still", n), 10)
+    (tmp_path / "raw/captions.csv").write_text("video,caption\n")
+    found, config, counts = init(tmp_path / "raw", tmp_path)
+    assert (found.kind, found.state_size, counts["kept"]) == ("video_folder", None, 3)
+    assert config.encode_latents.primary_alone
+    assert any("captions.csv" in note for note in found.notes)
+
+
+def test_an_episode_set_and_its_mcap_files(tmp_path: Path, project_root: Path) -> None:
+    shipped = project_root / "artifacts/shipped/recordings"
+    found = look(shipped)
+    assert (found.kind, found.views, found.calibrated) == (
+        "episode_set",
+        ["head", "right_wrist"],
+        True,
+    )  # of all robots
+    write_config(found, tmp_path / "my.yaml", str(shipped))
+    assert PipelineConfig.load(None, tmp_path / "my.yaml").render_actions is not None
+    export(shipped, tmp_path / "mcap", ["mcap"], episode_ids=[EpisodeSet.open(shipped).rows[0].episode_id])
+    exported = look(tmp_path / "mcap")
+    assert (exported.kind, set(exported.views) >= {"head", "right_wrist"}, exported.calibrated) == ("mcap", True, True)
+
+
+def test_ros_2_topics(tmp_path: Path, toy: Any) -> None:
+    for n in range(3):
+        toy.robot(seconds=3.0 + 0.2 * n, seed=n).write(tmp_path / f"raw/{n}.mcap")
+    found, config, counts = init(tmp_path / "raw", tmp_path)
+    assert found.source["views"] == {
+        "head": {"image": "/head/image/compressed", "calibration": "/head/camera_info"},
+        "right_wrist": {"image": "/wrist/image/compressed", "calibration": "/wrist/camera_info"},
+    }
+    assert found.source["arms"][0]["state"]["gripper"]["range"] == {"closed": 0, "open": 0.04}
+    assert (found.fps, found.source["embodiment"], found.source["base_frame"]) == (30, "none", "base_link")
+    assert "/command" in found.evidence["without_commands",]
+    assert counts["kept"] == 3
+    assert config.train_stage2.native_size == 3
+
+
+@pytest.mark.parametrize("write", [write_hdf5, write_transitions])
+def test_unitree(tmp_path: Path, write: Any) -> None:
+    for n in range(3):
+        write(tmp_path / "raw", n, 20 * n)
+    found, _, counts = init(tmp_path / "raw", tmp_path)
+    assert (found.source["robot"], found.source["embodiment"]) == ("g1_dex1", "unitree_g1_29dof")
+    assert found.source["views"] == {"head": "cam_left_high", "right_wrist": "cam_right_wrist"}
+    assert counts["found"] == 3
+
+
+def test_unitrees_other_arms(tmp_path: Path) -> None:
+    write_hdf5(tmp_path / "one", robot="z1_single")
+    found = look(tmp_path / "one")
+    assert (found.source["robot"], found.source["embodiment"]) == ("z1_single", "none")
+    assert {question.name for question in found.questions} == {
+        f"gripper_{track}_{end}" for track in ("state", "command") for end in ("closed", "open")
+    }
+    write_hdf5(tmp_path / "two", robot="aloha")
+    found = look(tmp_path / "two")
+    assert (found.source["robot"], found.source["channels"], found.source["fps"]) == ("aloha", "as_written", 50)
+
+
+def test_robomind(tmp_path: Path) -> None:
+    for n in range(3):
+        write_franka(tmp_path / "h5_franka_3rgb", f"task_{n}", seed=n)
+    answers = {"fps": 30, "gripper_state_closed": 1, "gripper_state_open": 0}
+    found, config, counts = init(tmp_path / "h5_franka_3rgb", tmp_path, **answers)
+    assert (found.source["layout"], counts["kept"]) == ("h5_franka_3rgb", 3)
+    assert config.curate.sources[0].gripper_state.closed == 1  # type: ignore[union-attr]
+
+
+def test_agibot_and_enerverse(tmp_path: Path) -> None:
+    for n in range(3):
+        write_agibot(tmp_path / "world", 327, 648642 + n, 20 * n)
+    found = look(tmp_path / "world")
+    assert (found.kind, found.views, found.calibrated) == ("agibot_world", ["head", "left_wrist", "right_wrist"], True)
+    write_clip(tmp_path / "clips", "1-2-3")
+    assert look(tmp_path / "clips").kind == "enerverse_ac"
+    for name in ("world", "clips"):
+        write_config(look(tmp_path / name), tmp_path / f"{name}.yaml", name)
+        assert PipelineConfig.load(None, tmp_path / f"{name}.yaml").render_actions is not None
+
+
+def test_robotwin_is_for_evaluation(tmp_path: Path) -> None:
+    write_robotwin(tmp_path / "raw")
+    found, config, counts = init(tmp_path / "raw", tmp_path, fps=16.667)
+    assert (found.trains, counts["kept"], config.curate.splits) == (False, 1, {})
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({}, "folder is empty"),
+        ({"notes.txt": b"x", "a/b.bin": b"x"}, r"(?s)Nothing here.*meta/info\.json.*1 \.txt"),
+        ({"dataset.tar.gz": b"x"}, r"(?s)Nothing here.*unpack dataset\.tar\.gz"),
+        ({"meta/info.json": b"{}"}, r"meta/info\.json is not understood"),
+        ({"meta/info.json": b'{"codebase_version": "v1.6", "fps": 1, "features": {}}'}, r"another version"),
+        ({"a.mp4": b"no video"}, "None of the videos can be read"),
+        ({"a.mcap": b"no mcap"}, r"a\.mcap"),
+        ({"a.db3": b"x"}, r"(?s)a\.db3.*mcap"),
+        ({"trajectory.hdf5": b"x"}, r"trajectory\.hdf5|layout"),
+        ({"x/episode_0.hdf5": b"no hdf5"}, r"episode_0\.hdf5"),
+        ({"annotation/val/0.json": b"["}, r"0\.json"),
+    ],
+    ids=lambda value: next(iter(value), "empty") if isinstance(value, dict) else "",
+)
+def test_wrong_and_empty_folders_are_one_clear_error(tmp_path: Path, files: dict[str, bytes], said: str) -> None:
+    (tmp_path / "raw").mkdir()
+    for name, content in files.items():
+        (tmp_path / "raw" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "raw" / name).write_bytes(content)
+    if files.keys() == {"trajectory.hdf5"}:
+        assert "layout" in {question.name for question in look(tmp_path / "raw").questions}
+        return
+    with pytest.raises(DataError, match=said):
+        discover(tmp_path / "raw")
+
+
+def test_what_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file.txt").write_text("x")
+    for name, said in (("gone", "No such folder"), ("file.txt", "Not a folder")):
+        with pytest.raises(DataError, match=said):
+            look(tmp_path / name)
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_so101(tmp_path / "raw")
+    main(["init", "raw"])
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[0].startswith("LeRobotDataset v3.0 of so101_follower: 4 episodes at 30 fps")
+    assert printed.splitlines()[-1] == "next: worldline task curate --config my.yaml"
+    with pytest.raises(SystemExit):
+        main(["init", "raw"])
+    assert "there already" in capsys.readouterr().err
+    main(["init", "raw", "--output", "other.yaml", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert (found["source"]["embodiment"], found["todo"], found["file"]) == ("so101", {}, "other.yaml")
+    assert found["next"] == ["worldline task curate --config other.yaml"]
+    assert {"key": ["angle_unit"], "sentence": found["evidence"][1]["sentence"]} in found["evidence"]
+
+
+def test_the_hub_gives_meta_and_some_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A hub of files: `snapshot_download` copies what its patterns name."""
+    from fnmatch import fnmatch
+
+    dataset = write_so101(tmp_path / "hub/me/arm", version="v2.1", states=[s for _ in range(2) for s in _states()])
+    asked: list[list[str]] = []
+
+    def snapshot(repo_id: str, *, allow_patterns: list[str], revision: str | None = None, **_: object) -> str:
+        asked.append(allow_patterns)
+        folder = tmp_path / "cache/snapshots" / (revision or "abc")
+        for path in (tmp_path / "hub" / repo_id).rglob("*"):
+            name = str(path.relative_to(tmp_path / "hub" / repo_id))
+            if path.is_file() and any(fnmatch(name, pattern) for pattern in allow_patterns):
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).write_bytes(path.read_bytes())
+        return str(folder)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot)
+    main(["init", "me/arm"])
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[-2:] == [
+        "next: hf download me/arm --repo-type dataset --revision abc",
+        "next: worldline task curate --config my.yaml",
+    ]
+    assert len(list((tmp_path / "cache").rglob("*.mp4"))) == 6
+    assert len(list(dataset.rglob("*.mp4"))) == 16
+    source = CurateConfig.model_validate({"sources": [_source(tmp_path / "my.yaml")]}).sources[0]
+    assert str(source.path).endswith("cache/snapshots/abc")
+
+
+def _states() -> list[np.ndarray]:
+    from recorded_sets import so101_states
+
+    return so101_states()
+
+
+def _source(path: Path) -> dict[str, Any]:
+    from worldline_core.config import read_config
+
+    return read_config(None, path)["curate"]["sources"][0]
+
+
+def test_offline_the_hub_is_one_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "cache"))
+    from worldline_core.discovery.hub import fetch_sample, hub_id
+
+    with pytest.raises(UnavailableError, match=r"(?s)hub does not give.*me/arm.*offline, download it elsewhere"):
+        fetch_sample("me/arm")
+    assert (hub_id("me/arm"), hub_id("hf://datasets/me/arm"), hub_id("./arm"), hub_id("/a/b")) == (
+        "me/arm",
+        "me/arm",
+        None,
+        None,
+    )
+    (tmp_path / "me/arm").mkdir(parents=True)
+    assert hub_id("me/arm") is None
+
+
+SAMPLES = {
+    "lerobot_unitree_g1": ("unitree_g1_29dof", 2, 98),
+    "droid_ctrl_world": ("droid_franka", 13, 2),
+    "agibot_gesim": ("agibot_g1", 2, 0),
+    "agibot_gesim_v2": ("agibot_g1", 2, 0),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SAMPLES)
+def test_real_samples_run_with_nothing_changed_by_hand(tmp_path: Path, shared_data: Path, name: str) -> None:
+    robot, kept, quarantined = SAMPLES[name]
+    found, config, counts = init(shared_data / name, tmp_path)
+    assert (found.source["embodiment"], counts["kept"], counts["quarantined"]) == (robot, kept, quarantined)
+    assert not re.search("TODO", (tmp_path / "my.yaml").read_text())
+    if name == "lerobot_unitree_g1":
+        filter_episodes(config.filter, {"episodes": tmp_path / "curated"}, tmp_path / "filtered")
+        assert len(EpisodeSet.open(tmp_path / "filtered").rows) == 2

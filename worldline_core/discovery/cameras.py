@@ -1,0 +1,126 @@
+"""Which camera is the head view and which a wrist view: by its name, and by its picture while the arms move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from worldline_core.discovery.findings import named
+from worldline_core.discovery.words import Side, side_of, words_of
+
+_WRIST = {"wrist", "hand", "gripper", "inhand", "handeye", "eih", "eye", "palm", "endeffector", "ee"}
+_HEAD = (
+    {"head", "ego", "egocentric"}, {"high", "top", "overhead", "ceiling", "birdseye"}, {"front", "static", "workspace", "context"},
+    {"exterior", "external", "third", "agentview", "scene", "base", "main"}, {"image", "cam", "camera", "rgb", "color", "webcam"},
+)  # fmt: skip
+"""Words of a camera that sees the whole scene, those that say it best first."""
+MOVING_SHARE = 0.4
+"""Of the picture's cells that change while the arm moves; a camera on a table stays below, one on a wrist above."""
+_SIZE, _LEVELS = (48, 32), 8
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a camera's picture does while the arms move: the share of its cells that change, and the arm it follows.
+
+    Attributes:
+        moving, resting: median share of changed cells in the quarter of the frames with most, and with least motion.
+        follows: correlation of the changed share with the motion of each arm.
+    """
+
+    moving: float
+    resting: float
+    follows: Mapping[Side, float]
+
+    def sentence(self) -> str:
+        return f"{self.moving:.0%} of the picture changes while the arms move, {self.resting:.0%} while they rest"
+
+
+def watch(frames: np.ndarray, motion: Mapping[Side, np.ndarray]) -> Seen | None:
+    """Compare pictures (N, H, W, 3) with the motion (N - 1,) of each arm between them; None where nothing moves."""
+    total = np.sum(list(motion.values()), axis=0) if motion else np.zeros(0)
+    if len(frames) < 12 or not len(total) or float(total.max()) <= 1e-3:
+        return None
+    small = np.stack(
+        [cv2.resize(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY), _SIZE, interpolation=cv2.INTER_AREA) for f in frames]
+    )
+    changed = (np.abs(np.diff(small.astype(np.int16), axis=0)) > _LEVELS).mean(axis=(1, 2))
+    order = np.argsort(total, kind="stable")
+    quarter = max(3, len(order) // 4)
+    follows: dict[Side, float] = {
+        side: float(np.corrcoef(changed, values)[0, 1]) if values.std() > 0 and changed.std() > 0 else 0.0
+        for side, values in motion.items()
+    }
+    return Seen(float(np.median(changed[order[-quarter:]])), float(np.median(changed[order[:quarter]])), follows)
+
+
+@dataclass(frozen=True)
+class NamedViews:
+    """View of each camera that a model is to see, the evidence for it, and the cameras that are left over."""
+
+    views: dict[str, str]
+    evidence: dict[str, str]
+    unused: list[str]
+
+
+def name_views(cameras: Sequence[str], sides: Sequence[Side], seen: Mapping[str, Seen | None]) -> NamedViews:
+    """Give the cameras their views: head, and one wrist for each arm; head first.
+
+    Args:
+        sides: of the arms; empty for recordings without arms.
+        seen: by camera, where its pictures were compared with the joints.
+    """
+    words = {camera: _camera_words(camera) for camera in cameras}
+    on_wrists = {camera: "by its name" for camera in cameras if set(words[camera]) & _WRIST - _HEAD[0]}
+    said = set().union(*_HEAD[:3])
+    if len(cameras) > 1:
+        for camera in cameras:
+            found = seen.get(camera)
+            if camera not in on_wrists and not set(words[camera]) & said and found and found.moving >= MOVING_SHARE:
+                on_wrists[camera] = "by its picture"
+    views: dict[str, str] = {}
+    evidence: dict[str, str] = {}
+    free = list(sides)
+    for camera in sorted(on_wrists, key=lambda camera: side_of(words[camera]) is None):
+        side, why = (
+            _wrist_side(words[camera], free, seen.get(camera)) if len(sides) > 1 else (next(iter(free), None), "")
+        )
+        if side in free:
+            free.remove(side)
+            views[camera], evidence[camera] = f"{side}_wrist", on_wrists[camera] + why
+    rest = [camera for camera in cameras if camera not in views]
+    rest.sort(key=lambda camera: _rank(words[camera]))
+    if rest:
+        views = {rest[0]: "head", **views}
+        how = "by its name" if _rank(words[rest[0]]) < len(_HEAD) else "the camera that is on no wrist"
+        evidence[rest[0]] = how + (f", before {named(rest[1:])}" if rest[1:] else "")
+    elif len(cameras) == 1:
+        views, evidence = {cameras[0]: "head"}, {cameras[0]: "the only camera, though on a wrist"}
+    for camera, view in views.items():
+        if (found := seen.get(camera)) is not None:
+            doubt = view.endswith("_wrist") != (found.moving >= MOVING_SHARE) and len(cameras) > 1
+            evidence[camera] += f"; {found.sentence()}" + (", which is unusual there: look at it" if doubt else "")
+    return NamedViews(views, evidence, rest[1:])
+
+
+def _wrist_side(words: Sequence[str], free: Sequence[Side], found: Seen | None) -> tuple[Side | None, str]:
+    """The arm that a wrist camera is on: the one that it names, or whose motion its picture follows best."""
+    if (side := side_of(words)) is not None:
+        return side, ""
+    if not free or found is None:
+        return next(iter(free), None), ""
+    side = max(free, key=lambda each: found.follows.get(each, 0.0))
+    return side, f"; it follows the {side} arm (correlation {found.follows.get(side, 0.0):.2f})"
+
+
+def _camera_words(camera: str) -> tuple[str, ...]:
+    """Words of a camera's own name: DROID's `exterior_1_left` is the left picture of a stereo camera."""
+    words = words_of(camera.removeprefix("observation.images.").removeprefix("observation.image."))
+    return tuple(word for word in words if word not in ("observation", "images"))
+
+
+def _rank(words: Sequence[str]) -> int:
+    return next((rank for rank, group in enumerate(_HEAD) if set(words) & group), len(_HEAD))

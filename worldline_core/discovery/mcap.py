@@ -1,0 +1,360 @@
+"""MCAP files: those that this project exports, and recordings of ROS 2 and Foxglove, by their topics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from worldline_core.data.episodes.episode import NO_EMBODIMENT
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, find_files
+from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
+from worldline_core.data.mcap.file import McapFile, Stream
+from worldline_core.data.mcap.messages import IMAGE_KINDS, SCHEMA_KINDS, Kind
+from worldline_core.discovery.cameras import name_views
+from worldline_core.discovery.columns import ArmColumns, Column, find_arms
+from worldline_core.discovery.findings import Discovery, Question, named
+from worldline_core.discovery.licence import stated_licence
+from worldline_core.discovery.robots import joint_order, match_robot
+from worldline_core.discovery.units import gripper_readings
+from worldline_core.discovery.words import Side, words_of
+from worldline_core.errors import DataError
+from worldline_core.geometry.embodiment import load_embodiment
+
+_SECONDS = 30
+_COMMAND_WORDS = {
+    "command",
+    "commands",
+    "cmd",
+    "action",
+    "actions",
+    "target",
+    "targets",
+    "desired",
+    "leader",
+    "goal",
+    "controller",
+}
+
+
+def discover_mcap(root: AnyPath) -> Discovery:
+    """Raises: DataError where no file can be read, or none has pictures and joints."""
+    files = find_files(root, "*.mcap") if root.is_dir() else [root]
+    if not files:
+        other = next(iter([*find_files(root, "*.db3"), *find_files(root, "*.bag"), *find_files(root, "*.mcap.zst*")]))
+        McapFile(other)  # which says how it becomes an MCAP file
+    file = _first_readable(files)
+    if exported := _exported(file):
+        return _of_this_project(root, files, exported)
+    return _of_topics(root, files, file)
+
+
+def _first_readable(files: Sequence[AnyPath]) -> McapFile:
+    fault: RejectedInputError | None = None
+    for path in files[:20]:
+        try:
+            file = McapFile(path)
+            _ = file.topics
+        except RejectedInputError as error:
+            fault = fault or error
+        else:
+            return file
+    raise fault or DataError("No MCAP file can be read")
+
+
+def _exported(file: McapFile) -> str | None:
+    try:
+        return exported_episode_id(file)
+    except DataError:
+        return None
+
+
+def _of_this_project(root: AnyPath, files: Sequence[AnyPath], episode_id: str) -> Discovery:
+    loaded = read_exported_episode(_first_readable(files))
+    episode = loaded.episode
+    about = f"MCAP files of this project: {len(files)} episodes of {named([episode.embodiment])} at {episode.fps:g} fps"
+    found = Discovery("mcap", about, {"kind": "mcap", "path": str(root)}, views=list(loaded.views), fps=episode.fps)
+    found.evidence["kind",] = f"the first file is the episode {named([episode_id])}"
+    found.state_size = episode.state.shape[1] or None
+    found.calibrated = set(loaded.views) <= set(episode.cameras)
+    return found
+
+
+def _kind(schema: str) -> Kind | None:
+    return SCHEMA_KINDS.get(schema.replace("/msg/", "/"))
+
+
+def _of_topics(root: AnyPath, files: Sequence[AnyPath], file: McapFile) -> Discovery:
+    kinds: dict[str, Kind] = {
+        topic: kind for topic, schema in file.topics.items() if (kind := _kind(schema)) is not None
+    }
+    pictures = [
+        topic
+        for topic, kind in kinds.items()
+        if kind in IMAGE_KINDS and not set(words_of(topic)) & {"depth", "disparity", "infra"}
+    ]
+    pictures = _one_of_each_camera(pictures, kinds)
+    joints = [topic for topic, kind in kinds.items() if kind == "joints"]
+    if not pictures or not joints:
+        raise DataError(
+            "The MCAP file has no pictures or no joints that are read", where=file.path,
+            expected="a topic of images (sensor_msgs or Foxglove) and one of joint states",
+            got=named([f"{topic} ({schema})" for topic, schema in file.topics.items()], 12),
+            next_step="docs/mcap.md lists the schemas that are read",
+        )  # fmt: skip
+    start = file.first_log_ns
+    wanted: dict[str, tuple[Kind, ...]] = {topic: (kinds[topic],) for topic in [*pictures, *joints]}
+    wanted |= {
+        topic: (kind,) for topic, kind in kinds.items() if kind in ("numbers", "transforms", "calibration", "marker")
+    }
+    streams = file.streams(wanted, start, start + _SECONDS * 10**9)
+    found = Discovery(
+        "mcap_topics",
+        f"MCAP of {named(sorted(set(file.topics.values())), 4)}: {len(files)} files",
+        {"kind": "mcap_topics", "path": str(root)},
+    )
+    found.evidence["kind",] = f"{len(file.topics)} topics in {file.path.name}"
+    _rate(found, [streams[topic] for topic in pictures if topic in streams])
+    state_topic, arms = _state(found, [streams[topic] for topic in joints if topic in streams])
+    _views(found, pictures, kinds, streams, [arm.side for arm in arms])
+    _arms(found, state_topic, arms, streams, [topic for topic in kinds if topic != state_topic])
+    _episodes(found, kinds, streams)
+    if (licence := stated_licence(root if root.is_dir() else root.parent)) is not None:
+        found.say(("license",), *licence)
+    return found
+
+
+def _one_of_each_camera(topics: Sequence[str], kinds: dict[str, Kind]) -> list[str]:
+    """Compressed pictures before raw ones of the same camera (`/cam/image` and `/cam/image/compressed`)."""
+    compressed = [topic for topic in topics if kinds[topic] != "raw_image"]
+    return [
+        topic for topic in topics if topic in compressed or not any(other.startswith(topic) for other in compressed)
+    ]
+
+
+def _rate(found: Discovery, streams: Sequence[Stream]) -> None:
+    rates = {
+        s.topic: 1e9 / float(np.median(np.diff(_times(s))))
+        for s in streams
+        if len(s.log_ns) > 2 and np.median(np.diff(_times(s))) > 0
+    }
+    if not rates:
+        found.source["fps"] = Question("fps", "rate to which pictures and joints are brought")
+        return
+    slowest = min(rates.values())
+    found.fps = float(max(1, round(slowest)))
+    found.say(
+        ("fps",),
+        found.fps,
+        "pictures come at " + ", ".join(f"{rate:.1f} Hz ({named([topic])})" for topic, rate in rates.items()),
+    )
+
+
+def _times(stream: Stream) -> np.ndarray:
+    return np.array(
+        [log if stamp is None else stamp for log, stamp in zip(stream.log_ns, stream.stamps_ns, strict=True)],
+        np.float64,
+    )
+
+
+def _columns(stream: Stream) -> list[Column]:
+    """The joints that all messages of the topic have."""
+    names = list(dict.fromkeys(name for value in stream.values[:50] for name in value.names))
+    return [Column(stream.topic, i, name, words_of(name)) for i, name in enumerate(names)]
+
+
+def _state(found: Discovery, streams: Sequence[Stream]) -> tuple[Stream, list[ArmColumns]]:
+    """The topic of measured joints, and its arms."""
+    candidates = sorted(streams, key=lambda s: (bool(set(words_of(s.topic)) & _COMMAND_WORDS), -len(_columns(s))))
+    for stream in candidates:
+        arms, why = find_arms(_columns(stream))
+        if arms:
+            found.evidence["arms",] = f"{stream.topic}, {why}"
+            return stream, arms
+    raise DataError(
+        "No topic of joint states has an arm",
+        got=named([column.name for s in streams for column in _columns(s)], 20),
+        next_step="write the source by hand: configs/sources/mcap_ros2.yaml",
+    )
+
+
+def _values(stream: Stream, columns: Sequence[Column]) -> np.ndarray:
+    """(N, len(columns)) positions; messages that lack one are left out."""
+    rows = []
+    for value in stream.values:
+        known = dict(zip(value.names, value.position, strict=False))
+        if all(column.name in known and np.isfinite(known[column.name]) for column in columns):
+            rows.append([known[column.name] for column in columns])
+    return np.array(rows, np.float64).reshape(-1, len(columns))
+
+
+def _views(
+    found: Discovery, pictures: Sequence[str], kinds: dict[str, Kind], streams: dict[str, Stream], sides: list[Side]
+) -> None:
+    chosen = name_views(pictures, sides, {})
+    frames = {
+        t.child
+        for s in streams.values()
+        if s.kind == "transforms"
+        for value in s.values
+        for t in (value if isinstance(value, tuple | list) else [value])
+    }
+    parents = {
+        t.parent
+        for s in streams.values()
+        if s.kind == "transforms"
+        for value in s.values
+        for t in (value if isinstance(value, tuple | list) else [value])
+    }
+    transforms = [topic for topic, kind in kinds.items() if kind == "transforms"]
+    calibrations = [topic for topic, kind in kinds.items() if kind == "calibration"]
+    views: dict[str, Any] = {}
+    for topic, view in chosen.views.items():
+        entry: dict[str, Any] = {"image": topic}
+        near = [c for c in calibrations if _shared(c, topic) >= 1]
+        frame = streams[topic].frame if topic in streams else ""
+        if near and frame in frames:
+            entry["calibration"] = max(near, key=lambda c: _shared(c, topic))
+        elif near:
+            found.notes.append(
+                f"The pictures of {named([topic])} are in the frame {named([frame])}, which no transform names: the view stays without a camera."
+            )
+        views[view] = entry
+        found.evidence["views", view] = chosen.evidence[topic]
+    found.source["views"] = views
+    found.views = list(views)
+    found.calibrated = all("calibration" in view for view in views.values())
+    roots = sorted(parents - frames)
+    if found.calibrated and roots:
+        base = next((root for root in sorted(parents) if "base" in root), roots[0])
+        found.say(
+            ("base_frame",),
+            base,
+            f"transforms lead from {named(roots)}; frames called base: {named([f for f in sorted(parents | frames) if 'base' in f])}",
+        )
+    static = [topic for topic in transforms if "static" in topic]
+    found.source["transforms"] = [topic for topic in transforms if topic not in static] if found.calibrated else []
+    found.source["static_transforms"] = static if found.calibrated else []
+
+
+def _shared(one: str, other: str) -> int:
+    """Leading parts that two topics have in common."""
+    pairs = zip(PurePosixPath(one).parts[1:-1], PurePosixPath(other).parts[1:], strict=False)
+    return next(
+        (i for i, (a, b) in enumerate(pairs) if a != b),
+        min(len(PurePosixPath(one).parts) - 2, len(PurePosixPath(other).parts) - 1),
+    )
+
+
+def _arms(
+    found: Discovery, stream: Stream, arms: list[ArmColumns], streams: dict[str, Stream], others: Sequence[str]
+) -> None:
+    angles = [_values(stream, arm.joints) for arm in arms]
+    match, choices, said = match_robot(" ".join(column.name for arm in arms for column in arm.joints), arms, angles)
+    if match is not None and all(arm.gripper for arm in arms):
+        found.say(("embodiment",), match.name, match.evidence)
+        robot = load_embodiment(match.name)
+        for number, arm in enumerate(arms):
+            arm.joints = [arm.joints[i] for i in joint_order(arm, robot, number)]
+            arm.side = robot.arms[number].name  # type: ignore[assignment]
+    elif choices:
+        found.say(
+            ("embodiment",),
+            Question("embodiment", f"which robot: {', '.join(choices[:10])}; or none, or the path of a description"),
+            said,
+        )
+    else:
+        found.say(("embodiment",), NO_EMBODIMENT, said or "an arm without a gripper")
+    commands = _command_topics(streams, others, arms)
+    entries = []
+    for arm in arms:
+        entry: dict[str, Any] = {"name": arm.side, "state": _readings(found, stream, arm, ("arms", arm.side, "state"))}
+        if commands is not None:
+            entry["command"] = _readings(
+                found, commands[0], commands[1][arms.index(arm)], ("arms", arm.side, "command")
+            )
+        entries.append(entry)
+    found.source["arms"] = entries
+    if commands is None:
+        numbers = [topic for topic in others if topic in streams and streams[topic].kind == "numbers"]
+        text = (
+            f" ({named(numbers)} hold numbers without names: declare `command` where they are commands)"
+            if numbers
+            else ""
+        )
+        found.say(("without_commands",), "repeat_state", f"no topic of commands has the joints' names{text}")
+    found.state_size = sum(len(arm.joints) + 1 for arm in arms)
+
+
+def _command_topics(
+    streams: dict[str, Stream], others: Sequence[str], arms: Sequence[ArmColumns]
+) -> tuple[Stream, list[ArmColumns]] | None:
+    """A topic of joint states that are commands, with the same joints."""
+    for topic in others:
+        if topic not in streams or streams[topic].kind != "joints" or not set(words_of(topic)) & _COMMAND_WORDS:
+            continue
+        found, _ = find_arms(_columns(streams[topic]), commanded=True)
+        if [sorted(arm.joint_words) for arm in found] == [sorted(arm.joint_words) for arm in arms] and all(
+            arm.gripper for arm in found
+        ):
+            for command, arm in zip(found, arms, strict=True):
+                command.joints = [command.joints[command.joint_words.index(words)] for words in arm.joint_words]
+            return streams[topic], found
+    return None
+
+
+def _readings(found: Discovery, stream: Stream, arm: ArmColumns, place: tuple[str, ...]) -> dict[str, Any]:
+    side = place[1]
+    joints = {"topic": stream.topic, "names": [column.name for column in arm.joints]}
+    if arm.gripper is None:
+        raise DataError(
+            "An arm has no gripper among its joints",
+            where=stream.topic,
+            expected="a joint called gripper or finger",
+            got=named([c.name for c in arm.joints]),
+            next_step="write the source by hand: configs/sources/mcap_ros2.yaml",
+        )
+    values = _values(stream, [arm.gripper])[:, 0]
+    readings = gripper_readings(
+        values,
+        None,
+        arm.gripper.words,
+        open_is_high=True if "finger" in arm.gripper.words and values.max() < 0.2 else None,
+        why="a finger that opens by some centimetres",
+    )
+    low, high = readings.ends
+    if readings.open_is_high is None:
+        ends: dict[str, Any] = {
+            end: Question(
+                f"{side}_gripper_{end}",
+                f"reading of {named([arm.gripper.name])} when it is {end} ({readings.evidence})",
+            )
+            for end in ("closed", "open")
+        }
+    else:
+        ends = {"closed": low, "open": high} if readings.open_is_high else {"closed": high, "open": low}
+    found.evidence[(*place, "gripper")] = readings.evidence + (
+        "; nothing says which end is open" if readings.open_is_high is None else ""
+    )
+    return {"joints": joints, "gripper": {"topic": stream.topic, "names": [arm.gripper.name], "range": ends}}
+
+
+def _episodes(found: Discovery, kinds: dict[str, Kind], streams: dict[str, Stream]) -> None:
+    markers = [
+        topic
+        for topic, kind in kinds.items()
+        if kind == "marker"
+        and topic in streams
+        and any(str(v).startswith(("start", "stop")) for v in streams[topic].values)
+    ]
+    if markers:
+        found.say(("episodes",), {"by": "markers", "topic": markers[0]}, "its messages begin with start and stop")
+    else:
+        found.say(
+            ("episodes",),
+            {"by": "file"},
+            "every file is an episode; `ranges` or `markers` cut longer ones (docs/mcap.md)",
+        )
