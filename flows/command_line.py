@@ -11,6 +11,7 @@ from pathlib import Path
 from flows.embodiment_commands import add_embodiment_commands
 from flows.exchange_commands import add_exchange_commands
 from flows.full_size_commands import add_plan_command, add_rehearse_command
+from flows.init_commands import add_init_command
 from flows.serve_commands import add_serve_commands
 from tasks.execution.artifact_task import find_task, task_names
 from tasks.execution.command_line import add_config_arguments, add_task_arguments
@@ -24,6 +25,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"worldline {metadata.version('worldline')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    add_init_command(commands)
     pipeline = commands.add_parser("pipeline", help="run every step, from recordings to the report")
     pipeline.set_defaults(run=_pipeline)
     nightly = commands.add_parser("nightly", help="evaluate the shipped checkpoints and compare with earlier nights")

@@ -14,97 +14,20 @@ _SIDES: dict[str, Side] = {"left": "left", "l": "left", "right": "right", "r": "
 _GRIPPER = {"gripper", "grippers", "jaw", "claw", "carriage", "eoat"}
 _FINGERS = {"pinky", "ring", "middle", "index", "thumb", "little"}
 _ELSEWHERE = frozenset(
-    [
-        "eef",
-        "ee",
-        "tcp",
-        "pose",
-        "cartesian",
-        "x",
-        "y",
-        "z",
-        "w",
-        "rx",
-        "ry",
-        "rz",
-        "qx",
-        "qy",
-        "qz",
-        "qw",
-        "euler",
-        "quat",
-        "quaternion",
-        "rot",
-        "rotation",
-        "orientation",
-        "orient",
-        "xyz",
-        "rpy",
-        "vel",
-        "velocity",
-        "velocities",
-        "speed",
-        "effort",
-        "efforts",
-        "torque",
-        "torques",
-        "current",
-        "acc",
-        "acceleration",
-        "imu",
-        "base",
-        "chassis",
-        "wheel",
-        "hip",
-        "knee",
-        "ankle",
-        "leg",
-        "foot",
-        "remote",
-        "mobile",
-        "odom",
-        "temperature",
-        "theta",
-        "stick",
-        "button",
-        "timestamp",
-        "frame",
-        "done",
-        "reward",
-        "success",
-        "delta",
-    ]
+    """
+    eef ee tcp pose cartesian x y z w rx ry rz qx qy qz qw euler quat quaternion rot rotation orientation orient
+    xyz rpy vel velocity velocities speed effort efforts torque torques current acc acceleration imu base chassis
+    wheel hip knee ankle leg foot remote mobile odom temperature theta stick button timestamp frame done reward
+    success delta
+    """.split()  # noqa: SIM905
 )
 _BODY = {"waist", "torso", "head", "neck", "spine", "body", "trunk"}
 LEADERS, FOLLOWERS = {"leader", "master"}, {"follower", "puppet", "slave"}
 _NOISE = frozenset(
-    [
-        "k",
-        "main",
-        "pos",
-        "position",
-        "positions",
-        "q",
-        "qpos",
-        "rad",
-        "deg",
-        "observation",
-        "state",
-        "states",
-        "action",
-        "actions",
-        "motor",
-        "motors",
-        "hdas",
-        "arm",
-        "joint",
-        "joints",
-        "idx",
-        "panda",
-        "actuator",
-        "scale",
-        "open",
-    ]
+    """
+    k main pos position positions q qpos rad deg observation state states action actions motor motors hdas arm
+    joint joints idx panda actuator scale open
+    """.split()  # noqa: SIM905
 )
 
 
