@@ -128,7 +128,9 @@ def test_pictures_have_the_colours_that_ffmpeg_shows(tmp_path: Path, made: Made)
     assert np.abs((luma if pictures[0].full_range else (luma - 16) * 255 / 219) - light).max() <= TOLERANCE
 
 
-@pytest.mark.parametrize("made", CASES, ids=str)
+@pytest.mark.parametrize(
+    "made", [pytest.param(m, id=str(m), marks=[pytest.mark.slow] if m.matrix == "bt709" else []) for m in CASES]
+)
 def test_colours_stay_through_curation_and_export(tmp_path: Path, made: Made) -> None:
     (tmp_path / "raw").mkdir()
     made.write(tmp_path / "raw" / "a.mp4")

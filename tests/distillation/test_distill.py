@@ -200,6 +200,16 @@ def test_a_causal_model_goes_on_beside_its_teacher(finished: Finished, tmp_path:
         distill(config(), given | {"causal": tmp_path / "two"}, tmp_path / "no")
 
 
+def test_blocks_learn_from_generated_history_and_stage2_as_well(finished: Finished, tmp_path: Path) -> None:
+    plain = config().model_dump(mode="json")
+    plain["teacher_forcing"] |= {"history": "generated", "history_noise": 0.0, "teacher_share": 0.5}
+    distill(DistillConfig.model_validate(plain), finished.inputs, tmp_path)
+    before, after = (load_checkpoint(root / "teacher_forcing")[0] for root in (finished.output, tmp_path))
+    assert not torch.equal(next(before.parameters()), next(after.parameters()))
+    rows = [json.loads(line) for line in (tmp_path / "teacher_forcing/metrics.jsonl").read_text().splitlines()]
+    assert rows[-1]["validation/rollout_error"] > 0
+
+
 def test_a_finished_run_is_read_not_repeated(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*args: object, **kwargs: object) -> None:
         raise RuntimeError("trained again")

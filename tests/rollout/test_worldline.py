@@ -121,7 +121,7 @@ def test_weights_in_bfloat16_predict_nearly_the_same(observed: Observation, caus
         assert np.abs(found[view].astype(int) - frames).mean() < 1
 
 
-@pytest.mark.parametrize("anchor_blocks", [None, 1, 2])
+@pytest.mark.parametrize("anchor_blocks", [1, *(pytest.param(blocks, marks=pytest.mark.slow) for blocks in (None, 2))])
 def test_decoding_one_block_while_the_next_is_sampled_changes_nothing(
     observed: Observation, causal: WorldLine, anchor_blocks: int | None
 ) -> None:
