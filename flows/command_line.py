@@ -225,18 +225,20 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
     import sys
 
     from worldline_core.errors import WorldLineError
+    from worldline_core.store.store import clear_full_disk
 
     try:
         from worldline_core.calibration.check import check_command
         from worldline_core.calibration.check_report import as_json, table_text
 
-        found = check_command(
-            arguments.config,
-            arguments.artifact,
-            overrides=arguments.overrides,
-            episodes=arguments.episodes,
-            output=arguments.output,
-        )
+        with clear_full_disk():
+            found = check_command(
+                arguments.config,
+                arguments.artifact,
+                overrides=arguments.overrides,
+                episodes=arguments.episodes,
+                output=arguments.output,
+            )
     except WorldLineError as error:
         # 1 says that something was found; what cannot be checked at all is another status.
         print(f"error: {error}", file=sys.stderr)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import logging
 import os
 import select
@@ -15,15 +14,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, TextIO, cast
 
-from safetensors import SafetensorError
-
 from tasks.execution.artifact_task import ArtifactTask, TaskCall
 from tasks.execution.chain import find_artifacts, find_call, load_chain, outline, ready_inputs
 from tasks.execution.supervisor import run_supervised
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError, StoppedError, WorldLineError
 from worldline_core.store.artifact_files import read_manifest
-from worldline_core.store.store import Artifact, ArtifactStore
+from worldline_core.store.store import Artifact, ArtifactStore, clear_full_disk
 from worldline_core.untrusted_text import shown, visible, without_credentials
 
 if TYPE_CHECKING:
@@ -150,8 +147,9 @@ def exit_with_clear_errors(action: Callable[[], object]) -> None:
     log_to_stderr()
     sys.excepthook = _print_traceback
     try:
-        action()
-        sys.stdout.flush()
+        with clear_full_disk():
+            action()
+            sys.stdout.flush()
     except StoppedError as stopped:
         print(stopped, file=sys.stderr)
         raise SystemExit(128 + signal.SIGTERM) from stopped
@@ -162,11 +160,6 @@ def exit_with_clear_errors(action: Callable[[], object]) -> None:
         if not _nobody_reads():
             raise
         raise SystemExit(128 + signal.SIGPIPE) from error
-    except (OSError, SafetensorError) as error:
-        if getattr(error, "errno", None) not in _FULL and not any(f"(os error {n})" in str(error) for n in _FULL):
-            raise
-        print(f"error: No space left\n  where: {shown(error)}\n  next step: {_CONTINUE}", file=sys.stderr)
-        raise SystemExit(1) from error
 
 
 def _nobody_reads() -> bool:
@@ -177,10 +170,6 @@ def _nobody_reads() -> bool:
         return False
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return True
-
-
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_CONTINUE = "free some space, or move the artifacts (--artifacts); the same command continues"
 
 
 def _print_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

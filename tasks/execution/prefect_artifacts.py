@@ -15,12 +15,14 @@ from prefect import Flow
 from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
 from tasks.execution.chain import outline
-from tasks.execution.prefect_run import ArtifactReference, PrefectRun, shorten_errors
+from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+from tasks.execution.shard_mapper import shorten_errors
 from tasks.execution.temporary_server import private_server
 from worldline_core.config import StrictModel
 from worldline_core.errors import UnavailableError
 from worldline_core.evaluation.paired import collect_metrics
 from worldline_core.scale.mapping import RunnerConfig
+from worldline_core.store.store import clear_full_disk
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +37,8 @@ def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
 
     @functools.wraps(flow.fn)
     def body(*values: Any, **named: Any) -> R:
-        done.append(flow.fn(*values, **named))
+        with clear_full_disk():
+            done.append(flow.fn(*values, **named))
         return done[0]
 
     shorten_errors()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import json
-import logging
 import multiprocessing
 import os
 from collections.abc import Mapping
@@ -22,7 +21,6 @@ from queue import SimpleQueue
 from types import TracebackType
 from typing import Any, Self, cast
 
-import httpx
 from prefect import Task
 from prefect.cache_policies import CachePolicy
 from prefect.client.schemas.objects import RunInput, State, TaskRunResult
@@ -37,10 +35,16 @@ from prefect.task_runners import ProcessPoolTaskRunner
 from tasks.execution.artifact_task import Outline, TaskCall, activated, find_task
 from tasks.execution.command_line import log_to_stderr
 from tasks.execution.run_page import LATEST_REPORT, RunPage
-from tasks.execution.shard_mapper import limited_threads, process_runner, shard_mapper, shared_server
+from tasks.execution.shard_mapper import (
+    limited_threads,
+    process_runner,
+    shard_mapper,
+    shared_server,
+    shorten_errors,
+)
 from worldline_core.config import StrictModel
 from worldline_core.data.guards.source_paths import SourceFolder, parse_location
-from worldline_core.errors import ArtifactError, WorldLineError
+from worldline_core.errors import ArtifactError
 from worldline_core.progress import running_node
 from worldline_core.scale.mapping import RunnerConfig, WorkerDiedError
 from worldline_core.scale.process import end_with_pool, keep_freed_memory
@@ -239,18 +243,6 @@ class PrefectRun(Outline):
         return self._stack.enter_context(process_runner(self._runner.steps_at_once))
 
 
-def shorten_errors() -> None:
-    """Let Prefect log errors of this project, and of its own server's end, without tracebacks."""
-    for name in ("prefect.flow_runs", "prefect.task_runs"):
-        logging.getLogger(name).addFilter(_without_traceback)
-
-
-def _without_traceback(record: logging.LogRecord) -> bool:
-    if record.exc_info and isinstance(record.exc_info[1], WorldLineError | httpx.TransportError):
-        record.exc_info = None
-    return True
-
-
 def _prefect_task(call: TaskCall, *, refresh: bool) -> Task[..., dict[str, Any]]:
     return Task(
         fn=_run_task,
@@ -271,6 +263,7 @@ def _run_task(
     if multiprocessing.parent_process() is not None:
         end_with_pool()
         keep_freed_memory()
+        shorten_errors()
         log_to_stderr()
     task = find_task(task_name)
     folders = {name: parse_location(value["path"]) for name, value in inputs.items()}

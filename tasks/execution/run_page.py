@@ -14,6 +14,7 @@ from typing import Self
 
 from tasks.execution.artifact_task import TaskCall
 from worldline_core.report.progress import FinishedStep, write_finished_page, write_progress_page
+from worldline_core.store.store import disk_full
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +40,7 @@ class RunPage:
         self._running: dict[str, float] = {}
         self._done: dict[str, FinishedStep] = {}
         self._report: Path | None = None
+        self._writable = True
         self._began = time.monotonic()
         self._change = threading.RLock()
         self._over = threading.Event()
@@ -57,7 +59,7 @@ class RunPage:
         if error is not None:
             self._write(failed=str(error) or type(error).__name__)
         elif self._report is not None:
-            with _unless_read_only():
+            with self._unless_unwritable():
                 write_finished_page(self.folder, self._report)
 
     def finished(self, call: TaskCall, folder: Path, *, cached: bool) -> None:
@@ -84,18 +86,19 @@ class RunPage:
                 self._write()
 
     def _write(self, failed: str = "") -> None:
-        with self._change, _unless_read_only():
+        with self._change, self._unless_unwritable():
             to_come = [name for name in self._calls if name not in self._done and name not in self._running]
             elapsed = time.monotonic() - self._began
             write_progress_page(self.folder, list(self._done.values()), list(self._running), to_come, elapsed, failed)
 
-
-@contextmanager
-def _unless_read_only() -> Iterator[None]:
-    """A run that finds everything in a store that it may not write has no page."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
-            raise
-        logger.warning("no page of this run: %s", error)
+    @contextmanager
+    def _unless_unwritable(self) -> Iterator[None]:
+        """A run that finds everything in a store that it may not write has no page; on a full disk its own error counts."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM) and not disk_full(error):
+                raise
+            if self._writable:
+                logger.warning("no page of this run: %s", error)
+            self._writable = False

@@ -5,6 +5,7 @@ A shard is a task run named after it. Few are handed out at a time, so memory do
 
 from __future__ import annotations
 
+import logging
 import os
 import pickle
 import sys
@@ -13,8 +14,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import httpx
+
 from tasks.execution.temporary_server import private_server, set_up_temporary_server
-from worldline_core.errors import UnavailableError, installing
+from worldline_core.errors import UnavailableError, WorldLineError, installing
 from worldline_core.scale.mapping import (
     Outcome,
     RunnerConfig,
@@ -98,11 +101,22 @@ class PrefectMapper:
                 return process_runner(workers)
 
 
+def shorten_errors() -> None:
+    """Let Prefect say once, in the state of a run, how an error of this project or the end of its server ended it."""
+    for name in ("prefect.flow_runs", "prefect.task_runs"):
+        logging.getLogger(name).addFilter(_is_unforeseen)
+
+
+def _is_unforeseen(record: logging.LogRecord) -> bool:
+    return not (record.exc_info and isinstance(record.exc_info[1], WorldLineError | httpx.TransportError))
+
+
 def _work(payload: bytes, pauses: list[float]) -> None:
     """The body of every shard's task, in a worker: one thread per worker, since there is one worker per core."""
     import cv2
 
     cv2.setNumThreads(1)
+    shorten_errors()
     shard: Shard[Any] = pickle.loads(payload)  # noqa: S301 - made by `PrefectMapper` in this same run
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)

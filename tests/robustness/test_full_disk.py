@@ -77,3 +77,34 @@ def test_a_video_is_whole_or_an_error_however_little_space_is_left(
     assert set(said) == {"whole True", "full 28"}
     assert said[0] == "full 28"
     assert len(said) > 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["pipeline"],
+        [
+            "task",
+            "curate",
+            "--runner",
+            "processes",
+            "--set",
+            "runner.workers=2",
+            "--set",
+            "runner.episodes_per_shard=4",
+        ],
+    ],
+    ids=["pipeline", "shards in processes"],
+)
+def test_a_full_disk_is_one_message_of_any_command(disk: Path, project_root: Path, command: list[str]) -> None:
+    leave(disk, 300_000)
+    ended = subprocess.run(
+        [sys.executable, "-m", "flows.command_line", *command, "--preset", "smoke", "--artifacts", str(disk / "store")],
+        cwd=project_root, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert ended.returncode == 1, ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert [line for line in ended.stderr.splitlines() if line.startswith("error:")] == ["error: No space left"]
+    assert "the same command continues" in ended.stderr
+    assert not list(disk.rglob("manifest.json"))

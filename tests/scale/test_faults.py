@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
+from safetensors import SafetensorError
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError, UnavailableError
@@ -48,7 +49,9 @@ def test_what_passes_is_tried_again_and_ends_no_run(error: Exception) -> None:
         (PermissionError(errno.EACCES, "no"), False), (RejectedInputError("truncated_video", "cut"), False),
         (OSError("file signature not found"), False),  # h5py, of a damaged file
         (DataError("bad"), False), (MemoryError(), False), (ConfigError("wrong"), True), (UnavailableError("h5py"), True),
-        (OSError(errno.ENOSPC, "full"), True),
+        *((OSError(number, "full"), True) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)),
+        (SafetensorError("I/O error: No space left on device (os error 28)"), True),
+        (DataError("a text with (os error 28)"), False),
     ],
 )  # fmt: skip
 def test_bad_data_is_not_tried_again_and_what_every_episode_would_meet_ends_the_run(

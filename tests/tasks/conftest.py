@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +23,8 @@ class WriteConfig(StrictModel):
 def write(config: WriteConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     if config.text == "broken":
         raise DataError("This task cannot work")
+    if config.text == "full":
+        raise OSError(errno.ENOSPC, "No space left on device")
     before = "".join((folder / "text").read_text() for folder in inputs.values())
     (output / "text").write_text(before + config.text)
     return {"written": len(before) + 1}

@@ -24,7 +24,7 @@ from tasks.execution.artifact_task import variant
 from tasks.execution.chain import outline
 from tasks.execution.prefect_artifacts import show_in_prefect
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
-from worldline_core.errors import ConfigError, DataError
+from worldline_core.errors import ConfigError, DataError, WorldLineError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.scale.mapping import RunnerConfig
 
@@ -57,8 +57,17 @@ def run(store: Path, chain: Callable[..., None], *arguments: str, page: bool = F
     return some_calls()
 
 
+@pytest.mark.parametrize(
+    ("number", "text", "message"), [(errno.EROFS, "broken", "cannot work"), (errno.ENOSPC, "full", "No space left")]
+)
 def test_a_call_starts_when_its_inputs_are_finished_and_is_found_where_nothing_may_be_written(
-    storage: Path, two_calls: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+    storage: Path,
+    two_calls: Callable[..., None],
+    number: int,
+    text: str,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     done = run(storage, two_calls)
     assert list(done) == ["write_first", "write_next.second"]
@@ -66,13 +75,14 @@ def test_a_call_starts_when_its_inputs_are_finished_and_is_found_where_nothing_m
     made = {path: path.stat().st_mtime_ns for path in storage.rglob("text")}
 
     def refuse(*_: object) -> NoReturn:
-        raise OSError(errno.EROFS, "Read-only file system")
+        raise OSError(number, "the page cannot be written")
 
     monkeypatch.setattr(run_page, "write_progress_page", refuse)
     assert run(storage, two_calls, page=True) == done
     assert {path: path.stat().st_mtime_ns for path in storage.rglob("text")} == made
-    with pytest.raises(DataError, match="cannot work"):
-        run(storage, two_calls, "broken", page=True)
+    with pytest.raises(WorldLineError, match=message):
+        run(storage, two_calls, text, page=True)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_equal_calls_are_one(declare: Any) -> None:

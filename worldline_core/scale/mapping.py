@@ -28,10 +28,11 @@ from worldline_core.progress import Progress
 from worldline_core.scale.account import InputRow, crash_evidence, portable_message, write_shard_account
 from worldline_core.store.artifact_files import VerifyMode
 from worldline_core.store.remote import UnreachableInputError, first_line, is_transient, with_retries
+from worldline_core.store.store import clear_store_errors, disk_full
 
 logger = logging.getLogger(__name__)
 
-_MACHINE_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EMFILE, errno.ENFILE})
+_MACHINE_UNUSABLE = frozenset({errno.EROFS, errno.EMFILE, errno.ENFILE})
 
 
 class WorkerDiedError(WorldLineError):
@@ -181,7 +182,7 @@ def ends_the_run(error: BaseException) -> bool:
     """Returns whether every other episode would fail as well until the user removes the cause (a full disk, a wrong setting)."""
     if isinstance(error, UnreachableInputError):
         return False
-    if isinstance(error, OSError) and error.errno in _MACHINE_FULL:
+    if disk_full(error) or (isinstance(error, OSError) and error.errno in _MACHINE_UNUSABLE):
         return True
     return isinstance(error, ConfigError | UnavailableError | ArtifactError)
 
@@ -303,7 +304,8 @@ class RunnerConfig(StrictModel):
 def try_shard(shard: Shard[Any], pauses: Sequence[float]) -> Exception | None:
     """Do a shard, again after each of `pauses` seconds while its input cannot be reached; returns what it ends with."""
     try:
-        with_retries(partial(do_shard, shard), shard.label, pauses)
+        with clear_store_errors(shard.work.output):
+            with_retries(partial(do_shard, shard), shard.label, pauses)
     except Exception as error:  # noqa: BLE001 - returned to `map_episodes`, which decides whether it ends the run
         return error
     return None

@@ -26,8 +26,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError
+
 from worldline_core.config import StrictModel, cache_relevant_config
-from worldline_core.errors import ArtifactError
+from worldline_core.errors import ArtifactError, WorldLineError
 from worldline_core.store.artifact_files import (
     KEY_LENGTH,
     MANIFEST_NAME,
@@ -59,11 +61,42 @@ _WRITERS = ".writers"
 StepFunction = Callable[[Any, Mapping[str, Path], Path], dict[str, Any]]
 
 
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def disk_full(error: BaseException) -> bool:
+    """Returns whether an error says that a disk is full, or a quota or the allowed size of a file used up."""
+    if isinstance(error, OSError):
+        return error.errno in _FULL
+    return isinstance(error, SafetensorError) and any(f"(os error {number})" in str(error) for number in _FULL)
+
+
 @contextmanager
-def clear_store_errors(root: Path) -> Iterator[None]:
-    """Turn missing rights, a read-only disk and files that are in the way below ``root`` into one ArtifactError."""
+def clear_full_disk(folder: Path | None = None) -> Iterator[None]:
+    """Turn the error of a full disk into one ArtifactError.
+
+    Args:
+        folder: where is written, for errors that name no file.
+    """
     try:
         yield
+    except Exception as error:
+        if isinstance(error, WorldLineError) or not disk_full(error):
+            raise
+        raise ArtifactError(
+            "No space left",
+            where=getattr(error, "filename", None) or folder,
+            got=error,
+            next_step="free some space, or choose a folder elsewhere (--artifacts, --output); the same command continues",
+        ) from error
+
+
+@contextmanager
+def clear_store_errors(root: Path) -> Iterator[None]:
+    """Turn a full disk, and below ``root`` missing rights, a read-only disk and files in the way, into one ArtifactError."""
+    try:
+        with clear_full_disk(root):
+            yield
     except OSError as error:
         in_the_way = PermissionError | FileExistsError | NotADirectoryError | IsADirectoryError
         if not isinstance(error, in_the_way) and error.errno not in (errno.EROFS, errno.EXDEV, errno.ELOOP):
@@ -261,7 +294,7 @@ class ArtifactStore:
             distributed: the step shares its work among the processes of torchrun; otherwise the first process does it all.
 
         Raises:
-            ArtifactError: an input differs from its manifest, or the store cannot be read or written.
+            ArtifactError: an input differs from its manifest, the store cannot be read or written, or the disk is full.
             WorldLineError: an error of the step; its unfinished work stays in ``<key>.partial/``.
         """
         with clear_store_errors(self.root):
