@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from worldline_core import Camera, WorldLine
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.tokenizers import PatchTokenizer
+from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.rollout.robot import CommandedRobot
 from worldline_core.rollout.simulation import Simulation
 
@@ -85,6 +87,47 @@ def test_steps_give_the_bytes_of_a_prediction(causal: WorldLine, starts: list[St
         assert equal(simulation.pictures[0], {view: video[-1] for view, video in predicted.items()})
     # Limits change nothing of commands within them.
     assert equal(videos(given.begin(causal, limits=True), start.controls[None])[0], predicted)
+
+
+def test_a_simulation_begins_in_the_middle_of_a_recording(causal: WorldLine, recordings: EpisodeSet) -> None:
+    """The robot is where the earlier commands led it; wrist cameras, known at the first frame, have moved with their arms."""
+    recorded = RecordedStarts(recordings.root, view_sets=[VIEWS], fps=8.0, embodiment=ROBOT, splits=("test",))
+    arms = load_embodiment(ROBOT)
+    grippers = [arms.gripper_column(arm) for arm in arms.arms]
+    row = recorded.rows[1]
+    episode = recordings.episode(recordings.position(row.episode_id))
+    frame = int(np.abs(np.diff(episode.action[:, grippers], axis=0)).max(axis=1).argmax()) + 1  # a gripper is moving
+    start = recorded.at(row.episode_id, frame)
+    assert np.array_equal(
+        start.images["head"], recordings.frames(recordings.position(row.episode_id), "head", [frame])[0]
+    )
+    begun = {"embodiment": ROBOT, "state": start.state, "earlier": [start.earlier]}
+    simulation = causal.start(start.images, start.cameras, **begun)
+    begins = episode.action[:1].astype(np.float64)
+    robot, _, states = CommandedRobot(simulation._starts.kinematics, 8.0, begins, limits=False).follow(
+        episode.action[None, 1 : frame + 1].astype(np.float64)
+    )
+    assert np.array_equal(simulation.state, states[:, -1])
+    assert np.array_equal(simulation.commands[:, -1], robot.command)
+    assert np.abs(simulation.state - robot.command)[:, grippers].max() > 0.05
+    mounted = causal.start(start.images, {view: Camera(camera.K, None if view != "head" else camera.T_base_camera)
+                                          for view, camera in start.cameras.items()}, **begun)  # fmt: skip
+    unknown = ArmKinematics(
+        arms.model_copy(update={"arms": tuple(arm.model_copy(update={"wrist_camera": None}) for arm in arms.arms)})
+    )
+    solved = causal.start(start.images, start.cameras, **begun | {"embodiment": unknown})
+    for one in (simulation, solved):
+        np.testing.assert_allclose(one.tracks[0].uv, mounted.tracks[0].uv, atol=0.2)
+    driven = episode.action[frame + 1 : frame + 17]
+    driven = np.concatenate((driven, np.repeat(driven[-1:], 16 - len(driven), axis=0)))
+    assert equal(simulation.step(driven)[0], mounted.step(driven)[0])
+    branch = causal.start([start.images] * 2, [start.cameras] * 2, embodiment=ROBOT, state=start.state,
+                          earlier=[start.earlier[:0], start.earlier])  # fmt: skip
+    assert np.array_equal(branch.state, np.stack((start.state, states[0, -1])))
+    for wrong, said in (([start.earlier] * 2, "do not fit together"), ([start.earlier[:, 1:]], "wrong length"),
+                        ([np.full_like(start.earlier, 90.0)], "limit")):  # fmt: skip
+        with pytest.raises(DataError, match=said):
+            causal.start(start.images, start.cameras, **begun | {"earlier": wrong})
 
 
 def test_stage2_is_stepped_clip_by_clip(project_root: Path, starts: list[Start]) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -153,9 +153,13 @@ def open_rollouts(inputs: Mapping[str, Path]) -> dict[str, RolloutSet]:
 
 def simulated_points(simulation: Simulation, clip: int) -> np.ndarray:
     """Tools in the head view of the last step ``(n, arms, 2)`` [px of the simulated picture], NaN where not seen."""
-    tracks = simulation.tracks[clip]
+    return shown_points(simulation.tracks[clip], simulation.image_size)
+
+
+def shown_points(tracks: EpisodeTracks, size: tuple[int, int]) -> np.ndarray:
+    """Tools in the head view ``(n, arms, 2)`` [px of a picture of this size (H, W)], NaN where not seen."""
     column = tracks.views.index(HEAD)
-    scale = np.array(simulation.image_size[::-1]) / np.array(tracks.image_size[::-1])
+    scale = np.array(size[::-1]) / np.array(tracks.image_size[::-1])
     points = (tracks.uv[:, column] + 0.5) * scale - 0.5
     points[~tracks.valid[:, column]] = np.nan
     return points

@@ -1,4 +1,4 @@
-"""First frames to start a simulation from: of recordings, or one given as files."""
+"""Frames to start a simulation from: of recordings, or one given as files."""
 
 from __future__ import annotations
 
@@ -6,28 +6,34 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import batched
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from worldline_core.config import read_yaml
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.sources.calibration_file import add_calibrated_view, read_calibration
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import Embodiment
+from worldline_core.model.tokenizers import resized_frames
 from worldline_core.rollout.observation import Camera
 
 
 @dataclass(frozen=True)
 class RecordedStart:
-    """The first frame of a recording.
+    """A frame of a recording.
 
     Attributes:
-        images: ``uint8 (H, W, 3)`` by view, with a camera each.
+        images: ``uint8 (H, W, 3)`` by view.
+        cameras: of each view, at the first frame of the recording.
         state: ``(state size)``, the first command.
+        earlier: ``(frame, state size)``, the commands from there to the frame of the images.
     """
 
     episode_id: str
@@ -35,11 +41,20 @@ class RecordedStart:
     images: dict[str, np.ndarray]
     cameras: dict[str, Camera]
     state: np.ndarray
+    earlier: np.ndarray
+
+    @property
+    def commands(self) -> np.ndarray:
+        """``(1 + frame, state size)``: all so far."""
+        return np.concatenate((self.state[None], self.earlier))
+
+
+_SAME_START = "from the same start as another"
 
 
 class RecordedStarts:
     """Starts of the recordings that a model can go on from, in the order of the set; each bank (attempts from one initial
-    state) is one start, that of its first recording.
+    state) is one start, that of its first recording. By name every recording can be begun, at any frame.
 
     Args:
         view_sets: of the model; a start shows the first one whose views are all recorded and calibrated.
@@ -57,27 +72,27 @@ class RecordedStarts:
         splits: Sequence[str] | None = None,
     ) -> None:
         self._episodes, self._view_sets = EpisodeSet.open(recordings), view_sets
-        positions: list[int] = []
-        self._left_out: Counter[str] = Counter()
+        self._rows = {row.episode_id: row for row in self._episodes.rows}
+        self._left_out: dict[str, str] = {}
+        self.rows: list[EpisodeRow] = []
         banks: set[str] = set()
-        for position, row in enumerate(self._episodes.rows):
+        for row in self._episodes.rows:
             reasons = {
                 "of another robot": embodiment is not None and row.embodiment != embodiment,
                 "of another split": splits is not None and row.split not in splits,
                 "without all views": not any(set(views) <= set(row.views) for views in view_sets),
                 "of another rate": row.fps != fps,
                 "without calibration or commands": row.stage2_reason not in (None, "missing_view"),
-                "from the same start as another": row.bank in banks,
+                _SAME_START: row.bank in banks,
             }
             reason = next((reason for reason, holds in reasons.items() if holds), None)
             if reason is None:
-                positions.append(position)
+                self.rows.append(row)
                 banks |= {row.bank} if row.bank else set()
             else:
-                self._left_out[reason] += 1
-        self.rows = [self._episodes.rows[position] for position in positions]
-        self._positions = positions
+                self._left_out[row.episode_id] = reason
         self._start = lru_cache(maxsize=64)(self._read)
+        self._before = lru_cache(maxsize=8)(self._read_before)
 
     @property
     def embodiment(self) -> str:
@@ -90,7 +105,7 @@ class RecordedStarts:
             recorded = ", ".join(sorted({row.embodiment for row in self._episodes.rows}))
             raise DataError(
                 "Starts are needed of one robot", where=self._episodes.root,
-                got=f"{', '.join(sorted(robots)) or 'none'}; left out: {dict(self._left_out)}",
+                got=f"{', '.join(sorted(robots)) or 'none'}; left out: {dict(Counter(self._left_out.values()))}",
                 next_step=f"name an embodiment of the recordings ({recorded}), or give others",
             )  # fmt: skip
         return robots.pop()
@@ -99,29 +114,61 @@ class RecordedStarts:
         return len(self.rows)
 
     def __getitem__(self, number: int) -> RecordedStart:
-        return self._start(number)
+        return self.at(self.rows[number].episode_id)
+
+    def at(self, episode_id: str, frame: int = 0) -> RecordedStart:
+        """A frame of the recording of this name.
+
+        Raises: DataError when there is no such recording or frame.
+        """
+        row = self.row(episode_id)
+        if isinstance(frame, bool) or not isinstance(frame, int | np.integer) or not 0 <= frame < row.video_frames:
+            raise DataError(
+                "No such frame of a recording to start from", where=f"episode {episode_id}",
+                expected=f"an integer, 0 to {row.video_frames - 1}", got=frame,
+            )  # fmt: skip
+        return self._start(episode_id, int(frame))
+
+    def before(self, start: RecordedStart, size: tuple[int, int]) -> dict[str, Any]:
+        """Recorded pictures before a start, ``uint8 (frame, H, W, 3)`` by view at this size (H, W)."""
+        return self._before(start.episode_id, len(start.earlier), tuple(start.images), size)
+
+    def robot_state(self, start: RecordedStart) -> np.ndarray:
+        """``(state size)``: where the robot was at a start, as it was measured."""
+        return self._episode(start.episode_id).state[len(start.earlier)]
 
     def named(self, episode_id: str) -> tuple[EpisodeRow, RecordedStart]:
         """The recording of this name and its start.
 
         Raises: DataError when there is none.
         """
-        for number, row in enumerate(self.rows):
-            if row.episode_id == episode_id:
-                return row, self[number]
-        raise DataError(
-            "No recording of this name to start from", where=self._episodes.root, got=episode_id,
-            expected=f"one of {', '.join(row.episode_id for row in self.rows[:8])} ...",
-        )  # fmt: skip
+        return self.row(episode_id), self.at(episode_id)
+
+    def row(self, episode_id: str) -> EpisodeRow:
+        """The recording of this name.
+
+        Raises: DataError when there is none that fits.
+        """
+        row = self._rows.get(episode_id) if isinstance(episode_id, str) else None
+        reason = self._left_out.get(episode_id) if row else None
+        if row is None or reason not in (None, _SAME_START):
+            raise DataError(
+                "No recording of this name to start from", where=self._episodes.root,
+                expected=f"one of {', '.join(row.episode_id for row in self.rows[:8])} ...",
+                got=f"{episode_id}, {reason}" if row else episode_id,
+            )  # fmt: skip
+        return row
 
     def commands(self, number: int) -> np.ndarray:
         """``(n, state size)``: what was commanded after the first frame of the recording of a start."""
-        return np.asarray(self._episodes.episode(self._positions[number]).action[1:], np.float64)
+        return np.asarray(self._episode(self.rows[number].episode_id).action[1:], np.float64)
 
-    def _read(self, number: int) -> RecordedStart:
-        position = self._positions[number]
-        episode = self._episodes.episode(position)
-        usable = set(episode.cameras) & set(self._episodes.rows[position].views)
+    def _episode(self, episode_id: str) -> Episode:
+        return self._episodes.episode(self._episodes.position(episode_id))
+
+    def _read(self, episode_id: str, frame: int) -> RecordedStart:
+        position, episode = self._episodes.position(episode_id), self._episode(episode_id)
+        usable = set(episode.cameras) & set(self._rows[episode_id].views)
         views = next((views for views in self._view_sets if set(views) <= usable), None)
         if views is None:
             raise DataError(
@@ -130,10 +177,17 @@ class RecordedStarts:
                 next_step="add its calibration, or start from another recording",
             )  # fmt: skip
         cameras = {view: Camera(episode.cameras[view].K, episode.cameras[view].T_base_camera[0]) for view in views}
-        images = {view: self._episodes.frames(position, view, [0])[0] for view in views}
-        return RecordedStart(
-            episode.episode_id, episode.instruction, images, cameras, np.asarray(episode.action[0], np.float64)
-        )
+        images = {view: self._episodes.frames(position, view, [frame])[0] for view in views}
+        commands = np.asarray(episode.action[: frame + 1], np.float64)
+        return RecordedStart(episode_id, episode.instruction, images, cameras, commands[0], commands[1:])
+
+    def _read_before(self, episode_id: str, frame: int, views: Sequence[str], size: tuple[int, int]) -> dict[str, Any]:
+        position = self._episodes.position(episode_id)
+        video = {view: np.empty((frame, *size, 3), np.uint8) for view in views}
+        for view, pictures in video.items():
+            for numbers in batched(range(frame), 64):  # recordings may be large, and long
+                pictures[list(numbers)] = resized_frames(self._episodes.frames(position, view, numbers), size)
+        return video
 
 
 def read_start(folder: Path, embodiment: Embodiment, views: Sequence[str]) -> RecordedStart:
@@ -173,5 +227,5 @@ def read_start(folder: Path, embodiment: Embodiment, views: Sequence[str]) -> Re
         )
     return RecordedStart(
         folder.name, "", images, {view: Camera(track.K, track.T_base_camera[0]) for view, track in cameras.tracks.items()},
-        np.array([state[name] for name in names], np.float64),
+        np.array([state[name] for name in names], np.float64), np.empty((0, len(names))),
     )  # fmt: skip

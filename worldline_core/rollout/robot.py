@@ -27,12 +27,21 @@ class CommandedRobot:
         start: (b, j) where they are and what was commanded last, in the embodiment's layout. A limit never moves a robot that
             began beyond it.
         limits: hold commands within the embodiment's limits.
+        earlier: commands (n, j) of each clip that were executed since then as they are, whatever the limits.
 
     Attributes:
         command, state: (b, j) of the last frame.
     """
 
-    def __init__(self, kinematics: ArmKinematics, fps: float, start: np.ndarray, *, limits: bool) -> None:
+    def __init__(
+        self,
+        kinematics: ArmKinematics,
+        fps: float,
+        start: np.ndarray,
+        *,
+        limits: bool,
+        earlier: Sequence[np.ndarray] = (),
+    ) -> None:
         embodiment = kinematics.embodiment
         self.command = self.state = start
         self._fastest = np.full(start.shape[1], np.inf)
@@ -40,6 +49,11 @@ class CommandedRobot:
         self._grippers = [embodiment.gripper_column(arm) for arm in embodiment.arms]
         ranges = np.array([sorted((arm.gripper.closed, arm.gripper.open)) for arm in embodiment.arms])
         self._gripper_steps = (ranges[:, 1] - ranges[:, 0]) / (GRIPPER_TRAVEL_S * fps)
+        for clip, commands in enumerate(earlier):
+            if len(commands):
+                moved = self.select([clip]).follow(commands[None])[0]
+                self.command, self.state = self.command.copy(), self.state.copy()
+                self.command[clip], self.state[clip] = moved.command[0], moved.state[0]
         if not limits:
             return
         for arm, gripper_range in zip(embodiment.arms, ranges, strict=True):
@@ -48,7 +62,7 @@ class CommandedRobot:
             self._low[:, gripper], self._high[:, gripper] = gripper_range
             speeds = [SPEED_RAD_S if name in kinematics.revolute else SPEED_M_S for name in arm.joints]
             self._fastest[columns] = np.array(speeds) / fps
-        self._low, self._high = np.minimum(self._low, start), np.maximum(self._high, start)
+        self._low, self._high = np.minimum(self._low, self.command), np.maximum(self._high, self.command)
 
     def follow(self, commands: np.ndarray) -> tuple[CommandedRobot, np.ndarray, np.ndarray]:
         """The robots after finite commands (b, n, j), executed commands (b, n, j) and states (b, n, j); this one stays."""

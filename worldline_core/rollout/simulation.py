@@ -187,7 +187,8 @@ class Starts:
 
     Args:
         images, cameras: by view, of one start or of each; a wrist camera has its pose at the start, or a known mount.
-        state: ``(j)`` or ``(b, j)``, the controls that belong to the images.
+        state: ``(j)`` or ``(b, j)``, the controls that belong to the images, or to the cameras where there are ``earlier`` ones.
+        earlier: commands ``(n, j)`` of each start from there to its images, however many; None: the images are of the state.
 
     Raises:
         DataError: the starts do not fit together, a shape is wrong, a view or a camera is missing, a number is not finite,
@@ -202,6 +203,7 @@ class Starts:
         embodiment: str | Path | ArmKinematics,
         state: np.ndarray,
         seeds: int | Sequence[int],
+        earlier: Sequence[np.ndarray] | None = None,
     ) -> None:
         self.images = [images] if isinstance(images, Mapping) else list(images)
         count = len(self.images)
@@ -211,12 +213,17 @@ class Starts:
         self.kinematics = embodiment if known else ArmKinematics(load_embodiment(embodiment))
         rows = np.atleast_1d(real_numbers(state, "the state at the start"))
         self.state = np.repeat(rows[None], count, axis=0) if rows.ndim == 1 else rows
-        given = {"images": count, "cameras": len(self.cameras), "seeds": len(self.seeds), "state": len(self.state)}
+        none = np.empty((0, rows.shape[-1]))
+        self.earlier = [none] * count if earlier is None else [real_numbers(one, "earlier commands") for one in earlier]
+        given = {name: len(getattr(self, name)) for name in ("images", "cameras", "seeds", "state", "earlier")}
         if count == 0 or len(set(given.values())) > 1:
             raise DataError(
                 "The starts of a simulation do not fit together", expected="one of each per clip", got=given
             )
         check_controls(self.kinematics, self.state, "the state at the start")
+        for clip, commands in enumerate(self.earlier):
+            where = f"earlier commands, clip {clip}"
+            check_controls(self.kinematics, commands, where, COMMAND_TOLERANCE_RAD, COMMAND_OPENING)
         sizes = {image_size(*pair) for pair in zip(self.images, self.cameras, strict=True)}
         if len(sizes) > 1 or len({frozenset(start) for start in self.images}) > 1:
             raise DataError(
@@ -239,7 +246,7 @@ class Starts:
     def select(self, clips: Sequence[int]) -> Starts:
         """The starts of some clips."""
         other = copy(self)
-        for name in ("images", "cameras", "seeds"):
+        for name in ("images", "cameras", "seeds", "earlier"):
             setattr(other, name, [getattr(self, name)[clip] for clip in clips])
         other.state = self.state[list(clips)]
         return other
@@ -274,13 +281,13 @@ class Simulation:
     ) -> None:
         self._session, self._starts, self._maps = session, starts, maps
         self._draws_commands, self.fps = contract.controls == "action", contract.fps
-        self._robot = CommandedRobot(starts.kinematics, self.fps, starts.state, limits=limits)
+        self._robot = CommandedRobot(starts.kinematics, self.fps, starts.state, limits=limits, earlier=starts.earlier)
         self.views, self.image_size, self.frames_per_step = views, image_size, frames
         self.num_frames = 1
         self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in session.observed]
-        self.commands = self.states = starts.state[:, None]
-        self._drawn = starts.state
-        self._tracks = [self._project(clip, starts.state[clip][None]) for clip in range(len(self))]
+        self.commands, self.states = self._robot.command[:, None], self._robot.state[:, None]
+        self._drawn = self._robot.command if self._draws_commands else self._robot.state
+        self._tracks = [self._project(clip, rows[None]) for clip, rows in enumerate(self._drawn)]
 
     def __len__(self) -> int:
         """Number of clips."""

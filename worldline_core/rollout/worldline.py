@@ -184,6 +184,7 @@ class WorldLine:
         state: np.ndarray,
         seed: int | Sequence[int] = 42,
         limits: bool = True,
+        earlier: Sequence[np.ndarray] | None = None,
     ) -> Simulation:
         """A simulation that a policy drives from these images on, step by step.
 
@@ -194,11 +195,13 @@ class WorldLine:
             seed: of the noise, one for all starts or each.
             limits: hold commands within the embodiment's limits before they are drawn. Without, and with commands within
                 them, the bytes are those of :meth:`predict` (of a Stage II model: with ``clip_frames``, 33 if not given).
+            earlier: to begin in the middle of a recording: the commands ``(n, state size)`` of each start from ``state``, to which
+                the cameras' poses belong, to the frame of the images.
 
         Raises:
             DataError, CalibrationError, ConfigError: as :meth:`predict`.
         """
-        starts = Starts(images, cameras, embodiment, state, seed)
+        starts = Starts(images, cameras, embodiment, state, seed, earlier)
         views = self.chosen_views(starts.images[0])
         frames = self.unit(USUAL_CLIP_FRAMES)
         # Rows of the tracks of a step: the start, the last known frame, the new ones.
