@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,14 @@ from gymnasium.vector import SyncVectorEnv
 
 from worldline_core import WorldLine
 from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment import ENVIRONMENT
-from worldline_core.environment.environment import WorldLineEnv, WorldLineVectorEnv
+from worldline_core.environment.environment import WorldLineEnv, WorldLineVectorEnv, shipped_segmenter
+from worldline_core.environment.spaces import RobotSpaces
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.evaluation.policy.measured_judge import soft_score
+from worldline_core.evaluation.recordings import Trajectory
+from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.rollout.recorded_starts import RecordedStarts
 
 ROBOT = "ur5e_silver"
@@ -143,6 +149,129 @@ def test_what_cannot_be_seen_is_no_success(world: WorldLine, starts: RecordedSta
         environment.step(commands(starts, [0], 1)[0][0])
 
 
+def test_episodes_begin_at_named_frames_with_what_came_before(
+    world: WorldLine, shipped: Path, starts: RecordedStarts
+) -> None:
+    """The state is that of the commands so far, the judge sees the whole video, and the episode goes on as it was recorded."""
+    seen: list[Trajectory] = []
+    names, frames = [starts.rows[2].episode_id, starts.rows[0].episode_id], [0, 20]
+    options: dict[str, Any] = {
+        "model": world,
+        "episode_frames": 2,
+        **SHORT,
+        "success": lambda video: seen.append(video),
+    }
+    environment = WorldLineVectorEnv(2, **options)
+    observed, infos = environment.reset(seed=[3, 4], options={"start": names, "frame": frames})
+    assert infos["episode_id"].tolist() == names
+    begun = [starts.at(*chosen) for chosen in zip(names, frames, strict=True)]
+    simulation = world.start(
+        [start.images for start in begun], [start.cameras for start in begun], embodiment=ROBOT, seed=[3, 4],
+        state=np.stack([start.state for start in begun]), earlier=[start.earlier for start in begun],
+    )  # fmt: skip
+    np.testing.assert_allclose(observed["agent_pos"], simulation.state, atol=1e-6)
+    assert all(np.array_equal(observed["pixels"]["head"][slot], simulation.pictures[slot]["head"]) for slot in (0, 1))
+    for _ in range(2):
+        *_, ended, _ = environment.step(simulation.state)
+    assert ended.all()
+    assert [video.num_frames for video in seen] == [3, 23]
+    recorded = starts.before(begun[1], world.image_size)
+    assert all(np.array_equal(seen[1].frames[view][:20], video) for view, video in recorded.items())
+    assert seen[1].points is not None
+    assert len(seen[1].points) == 23
+    assert np.abs(np.diff(seen[1].points, axis=0)).max() < 12  # an arm moves on, it does not jump
+    always = WorldLineEnv(**options, start=names[1], frame=20)
+    assert data_equivalence(always.reset(seed=4)[0]["agent_pos"], observed["agent_pos"][1])
+    assert always.reset(seed=4, options={"frame": 0})[1]["episode_id"] == names[1]
+    assert np.allclose(always.reset()[0]["agent_pos"], observed["agent_pos"][1])  # another seed's noise alone
+    other = next(row.episode_id for row in EpisodeSet.open(shipped / "recordings").rows
+                 if row.embodiment == ROBOT and row.split == "train")  # fmt: skip
+    for asked, said in (
+        ({"start": "nothing"}, r"No recording of this name.*one of ur5e_silver-test.*got: nothing"),
+        ({"start": other}, rf"No recording of this name.*got: {other}, of another split"),
+        ({"start": 0}, r"No recording of this name"),
+        *(({"frame": frame}, rf"No such frame.*0 to 32.*got: {frame}") for frame in (33, 10**6, -1, 1.5, True, "2")),
+        ({"frame": [1, 2, 3]}, r"Not the starts.*where: frame.*one, or 2"),
+        ({"start": names[0], "frmae": 3}, r"Unknown options of a reset.*got: frmae"),
+    ):
+        with pytest.raises(DataError, match=rf"(?s){said}"):
+            environment.reset(seed=0, options=asked)
+    with pytest.raises(DataError, match="No such frame"):
+        WorldLineEnv(**options, start=names[0], frame=33)
+
+
+@pytest.mark.parametrize("robot", ["ur5e_silver", "so101", "panda_ivory", "agibot_g1"])
+def test_normalised_actions_are_the_robots_limits(robot: str) -> None:
+    embodiment = load_embodiment(robot)
+    spaces = RobotSpaces(embodiment, ["head"], (4, 6), flat=True, normalised=True)
+    limits = np.concatenate(
+        [(*arm.limits, tuple(sorted((arm.gripper.closed, arm.gripper.open)))) for arm in embodiment.arms]
+    )
+    ones = np.ones((2, embodiment.state_size))
+    for action, expected in ((-1, limits[:, 0]), (1, limits[:, 1]), (0, limits.mean(axis=1))):
+        np.testing.assert_array_equal(spaces.commands(action * ones, 2), np.stack([expected, expected]))
+    assert (spaces.action.low.tolist(), spaces.action.high.tolist()) == (list(-ones[0]), list(ones[0]))
+    drawn = spaces.action.sample()
+    np.testing.assert_array_equal(spaces.actions(spaces.commands(drawn)), drawn)
+    units = RobotSpaces(embodiment, ["head"], (4, 6), flat=True, normalised=False)
+    np.testing.assert_array_equal(units.actions(units.commands(drawn)), drawn)
+    for beyond in (1.01, -3.0):
+        with pytest.raises(DataError, match=rf"(?s)out of range.*{embodiment.state_names[0]}.*-1 to 1.*clip"):
+            spaces.commands(beyond * ones[0])
+    free = embodiment.arms[0].model_copy(update={"limits": ((-np.inf, np.inf), *embodiment.arms[0].limits[1:])})
+    turning = embodiment.model_copy(update={"arms": (free, *embodiment.arms[1:])})
+    with pytest.raises(ConfigError, match=rf"(?s)without limits.*{embodiment.state_names[0]}"):
+        RobotSpaces(turning, ["head"], (4, 6), flat=True, normalised=True)
+    RobotSpaces(turning, ["head"], (4, 6), flat=True, normalised=False)
+
+
+def test_normalised_actions_and_flat_observations_change_the_form_alone(
+    world: WorldLine, starts: RecordedStarts
+) -> None:
+    plain = WorldLineEnv(model=world, episode_frames=2, **SHORT)
+    flat = WorldLineEnv(model=world, episode_frames=2, flat_observation=True, normalised_actions=True, **SHORT)
+    for one in (plain, flat):
+        one.reset(seed=0)
+    for command in commands(starts, [0], 2)[:, 0]:
+        observed, given = plain.step(command)[0], flat.step(flat.spaces.actions(command))[0]
+    assert list(given) == [*observed["pixels"], "agent_pos"]
+    assert flat.observation_space.contains(given)
+    np.testing.assert_allclose(given["agent_pos"], observed["agent_pos"], atol=1e-5)
+    assert all(np.array_equal(given[view], picture) for view, picture in observed["pixels"].items())
+
+
+def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLine, starts: RecordedStarts) -> None:
+    numbers = [0, 3, 4]  # a drawer that is closed, a button that is pressed, one that is not lifted
+    environment = WorldLineVectorEnv(3, model=world, episode_frames=32, reward="soft", **SHORT)
+    _, infos = environment.reset(seed=numbers)
+    scores, sums = [infos["score"]], np.zeros(3)
+    assert set(environment.infos()[1]["task_state"]) == {"growth"}
+    for number, command in enumerate(commands(starts, numbers, 32), start=1):
+        _, rewards, _, _, infos = environment.step(command)
+        assert rewards.any() == (number % 16 == 0)
+        np.testing.assert_allclose(rewards, infos["score"] - scores[-1])
+        scores.append(infos["score"])
+        sums += rewards
+    np.testing.assert_allclose(sums, scores[-1] - scores[0])
+    assert (scores[0] < 0.1).all()
+    assert [starts.rows[number].outcome for number in numbers] == ["success", "success", "failure"]
+    assert (sums > 0.8).tolist() == [True, True, False]
+    later = environment.reset(seed=numbers, options={"frame": 30})[1]
+    assert (later["score"] > 0.8).tolist() == [True, True, False]
+    segmenter = shipped_segmenter()
+    video = environment._episodes[0].video
+    dark: Any = {view: np.concatenate([frames[:20], 0 * frames[:11]]) for view, frames in video.frames.items()}
+    for instruction in (
+        "lift the green drawer",
+        "place the green drawer on the blue pad",
+    ):  # hiding a thing gains nothing
+        score, facts = soft_score(segmenter, replace(video, instruction=instruction, frames=dark, points=None))
+        assert score < 0.1
+        assert np.isnan(list(facts.values())).any()
+    with pytest.raises(DataError, match=r"(?s)no soft score.*named by its colour.*got: 'tidy up'"):
+        soft_score(segmenter, replace(video, instruction="tidy up"))
+
+
 @pytest.mark.slow
 def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> None:
     """Replayed in the environment, recorded episodes end as they did: 8 of the 10 first ones at least."""
@@ -177,7 +306,7 @@ def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: RecordedStar
     for seed in (np.int64(0), np.array([0, 1]), [0, np.int64(1)]):  # a zero of NumPy counted as no seed
         _, infos = environment.reset(seed=seed)  # type: ignore[arg-type]
         assert infos["episode_id"].tolist() == [starts[number].episode_id for number in (0, 1)]
-    for change in ({"num_envs": -1}, {"episode_frames": 2.5}, {"success": "measurd"}):
+    for change in ({"num_envs": -1}, {"episode_frames": 2.5}, {"success": "measurd"}, {"reward": "sotf"}):
         with pytest.raises(ConfigError, match="Not an environment"):
             WorldLineVectorEnv(**{"num_envs": 2, "model": world, **SHORT, **change})
     for fps, reason in ((8.0, "of another split"), (10.0, "of another rate")):

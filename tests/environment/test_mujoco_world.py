@@ -17,6 +17,8 @@ from gymnasium.utils.env_checker import check_env
 
 pytest.importorskip("mujoco")
 
+from worldline_core import WorldLine
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment import MUJOCO_ENVIRONMENT
 from worldline_core.environment.environment import WorldLineEnv
@@ -107,13 +109,76 @@ def test_pictures_are_new_at_every_step_unless_told_otherwise(
     assert changed == [False, False, False, True, False]
 
 
-def test_it_is_an_environment_with_the_spaces_of_the_simulator(world: MujocoEnv) -> None:
+def test_both_worlds_begin_alike_at_any_frame_and_score_alike(world: MujocoEnv, shipped: Path) -> None:
+    """In MuJoCo the things have moved as they did when it was recorded; commands are held within the same limits."""
+    recordings = EpisodeSet.open(shipped / "recordings")
+    name, frame = world.starts.rows[0].episode_id, 20
+    options: dict[str, Any] = {
+        "start": name,
+        "frame": frame,
+        "reward": "soft",
+        "normalised_actions": True,
+        "observe_every": 2,
+    }
+    twin = MujocoEnv(embodiment=ROBOT, episode_frames=4, **options)
+    inside = WorldLineEnv(embodiment=ROBOT, success=None, episode_frames=4, **options)
+    episode = recordings.episode(recordings.position(name))
+    begun = [one.reset(seed=5) for one in (twin, inside)]
+    np.testing.assert_allclose(begun[0][0]["agent_pos"], episode.state[frame], atol=1e-5)
+    np.testing.assert_allclose(begun[1][0]["agent_pos"], episode.action[frame], atol=1e-5)
+    for view, picture in begun[0][0]["pixels"].items():
+        recorded = np.empty_like(picture)
+        resize_frame(recordings.frames(recordings.position(name), view, [frame])[0], picture.shape[:2], out=recorded)
+        assert np.abs(recorded.astype(int) - picture).mean() < 2.5
+    assert begun[0][1]["score"] == pytest.approx(begun[1][1]["score"], abs=0.1)
+    assert begun[0][1]["task_state"].keys() == begun[1][1]["task_state"].keys()
+    rewards = []
+    for command in episode.action[frame + 1 : frame + 5]:
+        _, reward, ended, truncated, info = twin.step(twin.spaces.actions(command))
+        rewards.append(reward)
+    np.testing.assert_allclose(
+        twin._data.qpos[twin._recorder.scene.arms[0].qpos], episode.state[frame + 4][:6], atol=1e-4
+    )
+    assert (rewards[0], rewards[2], ended or truncated) == (0.0, 0.0, True)
+    assert sum(rewards) == pytest.approx(info["score"] - begun[0][1]["score"])
+    far = np.clip(episode.action[frame] + 2.0, twin.spaces._low, twin.spaces._high)
+    for one in (twin, inside):
+        one.reset(seed=5)
+        one.step(one.spaces.actions(far))
+    np.testing.assert_allclose(twin._robot.command, inside.vector._running.simulation.follow(
+        inside.spaces.commands(inside.spaces.actions(far))[None, None])[0][:, -1], atol=1e-9)  # fmt: skip
+    for asked, said in (({"frame": 33}, "No such frame"), ({"start": "x"}, "No recording of this name")):
+        with pytest.raises(DataError, match=said):
+            twin.reset(options=asked)
+    with pytest.raises(ConfigError, match="reward sotf"):
+        MujocoEnv(embodiment=ROBOT, reward="sotf")  # type: ignore[arg-type]
+    twin.close()
+
+
+def test_it_is_an_environment_with_the_spaces_of_the_simulator(world: MujocoEnv, shipped: Path) -> None:
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         check_env(world)
     assert not [str(one.message) for one in found if "symmetric and normalized space" not in str(one.message)]
-    inside = WorldLineEnv(embodiment=ROBOT, success=None)
-    assert (world.action_space, world.observation_space) == (inside.action_space, inside.observation_space)
+    model = WorldLine.from_pretrained(shipped / "models" / "causal")
+    options: dict[str, Any]
+    for options in (
+        {},
+        {"flat_observation": True},
+        {"normalised_actions": True, "views": VIEWS[::-1]},
+        {
+            "flat_observation": True,
+            "normalised_actions": True,
+            "limits": False,
+            "observe_every": 8,
+            "episode_frames": 16,
+        },
+    ):
+        twin, inside = (
+            MujocoEnv(embodiment=ROBOT, **options),
+            WorldLineEnv(model=model, embodiment=ROBOT, success=None, **options),
+        )
+        assert (twin.action_space, twin.observation_space) == (inside.action_space, inside.observation_space)
     world.reset(seed=0)
     with pytest.raises(DataError, match=r"finite \(14,\): left/shoulder"):
         world.step(np.zeros(13))

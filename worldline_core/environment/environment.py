@@ -7,30 +7,34 @@ smaller number the block is also predicted from what was commanded so far, the l
 there are more (``frames_per_step / observe_every`` times the work). Between two observations the pictures stay; the state of the
 robot (``agent_pos``) is new at every step.
 
-Episodes begin at recorded first frames: a seed ``s`` at start ``s`` modulo their number, with noise of seed ``s``. They end after
+Episodes begin at recorded first frames: a seed ``s`` at start ``s`` modulo their number, with noise of seed ``s``; or at any frame of
+a recording that is named, with what happened before it: the robot's motion, and the video so far. They end after
 ``episode_frames`` steps, where a judge looks at the whole video: ``is_success``, and a reward of 1. What the judge cannot see is no
-success.
+success. The soft reward comes with every new picture instead: what it adds to the likelihood that the task is done, so that an
+episode's sum is the likelihood at its end less that at its beginning.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from worldline_core.environment.spaces import RobotSpaces, each_seed, each_start
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.policy.judge import judge_trajectory
-from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
-from worldline_core.evaluation.recordings import Trajectory, simulated_points
-from worldline_core.evaluation.segmenters.segmenter import open_segmenter
-from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, Embodiment, load_embodiment
+from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge, soft_score
+from worldline_core.evaluation.recordings import Trajectory, shown_points, simulated_points
+from worldline_core.evaluation.segmenters.segmenter import Segmenter, open_segmenter
+from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.rollout.observation import project_controls
 from worldline_core.rollout.recorded_starts import RecordedStart, RecordedStarts
 from worldline_core.rollout.simulation import Frames, Simulation
 from worldline_core.rollout.worldline import WorldLine
@@ -40,10 +44,17 @@ Success = Callable[[Trajectory], bool | None]
 """True for a video that shows its task done; None where that cannot be seen."""
 
 
+Reward = Literal["success", "soft"]
+
+
+def shipped_segmenter() -> Segmenter:
+    """The segmenter that the measured judge uses here."""
+    return open_segmenter("learned", learned=shipped_folder() / "models" / "segmenter", sam3=None)
+
+
 def measured_success() -> Success:
     """The measured judge with the shipped segmenter: it tracks the thing that the instruction names by its colour."""
-    segmenter = open_segmenter("learned", learned=shipped_folder() / "models" / "segmenter", sam3=None)
-    judge = MeasuredEvidenceJudge(segmenter)
+    judge = MeasuredEvidenceJudge(shipped_segmenter())
     return lambda trajectory: judge_trajectory(judge, trajectory).success
 
 
@@ -84,70 +95,35 @@ class CommandedSimulation:
 
 @dataclass
 class RunningEpisode:
-    """One running episode: its start, its video so far, the tools in the head view, the newest picture, and the robot's state."""
+    """One running episode: its video up to the last whole block, the newest picture, the robot's state, and the last reward."""
 
     start: RecordedStart
-    video: dict[str, list[np.ndarray]]
-    points: list[np.ndarray]
+    video: Trajectory
     picture: dict[str, np.ndarray]
     state: np.ndarray
     success: bool = False
+    reward: float = 0.0
+    score: float = 0.0
+    facts: dict[str, float] = field(default_factory=dict)
 
-    def trajectory(self, fps: float) -> Trajectory:
-        """The video so far, as a judge sees it."""
-        video: dict[str, Any] = {view: np.concatenate(pieces) for view, pieces in self.video.items()}
-        return Trajectory(self.start.instruction, video, fps, np.concatenate(self.points))
+    def info(self) -> dict[str, Any]:
+        """What Gymnasium calls info."""
+        known = {"is_success": self.success, "episode_id": self.start.episode_id, "task": self.start.instruction}
+        return known | ({"score": self.score, "task_state": dict(self.facts)} if self.facts else {})
 
-
-def each_seed(given: int | Sequence[int | None] | None, count: int) -> list[int | None]:
-    """A seed for each of ``count`` episodes: those given, or counted up from the one given, or None for each.
-
-    Raises: DataError when ``given`` has another number of seeds, or something that is no seed.
-    """
-    if isinstance(given, int | np.integer):
-        given = [int(given) + number for number in range(count)]
-    seeds: list[int | None] = [None] * count
-    if given is not None:
-        seeds = list(given) if isinstance(given, Sequence | np.ndarray) else []
-    known = [seed for seed in seeds if seed is not None]
-    if len(seeds) != count or not all(isinstance(seed, int | np.integer) and 0 <= seed < 2**63 for seed in known):
-        raise DataError("Not the seeds of the episodes", expected=f"one, or {count}, from 0 to 2^63 - 1", got=given)
-    return seeds
+    def look(self, segmenter: Segmenter, video: Trajectory) -> None:
+        """Measure how far the task is in the video so far; the reward is the change."""
+        before = self.score
+        self.score, self.facts = soft_score(segmenter, video)
+        self.reward = self.score - before
 
 
-def robot_spaces(
-    robot: Embodiment, views: Sequence[str], image_size: tuple[int, int]
-) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Dict]:
-    """Commands of a robot, and observations of it: pictures ``uint8 (H, W, 3)`` by view, and its state."""
-    low, high = (np.full(robot.state_size, bound, np.float32) for bound in (-np.inf, np.inf))
-    for arm in robot.arms:
-        low[robot.joint_columns(arm)], high[robot.joint_columns(arm)] = np.array(arm.limits, np.float32).T
-        column = robot.gripper_column(arm)
-        low[column], high[column] = sorted((arm.gripper.closed, arm.gripper.open))
-    picture = gymnasium.spaces.Box(0, 255, (*image_size, 3), np.uint8)
-    # A recording may begin a little beyond a limit, and stays where it is.
-    state = gymnasium.spaces.Box(low - LIMIT_TOLERANCE_RAD, high + LIMIT_TOLERANCE_RAD, dtype=np.float32)
-    seen = gymnasium.spaces.Dict({"pixels": gymnasium.spaces.Dict(dict.fromkeys(views, picture)), "agent_pos": state})
-    return gymnasium.spaces.Box(low, high, dtype=np.float32), seen
-
-
-def checked_commands(actions: Any, shape: tuple[int, ...] | None, robot: Embodiment) -> np.ndarray:
-    """Commands of one step as float64.
-
-    Raises: DataError: they have another shape or are not finite.
-    """
-    try:
-        given = np.asarray(actions)
-    except ValueError:  # rows of different lengths
-        given = np.empty(0)
-    numbers = given.dtype.kind in "fiu" and given.shape == shape
-    if not numbers or not np.isfinite(commands := given.astype(np.float64)).all():
-        raise DataError(
-            "Not the commands of one step",
-            expected=f"finite {shape}: {', '.join(robot.state_names)}",
-            got="numbers that are not finite" if numbers else f"{given.dtype} {given.shape}",
-        )
-    return commands
+def longer(video: Trajectory, clip: Mapping[str, np.ndarray], points: np.ndarray | None) -> Trajectory:
+    """A video that goes on with a clip, and the tools in its head view where they are known."""
+    seen: Any = video.frames
+    frames: dict[str, Any] = {view: np.concatenate((seen[view], more)) for view, more in clip.items()}
+    known = None if video.points is None or points is None else np.concatenate((video.points, points))
+    return Trajectory(video.instruction, frames, video.fps, known)
 
 
 class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
@@ -161,13 +137,18 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         episode_frames: steps of an episode.
         observe_every: steps between two observations of pictures, a divisor of the block's length; by default the block.
         success: "measured" (`measured_success`), a function, or None: then nothing is a success.
+        reward: "success", 1 at the end of an episode that is one; or "soft", at every new picture what it adds to the likelihood
+            that the task is done (`soft_score`); then infos have this likelihood (``score``) and what is measured (``task_state``).
+        start, frame: name of a recording and number of a frame at which every episode begins; a reset's ``options`` may name others.
+        flat_observation: one level of keys, the views and ``agent_pos``.
+        normalised_actions: -1 to 1 from one limit of a joint or gripper to the other (`RobotSpaces`).
         limits: as of ``WorldLine.start``.
         autoreset: begin new episodes at the step after the last one, as Gymnasium's "NextStep"; False: ``reset`` is needed.
         options: further arguments of ``WorldLine.from_pretrained``.
 
     Raises:
         ConfigError: ``observe_every`` does not divide the block, or a number is not positive.
-        DataError: no recording fits.
+        DataError: no recording fits, or there is no such start or frame.
     """
 
     def __init__(
@@ -182,16 +163,23 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         episode_frames: int = 32,
         observe_every: int | None = None,
         success: Literal["measured"] | Success | None = "measured",
+        reward: Reward = "success",
+        start: str | None = None,
+        frame: int = 0,
+        flat_observation: bool = False,
+        normalised_actions: bool = False,
         limits: bool = True,
         autoreset: bool = True,
         render_mode: Literal["rgb_array"] | None = "rgb_array",
         **options: Any,
     ) -> None:
         counted = all(isinstance(number, int) and number > 0 for number in (num_envs, episode_frames))
-        if not counted or not (success in ("measured", None) or callable(success)):
+        judged = (success in ("measured", None) or callable(success)) and reward in get_args(Reward)
+        if not counted or not judged:
             raise ConfigError(
-                "Not an environment", got=f"num_envs {num_envs}, episode_frames {episode_frames}, success {success}",
-                expected="at least one environment and frame; success: measured, a function, or None",
+                "Not an environment",
+                got=f"num_envs {num_envs}, episode_frames {episode_frames}, success {success}, reward {reward}",
+                expected="at least one environment and frame; success: measured, a function, or None; reward: success or soft",
             )  # fmt: skip
         shipped = shipped_folder()
         self.world = (
@@ -208,6 +196,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         self.num_envs, self.episode_frames = num_envs, episode_frames
         self._limits, self._autoreset = limits, autoreset
         self._succeeds = measured_success() if success == "measured" else success
+        self._segmenter = shipped_segmenter() if reward == "soft" else None
+        self._usual_start = start, frame
         self.render_mode = render_mode
         self.metadata = {
             "render_modes": ["rgb_array"], "render_fps": round(self.world.contract.fps),
@@ -215,7 +205,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         }  # fmt: skip
         self._random = [np.random.default_rng() for _ in range(num_envs)]
         self._episodes: list[RunningEpisode] = []
-        self._running = self._begun([0])
+        self._running = self._begun([0], self._chosen([0], each_start(None, self._usual_start, 1)))
         self.frames_per_step = self._running.simulation.frames_per_step
         self.observe_every = observe_every or self.frames_per_step
         if self.observe_every < 1 or self.frames_per_step % self.observe_every:
@@ -223,9 +213,11 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                 "observe_every does not divide a block of the model",
                 expected=f"observe_every a divisor of {self.frames_per_step}", got=f"observe_every {self.observe_every}",
             )  # fmt: skip
-        self.single_action_space, self.single_observation_space = robot_spaces(
-            self.kinematics.embodiment, self.views, self.world.image_size
-        )
+        self.spaces = RobotSpaces(
+            self.kinematics.embodiment, self.views, self.world.image_size, flat=flat_observation,
+            normalised=normalised_actions,
+        )  # fmt: skip
+        self.single_action_space, self.single_observation_space = self.spaces.action, self.spaces.observation
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
@@ -234,9 +226,12 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin new episodes, at the starts of the seeds (an integer counts up), or else at drawn ones.
 
-        Raises: DataError: other seeds than one, or one for each.
+        Args:
+            options: ``start``, a recording's name, and ``frame``, the number of one of its frames; one for all, or a list.
+
+        Raises: DataError: other seeds or options than one, or one for each; there is no such recording or frame.
         """
-        self._begin(each_seed(seed, self.num_envs))
+        self._begin(each_seed(seed, self.num_envs), each_start(options, self._usual_start, self.num_envs))
         return self._observation(), self._infos()
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -244,17 +239,18 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
         Raises: DataError: the commands have another shape or are not finite, or the episodes have ended or not begun.
         """
-        commands = checked_commands(actions, self.action_space.shape, self.kinematics.embodiment)
+        commands = self.spaces.commands(actions, self.num_envs)
         over = self._running.age == self.episode_frames
         if not self._episodes or (over and not self._autoreset):
             raise DataError("An episode has ended or not begun", next_step="call reset first")
         if over:
-            self._begin([None] * self.num_envs)
+            self._begin([None] * self.num_envs, each_start(None, self._usual_start, self.num_envs))
         else:
             self._advance(commands)
         last = self._running.age == self.episode_frames
         success = np.array([episode.success for episode in self._episodes])
-        return self._observation(), success.astype(np.float64), success, last & ~success, self._infos()
+        rewards = np.array([episode.reward for episode in self._episodes])
+        return self._observation(), rewards, success, last & ~success, self._infos()
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Latest picture of each episode, its views side by side, ``uint8 (H, views * W, 3)``."""
@@ -278,72 +274,93 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         """An attribute of every environment."""
         return self.call(name)
 
-    def _begun(self, seeds: Sequence[int]) -> CommandedSimulation:
-        starts = [self.starts[seed % len(self.starts)] for seed in seeds]
+    def _chosen(self, seeds: Sequence[int], asked: Sequence[tuple[str | None, int]]) -> list[RecordedStart]:
+        """The start of each episode: the one that is asked for, or that of its seed."""
+        numbered = (self.starts.rows[seed % len(self.starts)].episode_id for seed in seeds)
+        pairs = zip(numbered, asked, strict=True)
+        return [self.starts.at(own if name is None else name, frame) for own, (name, frame) in pairs]
+
+    def _begun(self, seeds: Sequence[int], starts: Sequence[RecordedStart]) -> CommandedSimulation:
         return CommandedSimulation(
             self.world.start(
                 [start.images for start in starts], [start.cameras for start in starts], embodiment=self.kinematics,
                 state=np.stack([start.state for start in starts]), seed=seeds, limits=self._limits,
+                earlier=[start.earlier for start in starts],
             )
         )  # fmt: skip
 
-    def _begin(self, given: Sequence[int | None]) -> None:
-        """Start at the given seeds; where there is none, at one drawn by the episode's generator."""
-        seeds: list[int] = []
+    def _begin(self, given: Sequence[int | None], asked: Sequence[tuple[str | None, int]]) -> None:
+        """Start with the given seeds, where there is none with one drawn by the episode's generator."""
         for slot, seed in enumerate(given):
             if seed is not None:
                 self._random[slot] = np.random.default_rng(seed)
-            seeds.append(int(self._random[slot].integers(2**31)) if seed is None else int(seed))
-        self._running = self._begun(seeds)
+        seeds = [int(self._random[slot].integers(2**31) if seed is None else seed) for slot, seed in enumerate(given)]
+        starts = self._chosen(seeds, asked)
+        self._running = self._begun(seeds, starts)
         simulation = self._running.simulation
         self._episodes = [
             RunningEpisode(
-                self.starts[seed % len(self.starts)], {view: [frame[None]] for view, frame in picture.items()},
-                [simulated_points(simulation, slot)], picture, simulation.state[slot],
+                start, self._video_so_far(start, picture, simulated_points(simulation, slot)), picture,
+                simulation.state[slot],
             )
-            for slot, (seed, picture) in enumerate(zip(seeds, simulation.pictures, strict=True))
+            for slot, (start, picture) in enumerate(zip(starts, simulation.pictures, strict=True))
         ]  # fmt: skip
+        if self._segmenter is not None:
+            for episode in self._episodes:
+                episode.look(self._segmenter, episode.video)
+                episode.reward = 0.0
+
+    def _video_so_far(self, start: RecordedStart, picture: dict[str, np.ndarray], points: np.ndarray) -> Trajectory:
+        """The picture, as the model sees it, and where a judge will look at it, what was recorded before."""
+        size, fps = self.world.image_size, self.world.contract.fps
+        frames: dict[str, Any] = {view: seen[None] for view, seen in picture.items()}
+        if not len(start.earlier) or (self._succeeds is None and self._segmenter is None):
+            return Trajectory(start.instruction, frames, fps, points)
+        shown = next(iter(start.images.values())).shape[:2]
+        tracks = project_controls(start.cameras, shown, self.kinematics, controls=start.commands[:-1], fps=fps)
+        before = Trajectory(start.instruction, self.starts.before(start, size), fps, shown_points(tracks, size))
+        return longer(before, frames, points)
 
     def _advance(self, commands: np.ndarray) -> None:
         """Take one command for each episode; predict and judge when it is time."""
         running = self._running
         for episode, state in zip(self._episodes, running.take(commands)[1], strict=True):
-            episode.state = state
+            episode.state, episode.reward = state, 0.0
         count, last = len(running.commands), running.age == self.episode_frames
         if not last and count % self.observe_every:
             return
         simulation, clips = running.predict()
         for slot, (episode, clip) in enumerate(zip(self._episodes, clips, strict=True)):
             episode.picture = {view: video[-1] for view, video in clip.items()}
-            if last or count == self.frames_per_step:
-                for view, video in clip.items():
-                    episode.video[view].append(video)
-                episode.points.append(simulated_points(simulation, slot)[:count])
+            video = longer(episode.video, clip, simulated_points(simulation, slot)[:count])
+            if count == self.frames_per_step:
+                episode.video = video
             if last and self._succeeds is not None:
-                found = self._succeeds(episode.trajectory(self.world.contract.fps))
+                found = self._succeeds(video)
                 if not isinstance(found, bool | np.bool_ | None):
                     raise DataError("Not a judgement", where="success", expected="True, False or None", got=found)
                 episode.success = bool(found)
+            episode.reward = float(episode.success)
+            if self._segmenter is not None:
+                episode.look(self._segmenter, video)
 
     def _observed(self, slot: int) -> dict[str, Any]:
         episode = self._episodes[slot]
-        pictures = {view: episode.picture[view].copy() for view in self.views}
-        return {"pixels": pictures, "agent_pos": episode.state.astype(np.float32)}
+        return self.spaces.observed({view: episode.picture[view].copy() for view in self.views}, episode.state)
 
     def _observation(self) -> dict[str, Any]:
-        each = [self._observed(slot) for slot in range(self.num_envs)]
-        pictures = {view: np.stack([one["pixels"][view] for one in each]) for view in self.views}
-        return {"pixels": pictures, "agent_pos": np.stack([one["agent_pos"] for one in each])}
+        episodes = self._episodes
+        pictures = {view: np.stack([episode.picture[view] for episode in episodes]) for view in self.views}
+        return self.spaces.observed(pictures, np.stack([episode.state for episode in episodes]))
 
-    def _info(self, slot: int) -> dict[str, Any]:
-        episode = self._episodes[slot]
-        start = episode.start
-        return {"is_success": episode.success, "episode_id": start.episode_id, "task": start.instruction}
+    def infos(self) -> list[dict[str, Any]]:
+        """What is known of each episode now."""
+        return [episode.info() for episode in self._episodes]
 
     def _infos(self) -> dict[str, Any]:
         gathered: dict[str, Any] = {}
-        for slot in range(self.num_envs):
-            gathered = self._add_info(gathered, self._info(slot), slot)
+        for slot, info in enumerate(self.infos()):
+            gathered = self._add_info(gathered, info, slot)
         return gathered
 
 
@@ -356,22 +373,22 @@ class WorldLineEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.vector = WorldLineVectorEnv(1, render_mode=render_mode, autoreset=False, **options)
         self.render_mode = render_mode
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": self.vector.metadata["render_fps"]}
-        self.action_space = self.vector.single_action_space
-        self.observation_space = self.vector.single_observation_space
+        self.spaces = self.vector.spaces
+        self.action_space, self.observation_space = self.spaces.action, self.spaces.observation
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode: at start ``seed`` modulo their number, or at a drawn one."""
+        """Begin an episode: at start ``seed`` modulo their number, at a drawn one, or at the one named by the options."""
         super().reset(seed=seed)
         chosen = int(self.np_random.integers(2**31)) if seed is None else seed
-        self.vector.reset(seed=[chosen])
-        return self.vector._observed(0), self.vector._info(0)
+        self.vector.reset(seed=[chosen], options=options)
+        return self.vector._observed(0), self.vector.infos()[0]
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One command."""
         _, reward, terminated, truncated, _ = self.vector.step(np.asarray(action)[None])
-        observed, info = self.vector._observed(0), self.vector._info(0)
+        observed, info = self.vector._observed(0), self.vector.infos()[0]
         return observed, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> np.ndarray | None:

@@ -1,7 +1,7 @@
 """The recorder's MuJoCo world as an environment: what the simulator predicts is here computed by physics.
 
-Starts, observations, actions, rate and length are those of ``WorldLineEnv`` with the same recordings, so that a policy can be
-tried in both from the same starts (``benchmarks/policies_inside.py``). Pictures are new at every step by default, and
+Starts, observations, actions, limits, rate, length and soft reward are those of ``WorldLineEnv`` with the same recordings, so that a
+policy can be tried in both from the same starts (``benchmarks/policies_inside.py``). Pictures are new at every step by default, and
 success is read from the simulated things. Recordings do not hold where things stand: each start is drawn again by the configuration in their
 manifest. Needs the extras ``sim`` and ``gym``.
 """
@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
@@ -21,10 +22,13 @@ from worldline_core.config import validate
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.environment.environment import checked_commands, robot_spaces
+from worldline_core.environment.environment import Reward, RunningEpisode, longer, shipped_segmenter
+from worldline_core.environment.spaces import RobotSpaces, each_start
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.geometry.embodiment import load_embodiment
-from worldline_core.model.tokenizers import resize_frame
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.model.tokenizers import resized_frames
 from worldline_core.recorder.attempts import RecordPoliciesConfig
 from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.record import RecordConfig, plan_jobs
@@ -38,7 +42,8 @@ from worldline_core.recorder.simulate import (
     place_arms,
     read_state,
 )
-from worldline_core.rollout.recorded_starts import RecordedStarts
+from worldline_core.rollout.recorded_starts import RecordedStart, RecordedStarts
+from worldline_core.rollout.robot import CommandedRobot
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.artifact_files import MANIFEST_NAME, read_manifest
 
@@ -49,13 +54,15 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     Args:
         recordings: written by ``worldline record`` (episodes, or policies), whose first frames are the starts; by default the
             shipped ones.
-        embodiment, splits, views, episode_frames: as of ``WorldLineVectorEnv``.
+        embodiment, splits, episode_frames, reward, start, frame, flat_observation, normalised_actions, limits: as of
+            ``WorldLineVectorEnv``; the soft reward is what the judge sees of MuJoCo's pictures.
+        views: that are rendered; by default all.
         image_size: (H, W) of the pictures; the shipped models'.
-        observe_every: steps between two pictures.
+        observe_every: steps between two pictures; by default 1.
 
     Raises:
-        ConfigError: ``episode_frames`` or ``observe_every`` is not positive.
-        DataError: the recordings are not the recorder's, or none fits.
+        ConfigError: ``episode_frames`` or ``observe_every`` is not positive, or there is no such reward.
+        DataError: the recordings are not the recorder's, none fits, or there is no such start or frame.
         UnavailableError: MuJoCo is not installed.
     """
 
@@ -67,16 +74,23 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         *,
         embodiment: str | None = None,
         splits: Sequence[str] = ("test",),
-        views: Sequence[str] = VIEWS,
+        views: Sequence[str] | None = None,
         image_size: tuple[int, int] = (64, 96),
         episode_frames: int = 32,
-        observe_every: int = 1,
+        observe_every: int | None = None,
+        reward: Reward = "success",
+        start: str | None = None,
+        frame: int = 0,
+        flat_observation: bool = False,
+        normalised_actions: bool = False,
+        limits: bool = True,
         render_mode: Literal["rgb_array"] | None = "rgb_array",
     ) -> None:
-        if min(episode_frames, observe_every) < 1:
+        views, observe_every = VIEWS if views is None else views, 1 if observe_every is None else observe_every
+        if min(episode_frames, observe_every) < 1 or reward not in get_args(Reward):
             raise ConfigError(
-                "Not an environment", expected="episode_frames and observe_every of at least 1",
-                got=f"episode_frames {episode_frames}, observe_every {observe_every}",
+                "Not an environment", expected="episode_frames and observe_every of at least 1; reward: success or soft",
+                got=f"episode_frames {episode_frames}, observe_every {observe_every}, reward {reward}",
             )  # fmt: skip
         prepare_rendering()
         folder = Path(recordings or shipped_folder() / "recordings")
@@ -84,14 +98,22 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.views, self.image_size, self.render_mode = tuple(views), image_size, render_mode
         self._max_episode_steps, self._observe_every = episode_frames, observe_every
         self.robot = load_embodiment(self.starts.embodiment)
-        self.action_space, self.observation_space = robot_spaces(self.robot, self.views, image_size)
+        self.spaces = RobotSpaces(
+            self.robot, self.views, image_size, flat=flat_observation, normalised=normalised_actions
+        )
+        self.action_space, self.observation_space = self.spaces.action, self.spaces.observation
+        self._kinematics, self._limits = ArmKinematics(self.robot), limits
+        self._segmenter = shipped_segmenter() if reward == "soft" else None
+        self._usual_start = start, frame
+        if start is not None:
+            self.starts.at(start, frame)  # refuses what is not there before an episode begins
         self._recorder = EpisodeRecorder(self.starts.embodiment)
         self._data = self._recorder.new_data()
         self._recipe = _recipe(folder)
         # Drawing a start again tries every policy that recorded it.
-        self._drawn = lru_cache(maxsize=1024)(lambda number: self._recipe(self._recorder, self.starts.rows[number]))
+        self._drawn = lru_cache(maxsize=1024)(lambda name: self._recipe(self._recorder, self.starts.row(name)))
         self.task = self.task_description = ""
-        self._qpos: list[np.ndarray] = []
+        self._left = 0  # steps of the running episode
 
     def close(self) -> None:
         """Give the renderers back; software OpenGL needs it."""
@@ -100,25 +122,40 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode: at start ``seed`` modulo their number, or at a drawn one.
+        """Begin an episode: at start ``seed`` modulo their number, at a drawn one, or at the one named by the options.
 
-        Raises: DataError where the drawn start is not the recorded one.
+        Raises: DataError where there is no such start, or the drawn start is not the recorded one.
         """
         super().reset(seed=seed)
         number = (int(self.np_random.integers(2**31)) if seed is None else seed) % len(self.starts)
-        self._start, (self._layout, self._scene, self._jitter, first) = self.starts[number], self._drawn(number)
-        self.task = self.task_description = self._start.instruction
-        if self._layout.instruction != self._start.instruction or not np.allclose(first, self._start.state, atol=1e-4):
-            raise DataError(
-                "A start cannot be drawn again as it was recorded", where=f"episode {self._start.episode_id}",
-                expected=f"{self._start.instruction}, {self._start.state}", got=f"{self._layout.instruction}, {first}",
-                next_step="record the starts with this version of the project and of MuJoCo",
-            )  # fmt: skip
-        scene = self._recorder.scene
+        ((name, frame),) = each_start(options, self._usual_start, 1)
+        start = self.starts.at(self.starts.rows[number].episode_id if name is None else name, frame)
+        self._layout, self._scene, self._jitter, first = self._drawn(start.episode_id)
+        self.task = self.task_description = start.instruction
+        if self._layout.instruction != start.instruction or not np.allclose(first, start.state, atol=1e-4):
+            raise _drawn_otherwise(start, f"{start.instruction}, {start.state}", f"{self._layout.instruction}, {first}")
+        scene, targets = self._recorder.scene, motor_targets(self._recorder.scene, start.commands)
         apply_layout(scene, self._data, self._layout)
-        place_arms(scene, self._data, self._start.state)
-        self._target = motor_targets(scene, self._start.state[None])[0]
-        self._qpos, self._success, self._failure = [self._data.qpos.copy()], False, ""
+        place_arms(scene, self._data, start.state)
+        self._qpos, self._failure = [self._data.qpos.copy()], ""
+        for before, after in pairwise(targets):
+            drive(scene, self._data, before, after)
+            self._qpos.append(self._data.qpos.copy())
+        self._target, state = targets[-1], read_state(scene, self._data)
+        if not np.allclose(state, recorded := self.starts.robot_state(start), atol=1e-2):
+            raise _drawn_otherwise(start, f"the state {recorded}", state)
+        self._robot = CommandedRobot(
+            self._kinematics, FRAME_RATE, start.state[None], limits=self._limits, earlier=[start.earlier]
+        )
+        self._left = self._max_episode_steps
+        picture = self._film(start, state)
+        frames: dict[str, Any] = {view: seen[None] for view, seen in picture.items()}
+        video = Trajectory(start.instruction, frames, FRAME_RATE)
+        self._episode = RunningEpisode(start, video, picture, state)
+        if self._segmenter is not None:
+            before = Trajectory(start.instruction, self.starts.before(start, self.image_size), FRAME_RATE)
+            self._episode.video = longer(before, frames, None)
+            self._episode.look(self._segmenter, self._episode.video)
         return self._observed(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -126,24 +163,36 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
         Raises: DataError: it has another shape or is not finite, or the episode has ended or not begun.
         """
-        command = checked_commands(action, self.action_space.shape, self.robot)
-        if not 0 < len(self._qpos) <= self._max_episode_steps:
+        command = self.spaces.commands(action)
+        if not self._left:
             raise DataError("The episode has ended or not begun", next_step="call reset first")
-        scene, before = self._recorder.scene, self._target
-        self._target = motor_targets(scene, command[None].astype(np.float32))[0]
+        self._left -= 1
+        scene, episode, before = self._recorder.scene, self._episode, self._target
+        self._robot, executed, _ = self._robot.follow(command[None, None])
+        self._target = motor_targets(scene, executed[0].astype(np.float32))[0]
         drive(scene, self._data, before, self._target)
         self._qpos.append(self._data.qpos.copy())
-        last = len(self._qpos) > self._max_episode_steps
-        if last:
+        episode.state = read_state(scene, self._data)
+        if not self._left:
             qpos = np.array(self._qpos)
             tool = self._recorder.tool_positions(self._layout.arm, qpos)
             ended, self._failure = outcome(scene, self._data, self._layout, qpos, tool)
-            self._success = ended == "success"
-        return self._observed(), float(self._success), self._success, last and not self._success, self._info()
+            episode.success = ended == "success"
+        episode.reward = float(episode.success) if self._segmenter is None else 0.0
+        shown = not self._left or (self._max_episode_steps - self._left) % self._observe_every == 0
+        if shown or self._segmenter is not None:  # the judge looks at every frame, as it does inside
+            picture = self._film(episode.start, episode.state)
+            episode.video = longer(episode.video, {view: seen[None] for view, seen in picture.items()}, None)
+            episode.picture = picture if shown else episode.picture
+        if shown and self._segmenter is not None:
+            episode.look(self._segmenter, episode.video)
+        return self._observed(), episode.reward, episode.success, not (self._left or episode.success), self._info()
 
     def render(self) -> np.ndarray | None:
         """Latest picture, its views side by side, ``uint8 (H, views * W, 3)``."""
-        return np.concatenate([self._pictures[view] for view in self.views], axis=1) if self.render_mode else None
+        return (
+            np.concatenate([self._episode.picture[view] for view in self.views], axis=1) if self.render_mode else None
+        )
 
     def target(self) -> np.ndarray:
         """Current position ``(3)`` of the thing that the task moves, or travel ``(1)`` of a drawer or button [m]."""
@@ -152,28 +201,31 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return self._qpos[-1][address : address + count].copy()
 
     def _observed(self) -> dict[str, Any]:
-        state = read_state(self._recorder.scene, self._data).astype(np.float32)
-        if (len(self._qpos) - 1) % self._observe_every == 0:
-            self._film(state)
-        return {"pixels": {view: picture.copy() for view, picture in self._pictures.items()}, "agent_pos": state}
+        episode = self._episode
+        return self.spaces.observed({view: picture.copy() for view, picture in episode.picture.items()}, episode.state)
 
-    def _film(self, state: np.ndarray) -> None:
+    def _film(self, start: RecordedStart, state: np.ndarray) -> dict[str, np.ndarray]:
         now = ExecutedMotion(state[None], state[None], self._data.qpos[None].copy(), "unknown")
         frames = self._recorder.film(
-            self._layout, now, episode_id=self._start.episode_id, scene_id=self._scene, split="test",
+            self._layout,
+            now,
+            episode_id=start.episode_id,
+            scene_id=self._scene,
+            split="test",
             jitter=deepcopy(self._jitter),
-        ).frames  # fmt: skip
-        self._pictures = {view: np.empty((*self.image_size, 3), np.uint8) for view in self.views}
-        for view, picture in self._pictures.items():
-            resize_frame(frames[view][0], self.image_size, out=picture)
+        ).frames
+        return {view: resized_frames(frames[view], self.image_size)[0] for view in self.views}
 
     def _info(self) -> dict[str, Any]:
-        return {
-            "is_success": self._success,
-            "failure": self._failure,
-            "episode_id": self._start.episode_id,
-            "task": self.task,
-        }
+        return self._episode.info() | {"failure": self._failure}
+
+
+def _drawn_otherwise(start: RecordedStart, expected: object, got: object) -> DataError:
+    return DataError(
+        "A start cannot be drawn again as it was recorded", where=f"episode {start.episode_id}, frame {len(start.earlier)}",
+        expected=expected, got=got,
+        next_step="record the starts with this version of the project and of MuJoCo",
+    )  # fmt: skip
 
 
 Drawn = tuple[Layout, str, np.random.Generator, np.ndarray]

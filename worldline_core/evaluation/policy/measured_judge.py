@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from worldline_core.errors import DataError
 from worldline_core.evaluation.policy.evidence import (
     SCHEMAS,
     Evidence,
@@ -29,7 +30,7 @@ from worldline_core.evaluation.policy.evidence import (
     establishes_success,
     route,
 )
-from worldline_core.evaluation.policy.judge import Extracted
+from worldline_core.evaluation.policy.judge import Extracted, first_pass_indices
 from worldline_core.evaluation.recordings import HEAD, Trajectory
 from worldline_core.evaluation.segmenters.coloured_things import (
     ColouredThing,
@@ -104,8 +105,8 @@ def _text(value: float | None) -> str:
 class Measurement(Protocol):
     """A measured effect."""
 
-    def score(self) -> float:
-        """Likelihood that the task is done, 0..1: the facts with soft thresholds, multiplied."""
+    def score(self, unseen: float = UNSEEN_SCORE) -> float:
+        """Likelihood that the task is done, 0..1: the facts with soft thresholds, multiplied; of a fact not visible, ``unseen``."""
         ...
 
     def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
@@ -134,10 +135,10 @@ class LiftMeasurement:
     held: float | None
     vacated: float | None = None
 
-    def score(self) -> float:
-        hidden = max(UNSEEN_SCORE, 0.8 * (self.vacated or 0.0))
+    def score(self, unseen: float = UNSEEN_SCORE) -> float:
+        hidden = max(unseen, 0.8 * (self.vacated or 0.0))
         rise = hidden if self.rise is None else _above(self.rise, MIN_RISE, RISE_WIDTH)
-        return rise * (UNSEEN_SCORE if self.held is None else 0.1 + 0.9 * self.held)
+        return rise * (unseen if self.held is None else 0.1 + 0.9 * self.held)
 
     def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
         held = None if self.held is None else self.held >= MIN_HELD
@@ -169,8 +170,8 @@ class PlaceMeasurement:
 
     distance: float | None
 
-    def score(self) -> float:
-        return UNSEEN_SCORE if self.distance is None else _above(-self.distance, -MAX_DISTANCE, DISTANCE_WIDTH)
+    def score(self, unseen: float = UNSEEN_SCORE) -> float:
+        return unseen if self.distance is None else _above(-self.distance, -MAX_DISTANCE, DISTANCE_WIDTH)
 
     def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
         words = f"{names[0]}: {_text(self.distance)} destination sizes from the {names[1]} in the end"
@@ -190,9 +191,9 @@ class PushMeasurement:
     remaining: float | None
     retreat: float | None
 
-    def score(self) -> float:
+    def score(self, unseen: float = UNSEEN_SCORE) -> float:
         if self.remaining is None:
-            return UNSEEN_SCORE
+            return unseen
         retreat = 1.0 if self.retreat is None else _above(self.retreat, MIN_RETREAT, RETREAT_WIDTH)
         return retreat * _above(-self.remaining, -MAX_REMAINING, REMAINING_WIDTH)
 
@@ -210,8 +211,8 @@ class PressMeasurement:
 
     growth: float | None
 
-    def score(self) -> float:
-        return UNSEEN_SCORE if self.growth is None else _above(self.growth, MIN_GROWTH, GROWTH_WIDTH)
+    def score(self, unseen: float = UNSEEN_SCORE) -> float:
+        return unseen if self.growth is None else _above(self.growth, MIN_GROWTH, GROWTH_WIDTH)
 
     def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
         words = f"{names[0]}: its colour fills {_text(self.growth)} times its first area in the end"
@@ -361,6 +362,28 @@ def measure(
     if _CLOSING.search(instruction.lower()):
         return measure_push(frames, things[0], _robot_late(segmenter, frames[HEAD], points))
     return None
+
+
+def soft_score(segmenter: Segmenter, trajectory: Trajectory) -> tuple[float, dict[str, float]]:
+    """Likelihood that the task is done, 0..1, if the video ended here; and the measured facts by name, NaN where not visible.
+
+    Frames as of a judge's first pass; before there are three, the first one counts several times. What cannot be seen scores 0:
+    a controller that hides a thing must gain nothing by it.
+
+    Raises: DataError where nothing can be measured.
+    """
+    chosen = list(first_pass_indices(trajectory.num_frames))
+    chosen = [0] * (LATE_COUNT - len(chosen)) + chosen
+    frames = {view: video[chosen] for view, video in trajectory.frames.items()}
+    points = None if trajectory.points is None else trajectory.points[chosen]
+    measured = measure(segmenter, trajectory.instruction, route(trajectory.instruction), frames, points)
+    if measured is None:
+        raise DataError(
+            "The task has no soft score", got=f"{trajectory.instruction!r}, views {', '.join(frames)}",
+            expected="the head view, and a thing named by its colour to lift, place, push closed or press",
+            next_step="take reward='success' with a success function of your own, or other recordings",
+        )  # fmt: skip
+    return measured.score(unseen=0.0), {n: math.nan if v is None else float(v) for n, v in vars(measured).items()}
 
 
 def facts(measured: Measurement | None, instruction: str, family: EvidenceFamily) -> Evidence:
