@@ -24,6 +24,7 @@ EXTRAS = {
     "h5py": "hdf5 (HDF5 sources)",
     "s3fs": "s3 (S3 object stores)",
     "gymnasium": "gym (Gymnasium environments)",
+    "stable_baselines3": "rl (Stable-Baselines3)",
     "msgpack": "serve (worldline serve, play)",
 }
 SHIPPED_MODELS = ("tokenizer", "teacher", "base", "stage2", "causal", "segmenter")
