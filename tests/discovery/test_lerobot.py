@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from published_lerobot import write_droid, write_galaxea, write_robocoin
 from recorded_sets import (
     ALOHA,
     SO_JOINTS,
@@ -53,7 +54,7 @@ def test_an_so101_runs_as_it_was_recorded(tmp_path: Path, version: str) -> None:
     assert found.views == ["head", "right_wrist"]
     text = path.read_text()
     assert "ticks of 360/4095 degrees" in text
-    assert "of the picture changes while the arms move" in text
+    assert "details change while an arm moves" in text
     counts, curated = run(path, tmp_path)
     assert (counts["found"], counts["kept"]) == (4, 4)
     assert {row.fps for row in curated.rows} == {30.0}  # two seconds: every frame is kept for a clip
@@ -244,7 +245,37 @@ def test_views_by_name_and_by_motion(tmp_path: Path, cameras: dict[str, str], vi
     keyed = {f"observation.images.{name}": kind for name, kind in cameras.items()}
     found = look(write_so101(tmp_path / "raw", cameras=keyed))
     assert found.source["views"] == {f"observation.images.{name}": view for name, view in views.items()}
-    assert all("of the picture changes" in found.evidence["views", key] for key in found.source["views"])
+    assert all("details change" in found.evidence["views", key] for key in found.source["views"])
+
+
+def test_published_sets(tmp_path: Path) -> None:
+    """Galaxea's, RoboCOIN's and DROID's, whose columns, grippers and uses their readers' own configurations state."""
+    write_galaxea(tmp_path / "galaxea")
+    found = look(tmp_path / "galaxea")
+    assert found.source["views"]["observation.images.left_wrist_rgb"] == "left_wrist"
+    assert [arm["state"]["joints"]["feature"] for arm in arms_of(found)] == [
+        "observation.state.left_arm", "observation.state.right_arm",
+    ]  # fmt: skip
+    assert [arm["action"]["gripper"]["open"] for arm in arms_of(found)] == [100, 100]
+    write_robocoin(tmp_path / "robocoin")
+    found = look(tmp_path / "robocoin")
+    assert arms_of(found)[0]["state"]["joints"]["columns"] == [f"left_arm_joint_{i}_rad" for i in range(1, 7)]
+    assert arms_of(found)[1]["state"]["gripper"] == {
+        "feature": "observation.state", "columns": ["right_gripper_open_scale"], "closed": 0, "open": 1,
+    }  # fmt: skip
+    write_droid(tmp_path / "raw")
+    found = look(tmp_path / "raw")
+    assert (found.source["embodiment"], found.trains, found.questions) == ("droid_franka", False, [])
+    assert arms_of(found)[0]["state"]["gripper"]["closed"] == 1
+    assert found.source["success_column"] == "is_episode_successful"
+
+
+def test_wrist_cameras_over_a_plain_table_are_not_doubted(project_root: Path) -> None:
+    for folder in sorted((project_root / "artifacts/shipped/recordings/datasets").iterdir()):
+        found = look(folder)
+        assert found.source["embodiment"] == folder.name
+        assert not any("unusual" in text for text in found.evidence.values()), folder.name
+        assert {arm["state"]["gripper"]["closed"] for arm in arms_of(found)} == {0}
 
 
 def test_a_camera_whose_picture_contradicts_its_name_is_doubted(tmp_path: Path) -> None:

@@ -17,18 +17,20 @@ _HEAD = (
     {"exterior", "external", "third", "agentview", "scene", "base", "main"}, {"image", "cam", "camera", "rgb", "color", "webcam"},
 )  # fmt: skip
 """Words of a camera that sees the whole scene, those that say it best first."""
-MOVING_SHARE = 0.4
-"""Of the picture's cells that change while the arm moves; a camera on a table stays below, one on a wrist above."""
-_SIZE, _LEVELS = (48, 32), 8
+MOVING_SHARE, UNUSUAL_WRIST, UNUSUAL_HEAD = 0.4, 0.08, 0.7
+"""Share of the picture's details that change while an arm moves: a camera is on a wrist above the first; below and above the
+others its name is doubted. A camera on a table sees the arm alone, one on a wrist everything but its gripper."""
+_SIZE, _LEVELS = (64, 48), 8
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What a camera's picture does while the arms move: the share of its cells that change, and the arm it follows.
+    """What a camera's picture does while the arms move.
 
     Attributes:
-        moving, resting: median share of changed cells in the quarter of the frames with most, and with least motion.
-        follows: correlation of the changed share with the motion of each arm.
+        moving, resting: median share of its details that change, in the quarter of the frames with most and with least motion
+            of the arm that it follows best.
+        follows: correlation of that share with the motion of each arm.
     """
 
     moving: float
@@ -36,25 +38,27 @@ class Seen:
     follows: Mapping[Side, float]
 
     def sentence(self) -> str:
-        return f"{self.moving:.0%} of the picture changes while the arms move, {self.resting:.0%} while they rest"
+        return (
+            f"{self.moving:.0%} of the picture's details change while an arm moves, {self.resting:.0%} while it rests"
+        )
 
 
 def watch(frames: np.ndarray, motion: Mapping[Side, np.ndarray]) -> Seen | None:
     """Compare pictures (N, H, W, 3) with the motion (N - 1,) of each arm between them; None where nothing moves."""
-    total = np.sum(list(motion.values()), axis=0) if motion else np.zeros(0)
-    if len(frames) < 12 or not len(total) or float(total.max()) <= 1e-3:
+    if len(frames) < 12 or not motion or max(float(values.max()) for values in motion.values()) <= 1e-3:
         return None
-    small = np.stack(
-        [cv2.resize(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY), _SIZE, interpolation=cv2.INTER_AREA) for f in frames]
-    )
-    changed = (np.abs(np.diff(small.astype(np.int16), axis=0)) > _LEVELS).mean(axis=(1, 2))
-    order = np.argsort(total, kind="stable")
-    quarter = max(3, len(order) // 4)
+    grey = [cv2.cvtColor(cv2.resize(f, _SIZE, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY) for f in frames]
+    kernel = np.ones((3, 3), np.uint8)
+    details = np.stack([cv2.dilate(g, kernel) - cv2.erode(g, kernel) for g in grey])[:-1] > _LEVELS
+    changed = np.abs(np.diff(np.stack(grey).astype(np.int16), axis=0)) > _LEVELS
+    share = (changed & details).sum(axis=(1, 2)) / np.maximum(details.sum(axis=(1, 2)), 1)
     follows: dict[Side, float] = {
-        side: float(np.corrcoef(changed, values)[0, 1]) if values.std() > 0 and changed.std() > 0 else 0.0
+        side: float(np.corrcoef(share, values)[0, 1]) if values.std() > 0 and share.std() > 0 else 0.0
         for side, values in motion.items()
     }
-    return Seen(float(np.median(changed[order[-quarter:]])), float(np.median(changed[order[:quarter]])), follows)
+    order = np.argsort(motion[max(follows, key=follows.__getitem__)], kind="stable")
+    quarter = max(3, len(order) // 4)
+    return Seen(float(np.median(share[order[-quarter:]])), float(np.median(share[order[:quarter]])), follows)
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,9 @@ def name_views(cameras: Sequence[str], sides: Sequence[Side], seen: Mapping[str,
         views, evidence = {cameras[0]: "head"}, {cameras[0]: "the only camera, though on a wrist"}
     for camera, view in views.items():
         if (found := seen.get(camera)) is not None:
-            doubt = view.endswith("_wrist") != (found.moving >= MOVING_SHARE) and len(cameras) > 1
+            # Of two arms one may rest while the other works.
+            still = view.endswith("_wrist") and len(sides) == 1 and found.moving < UNUSUAL_WRIST
+            doubt = len(cameras) > 1 and (still or (view == "head" and found.moving > UNUSUAL_HEAD))
             evidence[camera] += f"; {found.sentence()}" + (", which is unusual there: look at it" if doubt else "")
     return NamedViews(views, evidence, rest[1:])
 

@@ -99,7 +99,7 @@ def find_arms(columns: Sequence[Column], *, commanded: bool = False) -> tuple[li
         + (f" of the {arm.side} arm" if len(found) > 1 else "")
         for arm in found
     )
-    return found, f"by their names: {said}" + (f"; left out: {named(left_out)}" if left_out else "")
+    return found, f"by their names: {said}" + (f"; left out: {named(left_out, 4)}" if left_out else "")
 
 
 def _of_one_robot(columns: Sequence[Column], *, commanded: bool) -> list[Column]:

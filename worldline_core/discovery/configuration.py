@@ -72,7 +72,8 @@ def _rate(found: Discovery) -> list[str]:
     if found.fps is None:
         return ["  # Every recording keeps its rate; the shipped base model knows 8 frames a second.", "  fps: null"]
     every = kept_frame(found.fps, found.frames)
-    kept = f"of {found.fps:g} frames a second {'all' if every == 1 else f'one in {every}'} is kept: {found.fps / every:.3g}"
+    rate = f"{found.fps / every:.3g} frames a second"
+    kept = f"{rate} of {found.fps:g}" if every > 1 else f"All {found.fps:g} frames a second"
     return [
         *_comment(f"{kept}, where the shipped base model knows {BASE_RATE:g}.", 2),
         "  fps: null",

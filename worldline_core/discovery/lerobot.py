@@ -80,6 +80,7 @@ def discover_lerobot(root: AnyPath) -> Discovery:
     dataset = LeRobotV3Dataset(root) if version == "v3.0" else LeRobotV21Dataset(root)
     sample = _sample(dataset)
     robot_type = info.robot_type if isinstance(info.robot_type, str) else ""
+    droid = says_droid(robot_type, root.name, str(info.repo_id)) or set(info.features) >= _DROID_VIDEOS
     about = f"LeRobotDataset {version} of {named([robot_type or 'an unnamed robot'])}: {sample.listed} episodes at {info.fps:g} fps"
     found = Discovery(
         "lerobot",
@@ -102,11 +103,9 @@ def discover_lerobot(root: AnyPath) -> Discovery:
     if not arms:
         _without_arms(found, why)
     else:
-        _with_arms(found, sample, robot_type, arms, action, why)
+        _with_arms(found, sample, "droid_franka" if droid else robot_type, arms, action, why)
     _views(found, sample, arms)
-    embodiment = found.source["embodiment"]
-    names = (robot_type, root.name, str(info.repo_id), embodiment if isinstance(embodiment, str) else "")
-    if says_droid(*names) or set(info.features) >= _DROID_VIDEOS:
+    if droid:
         found.say(("split",), "test", "DROID is for evaluation only: results are compared on it")
         found.source["evaluation_only"] = True
         found.trains = False
@@ -424,6 +423,8 @@ def _makers(robot_type: str, lerobot: bool, column: Column, *, fingers: bool) ->
         return False, "DROID's gripper is 0 open .. 1 closed"
     if "aloha" in said or "viperx" in said or "trossen" in said or "widowx" in said:
         return True, "ALOHA's grippers are 0 closed .. 1 open"
+    if "r1lite" in said or "galaxea" in said:
+        return True, "Galaxea's grippers are 0 closed .. 100 open"
     if fingers and "inspire" in said:
         return True, "Inspire's fingers are 0 closed .. 1 open in Unitree's recordings"
     return None, ""

@@ -15,7 +15,9 @@ from worldline_core.geometry.embodiment import Arm, Embodiment, embodiment_names
 LEROBOT_ARMS = ("so100", "so101", "so", "koch", "omx", "lekiwi")
 """Arms of LeRobot's own motors, which it records in degrees or as -100..100; grippers are 0 closed .. 100 open."""
 _MOTORS = {("shoulder", "pan"), ("shoulder", "lift"), ("elbow", "flex"), ("wrist", "flex"), ("wrist", "roll")}
-_SAME = {"so100": "so101", "so": "so101", "panda": "franka_panda", "franka": "franka_panda", "fr3": "franka_panda"}
+_SAME = {
+    "agilex": "piper_pair", "cobotmagic": "piper_pair", "so100": "so101", "so": "so101", "panda": "franka_panda", "franka": "franka_panda", "fr3": "franka_panda",
+}  # fmt: skip
 """Name in a dataset -> the description that stands for it where there is none of that name itself."""
 TOLERANCE_RAD = 0.2
 
@@ -58,7 +60,13 @@ def match_robot(
         fits, signs = _within_limits(robot.arms, arms, angles)
         if (not fits and not named_alike) or (signs and not named_alike and not words_alike):
             continue
-        score = 4.0 * named_alike + 2.0 * words_alike - 1.0 * bool(signs) - 3.0 * (not fits)
+        score = (
+            1.0 * (name.replace("_", "") == "".join(words_of(robot_type)))
+            + 4.0 * named_alike
+            + 2.0 * words_alike
+            - 1.0 * bool(signs)
+            - 3.0 * (not fits)
+        )
         reasons = [f"{'+'.join(str(len(a.joints)) for a in arms)} joints"]
         reasons += [f"the dataset calls the robot {named([robot_type])}"] if named_alike else []
         reasons += ["the joint names agree"] if words_alike else []
