@@ -5,7 +5,7 @@ from tasks.execution.artifact_task import ArtifactTask
 import_backbone = ArtifactTask(
     name="import_backbone",
     summary="turn pretrained Cosmos3 weights into the base checkpoint",
-    version=3,
+    version=4,
     function="worldline_core.model.cosmos3:import_backbone",
     config="worldline_core.model.world_model_config:ImportBackboneConfig",
     inputs=("diffusers",),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import fill, load_checkpoint
 from worldline_core.model.cosmos3 import config_from_diffusers, import_backbone, read_cosmos3
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import ImportBackboneConfig
+from worldline_core.model.world_model_config import ImportBackboneConfig, cosmos3_config
 
 
 def load_cosmos3(folder: Path, **options: Any) -> tuple[WorldModel, dict[str, list[str]]]:
@@ -38,16 +39,28 @@ SHAPE: dict[str, Any] = {
 }
 
 
-@pytest.fixture(scope="module")
-def diffusers_model() -> Any:
+KINDS: dict[str, dict[str, Any]] = {
+    "nano": {},
+    "edge": {"hidden_act": "relu2", "qk_norm_for_text": False, "use_und_k_norm_for_gen": True, "rms_norm_eps": 1e-5,
+             "rope_theta": 1e8},
+}  # fmt: skip
+
+
+def random_transformer(kind: str, seed: int = 3) -> Any:
     from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
 
-    torch.manual_seed(3)
-    model = Cosmos3OmniTransformer(**SHAPE)
+    torch.manual_seed(seed)
+    shape: dict[str, Any] = SHAPE | KINDS[kind]
+    model: Any = Cosmos3OmniTransformer(**shape)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.normal_(0.0, 0.25)
     return model.eval()
+
+
+@pytest.fixture(scope="module")
+def diffusers_model() -> Any:
+    return random_transformer("nano")
 
 
 def reference_velocity(
@@ -81,22 +94,37 @@ def reference_velocity(
     ).sample[0]
 
 
-@torch.no_grad()
-def test_diffusers_weights_give_the_same_velocity(diffusers_model: Any, tmp_path: Path) -> None:
-    diffusers_model.save_pretrained(tmp_path / "transformer", max_shard_size="40KB")
+@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_diffusers_weights_give_the_same_velocity_and_gradients(kind: str, seed: int, tmp_path: Path) -> None:
+    theirs = random_transformer(kind, seed)
+    theirs.save_pretrained(tmp_path / "transformer", max_shard_size="40KB")
     assert len(list((tmp_path / "transformer").glob("*.safetensors"))) > 1
     model, report = load_cosmos3(tmp_path, fps=16.0)
     assert report["ignored"] == ["lm_head.weight"]
     assert report["new"] == sorted(n for n, _ in model.named_parameters() if n.startswith("action_encoder."))
-    latents = torch.randn(1, 6, 4, 4, 6, generator=torch.Generator().manual_seed(5))
+    latents = torch.randn(1, 6, 4, 4, 6, generator=torch.Generator().manual_seed(seed))
     text = [3, 1, 4, 1, 5, 9, 2]
-    for sigma in (0.9, 0.3):
-        expected = reference_velocity(diffusers_model, latents, sigma, text, fps=16.0)
+    for sigma, fps in ((0.9, 16.0), (0.3, 10.0)):
+        theirs.zero_grad()
+        model.zero_grad()
+        expected = reference_velocity(theirs, latents, sigma, text, fps=fps)
         ours = model(
-            latents[:, None], torch.tensor([sigma]), text=model.encode_text(torch.tensor([text])), views=("head",)
-        ).velocity[:, 0]
+            latents[:, None], torch.tensor([sigma]), text=model.encode_text(torch.tensor([text])), views=("head",),
+            fps=torch.tensor([fps]),
+        ).velocity[:, 0]  # fmt: skip
         torch.testing.assert_close(ours, expected, rtol=1e-5, atol=1e-5)
         assert expected[:, :, 1:].abs().mean() > 0.1
+        expected[:, :, 1:].square().mean().backward()
+        ours[:, :, 1:].square().mean().backward()
+        gradients = {name: weight.grad for name, weight in theirs.named_parameters() if weight.grad is not None}
+        assert len(gradients) > 60 and ("layers.1.self_attn.k_norm_und_for_gen.weight" in gradients) == (kind == "edge")
+        for name, gradient in gradients.items():
+            weight = model.get_parameter(name)
+            found = (
+                torch.zeros_like(weight) if weight.grad is None else weight.grad
+            )  # the last layer's text is read by none
+            torch.testing.assert_close(found, gradient, rtol=1e-4, atol=1e-5 * float(gradient.abs().max()), msg=name)
 
 
 def test_the_import_holds_one_file_of_the_result(tmp_path: Path) -> None:
@@ -142,9 +170,10 @@ def test_clips_of_two_rates_in_one_batch_stand_where_diffusers_puts_each(diffuse
     assert bool((at_config_rate - ours).abs().amax(dim=(1, 2, 3, 4)).min() > 1e-3)
 
 
+@pytest.mark.parametrize("kind", list(KINDS))
 @torch.no_grad()
-def test_the_generation_tower_alone_equals_both_without_text(diffusers_model: Any, tmp_path: Path) -> None:
-    diffusers_model.save_pretrained(tmp_path)
+def test_the_generation_tower_alone_equals_both_without_text(kind: str, tmp_path: Path) -> None:
+    random_transformer(kind).save_pretrained(tmp_path)
     both, _ = load_cosmos3(tmp_path)
     alone, report = load_cosmos3(tmp_path, changes={"towers": "generation"})
     assert "embed_tokens.weight" in report["ignored"]
@@ -172,7 +201,12 @@ def test_another_architecture_is_refused(diffusers_model: Any, tmp_path: Path) -
     diffusers_model.save_pretrained(tmp_path)
     path = tmp_path / "config.json"
     config = json.loads(path.read_text())
-    for key, value in (("hidden_act", "relu2"), ("attention_bias", True), ("_class_name", "WanTransformer3DModel")):
+    for key, value in (
+        ("hidden_act", "relu2"),
+        ("hidden_act", "gelu"),
+        ("attention_bias", True),
+        ("_class_name", "WanTransformer3DModel"),
+    ):
         path.write_text(json.dumps(config | {key: value}))
         with pytest.raises(CheckpointError, match="Not a Cosmos3 transformer"):
             load_cosmos3(tmp_path)
@@ -181,16 +215,51 @@ def test_another_architecture_is_refused(diffusers_model: Any, tmp_path: Path) -
         load_cosmos3(tmp_path)
 
 
-def test_the_published_config_is_the_full_size() -> None:
+def test_weights_of_another_size_or_revision_are_refused(tmp_path: Path) -> None:
+    commit, other = "a" * 40, "b" * 40
+    folder = tmp_path / "cache" / "snapshots" / commit
+    random_transformer("nano").save_pretrained(folder)
+    with pytest.raises(CheckpointError, match=r"Cosmos3-Nano(?s:.)*Cosmos3-Edge"):
+        load_cosmos3(folder, size="edge")
+    with pytest.raises(CheckpointError, match=commit):
+        load_cosmos3(folder, revision=other)
+    local = tmp_path / "local"
+    random_transformer("edge").save_pretrained(local)
+    with pytest.raises(CheckpointError, match="does not say"):
+        load_cosmos3(local, revision=other)
+    note = local / ".cache" / "huggingface" / "download" / "config.json.metadata"
+    note.parent.mkdir(parents=True)
+    note.write_text(f"{other}\netag\n1.0\n")
+    load_cosmos3(local, size="edge", revision=other)
+    load_cosmos3(folder, size="nano", revision=commit)
+
+
+PUBLISHED_EDGE = {
+    "hidden_act": "relu2", "hidden_size": 2048, "intermediate_size": 9216, "num_attention_heads": 16, "num_hidden_layers": 28,
+    "num_key_value_heads": 8, "qk_norm_for_text": False, "use_und_k_norm_for_gen": True, "rms_norm_eps": 1e-5,
+    "rope_theta": 1e8, "vocab_size": 131072, "rope_scaling": {"mrope_section": [24, 20, 20]},
+    "temporal_compression_factor": 4, "backbone_type": "cosmos3_edge_nemotron_dense",
+}  # fmt: skip
+"""Fields of its transformer/config.json that are not the class's defaults, and two that it does not know."""
+
+
+@pytest.mark.parametrize(
+    ("size", "published", "generation", "both"),
+    [("nano", {}, (6.9e9, 7.1e9), (14.5e9, 14.6e9)), ("edge", PUBLISHED_EDGE, (1.41e9, 1.42e9), (3.0e9, 3.1e9))],
+)
+def test_the_published_config_is_the_full_size(
+    size: Any, published: dict[str, Any], generation: tuple[float, float], both: tuple[float, float]
+) -> None:
     from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
 
     defaults = {
         name: parameter.default
-        for name, parameter in __import__("inspect").signature(Cosmos3OmniTransformer.__init__).parameters.items()
+        for name, parameter in inspect.signature(Cosmos3OmniTransformer.__init__).parameters.items()
         if name != "self"
     }
-    config = config_from_diffusers(defaults, where="defaults")
-    with torch.device("meta"):
-        model = WorldModel(config.model_copy(update={"towers": "generation"}))
-    count = sum(parameter.numel() for parameter in model.parameters())
-    assert 6.9e9 < count < 7.1e9
+    config = config_from_diffusers(defaults | published, where="published", expected=size)
+    assert config == cosmos3_config(size)
+    for towers, (least, most) in (("generation", generation), ("both", both)):
+        with torch.device("meta"):
+            model = WorldModel(config.model_copy(update={"towers": towers}))
+        assert least < sum(parameter.numel() for parameter in model.parameters()) < most

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,12 +21,16 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "tokenizer"
 
 
-def test_ids_are_those_of_diffusers(folder: Path) -> None:
+@pytest.mark.parametrize("system_prompt", [True, False])
+def test_ids_are_those_of_diffusers(folder: Path, system_prompt: bool) -> None:
     from diffusers.pipelines.cosmos.pipeline_cosmos3_omni import Cosmos3OmniPipeline
 
-    text = Cosmos3Text(folder)
+    (folder.parent / "model_index.json").write_text(json.dumps({"default_use_system_prompt": system_prompt}))
+    text = Cosmos3Text(folder, system_prompt=system_prompt)
+    with pytest.raises(CheckpointError, match="system_prompt"):
+        Cosmos3Text(folder, system_prompt=not system_prompt)
     pipeline = SimpleNamespace(
-        config=SimpleNamespace(default_use_system_prompt=True),
+        config=SimpleNamespace(default_use_system_prompt=system_prompt),
         text_tokenizer=text.tokenizer,
         llm_special_tokens={
             "start_of_generation": text.tokenizer.convert_tokens_to_ids(VISION_START),

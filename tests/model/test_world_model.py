@@ -12,7 +12,7 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.layers import video_positions, view_starts
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import cosmos3_nano_config
+from worldline_core.model.world_model_config import cosmos3_config
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 
@@ -87,12 +87,14 @@ def test_views_share_time_and_have_their_own_height_slots(build: Build) -> None:
 
 
 def test_view_offsets_in_pixels_are_divided_by_the_pixels_of_a_patch() -> None:
-    assert view_starts(cosmos3_nano_config(), VIEWS) == [0.0, 480.0, 992.0]
-    assert view_starts(cosmos3_nano_config(view_offset_unit="pixel"), VIEWS) == [0.0, 15.0, 31.0]
+    assert view_starts(cosmos3_config("nano"), VIEWS) == [0.0, 480.0, 992.0]
+    assert view_starts(cosmos3_config("nano", view_offset_unit="pixel"), VIEWS) == [0.0, 15.0, 31.0]
 
 
 def test_fps_modulation_stretches_time() -> None:
-    positions = video_positions(cosmos3_nano_config(fps=12.0), torch.arange(3), (1, 1), ("head",), temporal_offset=5.0)
+    positions = video_positions(
+        cosmos3_config("nano", fps=12.0), torch.arange(3), (1, 1), ("head",), temporal_offset=5.0
+    )
     assert positions[0].tolist() == [5.0, 7.0, 9.0]
 
 

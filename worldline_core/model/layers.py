@@ -173,17 +173,19 @@ class RMSNorm(nn.Module):
         return F.rms_norm(values, (values.shape[-1],), self.weight.to(values.dtype), self.eps)
 
 
-class GatedFeedForward(nn.Module):
-    """SwiGLU."""
+class FeedForward(nn.Module):
+    """SwiGLU, or the squared ReLU without a gate."""
 
-    def __init__(self, hidden_size: int, intermediate_size: int) -> None:
+    def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
-        self.gate_proj = nn.Linear(hidden_size, intermediate_size, bias=False)
-        self.up_proj = nn.Linear(hidden_size, intermediate_size, bias=False)
-        self.down_proj = nn.Linear(intermediate_size, hidden_size, bias=False)
+        size, inner = config.hidden_size, config.intermediate_size
+        self.gate_proj = nn.Linear(size, inner, bias=False) if config.feed_forward == "swiglu" else None
+        self.up_proj = nn.Linear(size, inner, bias=False)
+        self.down_proj = nn.Linear(inner, size, bias=False)
 
     def forward(self, values: Tensor) -> Tensor:
-        return self.down_proj(F.silu(self.gate_proj(values)) * self.up_proj(values))
+        up = self.up_proj(values)
+        return self.down_proj(F.relu(up).square() if self.gate_proj is None else F.silu(self.gate_proj(values)) * up)
 
 
 class MixtureAttention(nn.Module):
@@ -198,8 +200,13 @@ class MixtureAttention(nn.Module):
             self.to_k = nn.Linear(config.hidden_size, shared, bias=False)
             self.to_v = nn.Linear(config.hidden_size, shared, bias=False)
             self.to_out = nn.Linear(inner, config.hidden_size, bias=False)
-            self.norm_q = RMSNorm(config.head_dim, config.rms_norm_eps)
-            self.norm_k = RMSNorm(config.head_dim, config.rms_norm_eps)
+            if config.text_keys == "normalised":
+                self.norm_q = RMSNorm(config.head_dim, config.rms_norm_eps)
+                self.norm_k = RMSNorm(config.head_dim, config.rms_norm_eps)
+            else:
+                self.norm_q = self.norm_k = nn.Identity()
+                self.k_norm_und_for_gen = RMSNorm(config.head_dim, config.rms_norm_eps)
+        self.text_keys = config.text_keys
         self.add_q_proj = nn.Linear(config.hidden_size, inner, bias=False)
         self.add_k_proj = nn.Linear(config.hidden_size, shared, bias=False)
         self.add_v_proj = nn.Linear(config.hidden_size, shared, bias=False)
@@ -213,12 +220,15 @@ class MixtureAttention(nn.Module):
     def understand(self, values: Tensor, by: Rotation) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """Causal self-attention over text; also returns the rotated keys and values the video reads."""
         queries = rotate(rearrange(self.norm_q(self._heads(self.to_q(values))), "b n k d -> b k n d"), by)
-        keys = rotate(rearrange(self.norm_k(self._heads(self.to_k(values))), "b n k d -> b k n d"), by)
+        keys = read = rotate(rearrange(self.norm_k(self._heads(self.to_k(values))), "b n k d -> b k n d"), by)
+        if self.text_keys == "normalised_for_video":
+            normalised = self.k_norm_und_for_gen(self._heads(self.to_k(values)))
+            read = rotate(rearrange(normalised, "b n k d -> b k n d"), by)
         value = rearrange(self._heads(self.to_v(values)), "b n k d -> b k n d")
         size = queries.shape[-2]
         causal = torch.ones(size, size, dtype=torch.bool, device=values.device).tril()
         mixed = grouped_attention(queries, keys, value, causal[None, None])
-        return self.to_out(mixed), (keys, value)
+        return self.to_out(mixed), (read, value)
 
     def project(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values of the video tokens, ``(b heads n d)``, normalised and not yet rotated."""
@@ -236,10 +246,10 @@ class MixtureLayer(nn.Module):
         eps = config.rms_norm_eps
         self.self_attn = MixtureAttention(config)
         if config.towers == "both":
-            self.mlp = GatedFeedForward(config.hidden_size, config.intermediate_size)
+            self.mlp = FeedForward(config)
             self.input_layernorm = RMSNorm(config.hidden_size, eps)
             self.post_attention_layernorm = RMSNorm(config.hidden_size, eps)
-        self.mlp_moe_gen = GatedFeedForward(config.hidden_size, config.intermediate_size)
+        self.mlp_moe_gen = FeedForward(config)
         self.input_layernorm_moe_gen = RMSNorm(config.hidden_size, eps)
         self.post_attention_layernorm_moe_gen = RMSNorm(config.hidden_size, eps)
 
@@ -284,6 +294,7 @@ TEXT_PARAMETERS = (
     ".to_out.",
     ".norm_q.",
     ".norm_k.",
+    ".k_norm_und_for_gen.",
     ".mlp.",
     ".input_layernorm.",
     ".post_attention_layernorm.",

@@ -1,6 +1,6 @@
 """Task text as token ids: UTF-8 bytes for the embedded models, the backbone's own chat prompt at full size.
 
-Cosmos3 was trained to read Qwen2 ids of a chat with a system prompt, the instruction, and the clip's length and size.
+Cosmos3 was trained to read a chat: a system prompt (Nano alone), the instruction, and the clip's length and size.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
 from worldline_core.model.world_model_config import TextConfig
+from worldline_core.store.artifact_files import read_json
 
 SYSTEM_PROMPT = "You are a helpful assistant who will generate videos from a give prompt."
 """Spelt as in training, the missing letter included."""
@@ -55,27 +56,37 @@ class Cosmos3Text:
     """Instructions to right-padded ids ``(b m)`` and a mask that is True on real tokens.
 
     Args:
-        folder: local folder of the Qwen2 tokenizer (``text_tokenizer`` of the diffusers pipeline).
+        folder: local folder ``text_tokenizer`` of the diffusers pipeline (Qwen2's for Nano, Nemotron's for Edge).
+        system_prompt: whether the prompt begins with the system's; Cosmos3-Edge was trained without (``default_use_system_prompt``
+            of the pipeline).
         max_length: most tokens of a prompt. An instruction that is too long loses its last words; the chat around it
             and the clip's facts stay whole.
 
     Raises:
         UnavailableError: there is no such folder.
-        CheckpointError: its tokenizer lacks the chat template or the vision token.
+        CheckpointError: its tokenizer lacks the chat template or the vision token, or the pipeline that it is a part of was trained
+            otherwise.
     """
 
-    def __init__(self, folder: Path, *, max_length: int | None = None) -> None:
+    def __init__(self, folder: Path, *, max_length: int | None = None, system_prompt: bool = True) -> None:
         if not folder.is_dir():
             raise UnavailableError(
                 "The text tokenizer is not here",
                 where=folder,
-                expected="a folder with a Qwen2 tokenizer",
-                next_step="download the text_tokenizer folder of nvidia/Cosmos3-Nano",
+                expected="the folder text_tokenizer of a Cosmos3 pipeline",
+                next_step="download it from nvidia/Cosmos3-Nano or nvidia/Cosmos3-Edge, as the backbone",
             )
+        pipeline = folder.parent / "model_index.json"
+        trained = read_json(pipeline).get("default_use_system_prompt", True) if pipeline.is_file() else system_prompt
+        if trained != system_prompt:
+            raise CheckpointError(
+                "The pipeline of this tokenizer was trained with another prompt", where=f"{pipeline}: default_use_system_prompt",
+                expected=system_prompt, got=trained, next_step=f"set text.system_prompt to {str(trained).lower()}",
+            )  # fmt: skip
         from transformers import AutoTokenizer
 
         self.tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
-        self.max_length = max_length
+        self.max_length, self.system_prompt = max_length, system_prompt
         start = self.tokenizer.get_vocab().get(VISION_START)
         if start is None or self.tokenizer.eos_token_id is None or self.tokenizer.chat_template is None:
             raise CheckpointError(
@@ -114,10 +125,8 @@ class Cosmos3Text:
         return ids
 
     def _prompt_ids(self, instruction: str, clip: ClipFacts) -> list[int]:
-        chat = [
-            {"role": "system", "content": SYSTEM_PROMPT},
-            {"role": "user", "content": video_prompt(instruction, clip)},
-        ]
+        chat = [{"role": "system", "content": SYSTEM_PROMPT}] if self.system_prompt else []
+        chat.append({"role": "user", "content": video_prompt(instruction, clip)})
         text = self.tokenizer.apply_chat_template(chat, tokenize=False, add_generation_prompt=True)
         return [*self.tokenizer(text, add_special_tokens=False)["input_ids"], *self._ending]
 
@@ -169,7 +178,7 @@ def load_text_encoder(config: TextConfig, vocabulary_size: int) -> TextEncoder:
     elif config.path is None:
         raise ConfigError("The backbone's text tokenizer needs a folder.", where="text.path", expected="a path")
     else:
-        encoder = Cosmos3Text(Path(config.path), max_length=config.max_length)
+        encoder = Cosmos3Text(Path(config.path), max_length=config.max_length, system_prompt=config.system_prompt)
     if vocabulary_size < encoder.vocabulary_size:
         raise ConfigError(
             "The model's vocabulary is too small for this text.",

@@ -26,7 +26,7 @@ ActionConditioning = Literal["maps", "native_film"]
 class WorldModelConfig(StrictModel):
     """Hyper-parameters of :class:`~worldline_core.model.world_model.WorldModel`.
 
-    The defaults are the small model that trains on two CPU cores; :func:`cosmos3_nano_config` is the full size.
+    The defaults are the small model that trains on two CPU cores; :func:`cosmos3_config` has the published ones.
     """
 
     latent_channels: int = Field(default=32, ge=1)
@@ -38,6 +38,11 @@ class WorldModelConfig(StrictModel):
     head_dim: int = Field(default=64, ge=2)
     intermediate_size: int = Field(default=576, ge=1)
     rms_norm_eps: float = Field(default=1e-6, gt=0)
+    feed_forward: Literal["swiglu", "squared_relu"] = "swiglu"
+    """``squared_relu``: without a gate (Cosmos3-Edge)."""
+    text_keys: Literal["normalised", "normalised_for_video"] = "normalised"
+    """Queries and keys of the text are normalised; or the text reads its keys as they are, and the video reads them normalised
+    (Cosmos3-Edge)."""
 
     rope_sections: tuple[int, int, int] = (12, 10, 10)
     """Rotary frequencies given to (time, height, width); they add up to ``head_dim / 2``."""
@@ -114,36 +119,56 @@ class WorldModelConfig(StrictModel):
         return self.patch_size**2 * self.latent_channels
 
 
-def cosmos3_nano_config(**changes: object) -> WorldModelConfig:
-    """The generation and understanding towers of Cosmos3-Nano, three views at 480x640 (paper, implementation)."""
-    values: dict[str, object] = {
-        "latent_channels": 48,
+Cosmos3Size = Literal["nano", "edge"]
+_COSMOS3: dict[str, object] = {
+    "latent_channels": 48,
+    "num_kv_heads": 8,
+    "head_dim": 128,
+    "rope_sections": (24, 20, 20),
+    "temporal_margin": 15000.0,
+    "view_offsets": (0.0, 480.0, 992.0),
+    "spatial_compression": 16,
+    "view_embedding": False,
+    "timestep_scale": 0.001,
+}
+_COSMOS3_SIZES: dict[Cosmos3Size, dict[str, object]] = {
+    "nano": {
         "hidden_size": 4096,
         "num_layers": 36,
         "num_heads": 32,
-        "num_kv_heads": 8,
-        "head_dim": 128,
         "intermediate_size": 12288,
-        "rope_sections": (24, 20, 20),
         "rope_theta": 5e6,
-        "temporal_margin": 15000.0,
-        "view_offsets": (0.0, 480.0, 992.0),
-        "spatial_compression": 16,
-        "view_embedding": False,
         "vocab_size": 151936,
-        "timestep_scale": 0.001,
-    }
-    return WorldModelConfig.model_validate(values | changes)
+    },
+    "edge": {
+        "hidden_size": 2048,
+        "num_layers": 28,
+        "num_heads": 16,
+        "intermediate_size": 9216,
+        "rope_theta": 1e8,
+        "vocab_size": 131072,
+        "feed_forward": "squared_relu",
+        "text_keys": "normalised_for_video",
+        "rms_norm_eps": 1e-5,
+    },
+}
+
+
+def cosmos3_config(size: Cosmos3Size, **changes: object) -> WorldModelConfig:
+    """Both towers of Cosmos3-Nano (paper, implementation) or Cosmos3-Edge, three views at 480x640."""
+    return WorldModelConfig.model_validate(_COSMOS3 | _COSMOS3_SIZES[size] | changes)
 
 
 class TextConfig(StrictModel):
     """``bytes`` needs nothing; ``cosmos3`` reads the backbone's tokenizer from the local folder ``path``.
 
+    ``system_prompt``: the chat begins with one, as Cosmos3-Nano's; Cosmos3-Edge was trained without.
     ``max_length``: tokens of a text; longer instructions are cut.
     """
 
     kind: Literal["bytes", "cosmos3"] = "bytes"
     path: str | None = None
+    system_prompt: bool = True
     max_length: int = Field(default=48, ge=2)
 
     def files_read(self) -> dict[str, Path | None]:
@@ -152,8 +177,10 @@ class TextConfig(StrictModel):
 
 
 class ImportBackboneConfig(StrictModel):
-    """Import of pretrained weights: their frame rate and the stored type."""
+    """Import of pretrained weights: which, their frame rate and the stored type."""
 
+    size: Cosmos3Size = "nano"
+    revision: str | None = Field(default=None, description="commit of the hub; published weights have been renewed")
     fps: float = Field(default=30.0, gt=0, description="rate of clips that state none: positions advance by 24 / fps")
     dtype: Literal["bfloat16", "float16"] = "bfloat16"
     changes: dict[str, Any] = Field(default={}, description="fields of the model's config to set besides (view slots)")
