@@ -8,11 +8,9 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
-from flows.embodiment_commands import add_embodiment_commands
 from flows.exchange_commands import add_exchange_commands
 from flows.full_size_commands import add_plan_command, add_rehearse_command
 from flows.init_commands import add_init_command
-from flows.serve_commands import add_serve_commands
 from tasks.execution.artifact_task import find_task, task_names
 from tasks.execution.command_line import add_config_arguments, add_task_arguments
 from tasks.execution.temporary_server import prepare_prefect
@@ -80,14 +78,47 @@ def build_parser() -> argparse.ArgumentParser:
     add_plan_command(commands)
     add_exchange_commands(commands)
     add_rehearse_command(commands)
-    add_embodiment_commands(commands)
-    add_serve_commands(commands)
+    _add_embodiment(commands)
+    _add_serve(commands)
     _add_calibrate(commands)
     doctor = commands.add_parser("doctor", help="say what this machine can do")
     doctor.add_argument("--json", action="store_true", help="print JSON")
     doctor.add_argument("--licences", action="store_true", help="list the licences of what is installed and shipped")
     doctor.set_defaults(run=_doctor)
     return parser
+
+
+def _add_embodiment(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    embodiment = commands.add_parser("embodiment", help="list robots, check the kinematics of one")
+    actions = embodiment.add_subparsers(dest="embodiment_command", required=True, metavar="ACTION")
+    listing = actions.add_parser("list", help="all robots: arms, state size, whether the description is here, verified")
+    listing.set_defaults(run=_embodiment_list)
+    check = actions.add_parser(
+        "check",
+        help="compare forward kinematics with MuJoCo (extra: sim)",
+        description="Compare forward kinematics with MuJoCo at random joint positions within the limits. Exit status:"
+        " 0 all frames agree, 1 not (or nothing could be compared), 2 wrong usage.",
+    )
+    check.add_argument("name", metavar="NAME", help="a name of the list, or a YAML file")
+    check.add_argument("--description", type=Path, metavar="FILE", help="the kinematic description to use")
+    check.add_argument("--samples", type=int, default=1000, help="random joint positions (default: 1000)")
+    check.set_defaults(run=_embodiment_check)
+
+
+def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    texts = {
+        "serve": "offer the simulator over a websocket (extra: serve)",
+        "play": "drive the simulator by hand: serve, and say where its page is (extra: serve)",
+    }
+    for name, text in texts.items():
+        parser = commands.add_parser(name, help=text)
+        parser.add_argument(
+            "--config", type=Path, metavar="FILE", help="what differs from the defaults (docs/serve.md)"
+        )
+        parser.add_argument(
+            "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
+        )
+        parser.set_defaults(run=_serve)
 
 
 def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -245,6 +276,64 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
         raise SystemExit(2) from error
     print(json.dumps(as_json(found), indent=1) if arguments.json else table_text(found))
     raise SystemExit(0 if found.consistent else 1)
+
+
+def _embodiment_list(_arguments: argparse.Namespace) -> None:
+    from worldline_core.geometry.embodiment_report import list_embodiments
+
+    print(list_embodiments())
+
+
+def _embodiment_check(arguments: argparse.Namespace) -> None:
+    from worldline_core.geometry.embodiment import load_embodiment
+    from worldline_core.geometry.embodiment_report import check_embodiment, format_check
+
+    check = check_embodiment(load_embodiment(arguments.name, arguments.description), arguments.samples)
+    print(format_check(check))
+    if not check["passed"]:
+        raise SystemExit(1)
+
+
+def _serve(arguments: argparse.Namespace) -> None:
+    """Load the model and serve until interrupted."""
+    from worldline_core.config import apply_overrides, load_config, validate
+    from worldline_core.errors import UnavailableError, installing
+    from worldline_core.serving.serve_config import ServeConfig
+
+    overrides = tuple(arguments.overrides)
+    if arguments.config is not None:
+        config = load_config(ServeConfig, path=arguments.config, overrides=overrides)
+    else:
+        config = validate(ServeConfig, apply_overrides({}, overrides), where="--set")
+    try:
+        import msgpack  # noqa: F401
+
+        from worldline_core.serving.app import listening_socket, make_server, server_token
+    except ImportError as error:
+        raise UnavailableError(
+            "The server needs packages that are not here", got=str(error), next_step=installing("serve")
+        ) from error
+    from worldline_core.rollout.worldline import WorldLine
+    from worldline_core.shipped import project_path
+
+    token, project = server_token(config), Path.cwd()
+    folders = [name for name in ("model", "tokenizer", "decoder", "episodes") if getattr(config, name) is not None]
+    config = config.model_copy(update={name: project_path(project, getattr(config, name)) for name in folders})
+    listening = listening_socket(config)  # before the model is loaded: whether there is a port is known at once
+    world = WorldLine.from_pretrained(
+        config.model,
+        tokenizer=config.tokenizer,
+        decoder=config.decoder,
+        device=config.device,
+        bfloat16=config.bfloat16,
+        steps=config.steps,
+    )
+    server = make_server(world, config, token)
+    host, port = f"[{config.host}]" if ":" in config.host else config.host, listening.getsockname()[1]
+    print(f"{config.model} at ws://{host}:{port}/v1", flush=True)
+    hint = "" if token is None else "#token=..., with the token of WORLDLINE_TOKEN"
+    print(f"drive it by hand at http://{host}:{port}/play{hint}", flush=True)
+    server.run(sockets=[listening])
 
 
 def _doctor(arguments: argparse.Namespace) -> None:

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import argparse
 import socket
 from pathlib import Path
 
 import pytest
 
-from flows.serve_commands import serve_command
+from flows.command_line import main
 from worldline_core import WorldLine
-from worldline_core.errors import UnavailableError
 from worldline_core.serving.app import listening_socket
 from worldline_core.serving.serve_config import ServeConfig
 from worldline_core.serving.session_host import SessionHost
 
 
-def test_a_port_that_is_taken_is_told_before_the_model_is_loaded() -> None:
+def test_a_port_that_is_taken_is_told_before_the_model_is_loaded(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        asked = argparse.Namespace(config=None, overrides=[f"port={port}", "model=nowhere"])
-        with pytest.raises(UnavailableError, match=rf"(?s)could not listen.*127.0.0.1:{port}.*take another port"):
-            serve_command(asked)
+        with pytest.raises(SystemExit, match="1"):
+            main(["serve", "--set", f"port={port}", "--set", "model=nowhere"])
+    assert f"127.0.0.1:{port}" in (error := capsys.readouterr().err)
+    assert "take another port" in error
 
 
 def test_a_free_port_is_known_before_the_server_runs() -> None:
