@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from published_robomind import write_franka
 from recorded_sets import motion, pictures, write_so101, write_video
@@ -18,12 +17,11 @@ from test_source_unitree_h5 import write_hdf5, write_transitions
 
 from flows.command_line import main
 from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.discovery.configuration import write_config
 from worldline_core.discovery.findings import Discovery
 from worldline_core.discovery.look import discover, look
-from worldline_core.errors import DataError, UnavailableError
+from worldline_core.errors import DataError
 from worldline_core.exports.export import export
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.pipeline.pipeline_config import PipelineConfig
@@ -183,71 +181,6 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     assert (found["source"]["embodiment"], found["todo"], found["file"]) == ("so101", {}, "other.yaml")
     assert found["next"] == ["worldline task curate --config other.yaml"]
     assert {"key": ["angle_unit"], "sentence": found["evidence"][1]["sentence"]} in found["evidence"]
-
-
-def test_the_hub_gives_meta_and_some_episodes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A hub of files: `snapshot_download` copies what its patterns name."""
-    from fnmatch import fnmatch
-
-    dataset = write_so101(tmp_path / "hub/me/arm", version="v2.1", states=[s for _ in range(2) for s in _states()])
-    asked: list[list[str]] = []
-
-    def snapshot(repo_id: str, *, allow_patterns: list[str], revision: str | None = None, **_: object) -> str:
-        asked.append(allow_patterns)
-        folder = tmp_path / "cache/snapshots" / (revision or "abc")
-        for path in (tmp_path / "hub" / repo_id).rglob("*"):
-            name = str(path.relative_to(tmp_path / "hub" / repo_id))
-            if path.is_file() and any(fnmatch(name, pattern) for pattern in allow_patterns):
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                (folder / name).write_bytes(path.read_bytes())
-        return str(folder)
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot)
-    main(["init", "me/arm"])
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[-2:] == [
-        "next: hf download me/arm --repo-type dataset --revision abc",
-        "next: worldline task curate --config my.yaml",
-    ]
-    assert len(list((tmp_path / "cache").rglob("*.mp4"))) == 6
-    assert len(list(dataset.rglob("*.mp4"))) == 16
-    source = CurateConfig.model_validate({"sources": [_source(tmp_path / "my.yaml")]}).sources[0]
-    assert str(source.path).endswith("cache/snapshots/abc")
-
-
-def _states() -> list[np.ndarray]:
-    from recorded_sets import so101_states
-
-    return so101_states()
-
-
-def _source(path: Path) -> dict[str, Any]:
-    from worldline_core.config import read_config
-
-    return read_config(None, path)["curate"]["sources"][0]
-
-
-def test_offline_the_hub_is_one_clear_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
-    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "cache"))
-    from worldline_core.discovery.hub import fetch_sample, hub_id
-
-    with pytest.raises(UnavailableError, match=r"(?s)hub does not give.*me/arm.*offline, download it elsewhere"):
-        fetch_sample("me/arm")
-    assert (hub_id("me/arm"), hub_id("hf://datasets/me/arm"), hub_id("./arm"), hub_id("/a/b")) == (
-        "me/arm",
-        "me/arm",
-        None,
-        None,
-    )
-    (tmp_path / "me/arm").mkdir(parents=True)
-    assert hub_id("me/arm") is None
 
 
 SAMPLES = {

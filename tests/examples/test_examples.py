@@ -21,10 +21,10 @@ from worldline_core.store.store import ArtifactStore
 pytestmark = pytest.mark.slow
 
 
-def _run(project_root: Path, name: str, *arguments: str | Path) -> str:
+def _run(project_root: Path, name: str, *arguments: str | Path, cwd: Path | None = None) -> str:
     result = subprocess.run(
         [sys.executable, project_root / "examples" / name, *map(str, arguments)],
-        cwd=project_root, capture_output=True, text=True, check=False,
+        cwd=cwd or project_root, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
@@ -72,9 +72,9 @@ def test_train_on_a_lerobot_dataset(project_root: Path, tmp_path: Path) -> None:
     dataset = tmp_path / "dataset"
     shutil.copytree(project_root / "artifacts/shipped/recordings/datasets/viperx_pearl", dataset)
     shutil.rmtree(dataset / "meta" / "worldline")  # what a foreign dataset does not have
-    printed = _run(
-        project_root, "train_on_lerobot.py", dataset, "--embodiment", "viperx_pearl", "--steps", 2,
-        "--artifacts", tmp_path / "artifacts",
-    )  # fmt: skip
-    facts, _ = json.JSONDecoder().raw_decode(printed)
-    assert facts["steps"] == 2
+    short = [f"train_stage1.trainer.{value}" for value in ("minutes=null", "steps=2", "validation_batches=0")]
+    options = [text for each in short for text in ("--set", each)]
+    printed = _run(project_root, "train_on_lerobot.py", dataset, *options, cwd=tmp_path)
+    assert "angle_unit: " in printed
+    (trained,) = (tmp_path / "artifacts/train_stage1").glob("*/manifest.json")
+    assert json.loads(trained.read_text())["metrics"]["steps"] == 2
