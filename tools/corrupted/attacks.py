@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from PIL import Image
 from pydantic import TypeAdapter
 
-from tools.corrupted import files
+from tools.corrupted import defects
 from tools.corrupted.mutations import read_everything
 from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
 from worldline_core.data.sources.hdf5 import require_h5py
@@ -163,7 +163,7 @@ def _tracks(path: Path) -> None:
     path.write_bytes(head + content[start : start + length] * 3000 + content[start + length :])
 
 
-def _random(defect: files.FileDefect) -> Callable[[Path], None]:
+def _random(defect: defects.FileDefect) -> Callable[[Path], None]:
     return lambda path: defect(path, np.random.default_rng(0))
 
 
@@ -187,8 +187,8 @@ ATTACKS = (
     Attack(*_PNG, "a text of 200 MB", _content(lambda: png_with((b"zTXt", b"a\0\0" + _zeros(200)))), (READ, "unreadable")),
     Attack(*_PNG, "data of 200 MB", _content(lambda: png_with(data=_zeros(200))), (READ, "unreadable")),
     Attack(*_PNG, "5,000 scans", _content(lambda: jpeg_of_scans(5000)), ("too_large",)),
-    Attack(*_MP4, "30,000 x 30,000 pixels", _random(files.claim_pixels), _VIDEO),
-    Attack(*_MP4, "10^9 frames", _random(files.claim_frames), _VIDEO[1:]),
+    Attack(*_MP4, "30,000 x 30,000 pixels", _random(defects.claim_pixels), _VIDEO),
+    Attack(*_MP4, "10^9 frames", _random(defects.claim_frames), _VIDEO[1:]),
     Attack(*_MP4, "10^9 frames of one size", _bytes_at((b"stsz", 4, struct.pack(">II", 1, 10**9))), _VIDEO),
     Attack(*_MP4, "frames of 4 GB", _bytes_at((b"stsz", 4, b"\xff" * 4)), _VIDEO),
     Attack(*_MP4, "3,000 tracks", _tracks, _VIDEO),

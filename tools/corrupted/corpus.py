@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tools.corrupted import droid_annotation, lerobot_v21, mcap
-from tools.corrupted.labels import SECOND, Label
+from tools.corrupted.defects import SECOND, Label
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine
 

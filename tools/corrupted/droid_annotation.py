@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tools.corrupted.content import FPS, gripper_motion, joint_motion, pictures
-from tools.corrupted.labels import Kind, Label
+from tools.corrupted.defects import Kind, Label
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematic_tree import read_tree, tool_poses
@@ -87,7 +87,6 @@ _TEXTS: tuple[tuple[str, Callable[[str, np.random.Generator], bytes]], ...] = (
 )
 
 
-KIND_COUNT = len(KINDS) + len(_TEXTS)
 """How many recordings `write` adds for each of `each`."""
 
 

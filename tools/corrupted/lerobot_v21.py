@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tools.corrupted import files
+from tools.corrupted import defects
 from tools.corrupted.content import FPS, NUM_FRAMES, gripper_motion, joint_motion, pictures
-from tools.corrupted.labels import SECOND, Kind, Label, Stage
+from tools.corrupted.defects import SECOND, Kind, Label, Stage
 from worldline_core.data.video.encoder import encode_video
 
 EMBODIMENT = "ur5e_pair"
@@ -46,11 +46,11 @@ class _Episode:
         return self.videos[int(random.integers(len(_VIEWS)))]
 
 
-def _on_video(defect: files.FileDefect) -> Callable[[_Episode, np.random.Generator], None]:
+def _on_video(defect: defects.FileDefect) -> Callable[[_Episode, np.random.Generator], None]:
     return lambda episode, random: defect(episode.video(random), random)
 
 
-def _on_table(defect: files.FileDefect) -> Callable[[_Episode, np.random.Generator], None]:
+def _on_table(defect: defects.FileDefect) -> Callable[[_Episode, np.random.Generator], None]:
     return lambda episode, random: defect(episode.table, random)
 
 
@@ -111,14 +111,14 @@ def _video_of_other_length(episode: _Episode, random: np.random.Generator) -> No
 
 
 KINDS = (
-    Kind("video_truncated", _on_video(files.truncate), ("truncated_video",)),
-    Kind("video_missing", _on_video(files.missing), ("missing_file",)),
-    Kind("video_pipe", _on_video(files.pipe), ("special_file", "missing_file")),
-    Kind("video_linked_out", _on_video(files.link_out), ("path_traversal",)),
-    Kind("video_claims_frames", _on_video(files.claim_frames), ("too_large", "truncated_video", "out_of_memory")),
+    Kind("video_truncated", _on_video(defects.truncate), ("truncated_video",)),
+    Kind("video_missing", _on_video(defects.missing), ("missing_file",)),
+    Kind("video_pipe", _on_video(defects.pipe), ("special_file", "missing_file")),
+    Kind("video_linked_out", _on_video(defects.link_out), ("path_traversal",)),
+    Kind("video_claims_frames", _on_video(defects.claim_frames), ("too_large", "truncated_video", "out_of_memory")),
     Kind("video_too_long", _video_of_other_length, ("length_mismatch",)),
-    Kind("table_truncated", _on_table(files.truncate), ("unreadable",)),
-    Kind("table_missing", _on_table(files.missing), ("missing_file",)),
+    Kind("table_truncated", _on_table(defects.truncate), ("unreadable",)),
+    Kind("table_missing", _on_table(defects.missing), ("missing_file",)),
     Kind("column_missing", _without_column, ("missing_column",)),
     Kind("rows_uneven", _uneven_rows, ("length_mismatch",)),
     Kind("state_not_finite", _on_state(_not_finite), ("nan_state",)),
@@ -156,7 +156,6 @@ _PICTURES: tuple[tuple[str, PictureDefect, tuple[str, ...]], ...] = (
 )
 
 
-KIND_COUNT = len(KINDS) + len(_PICTURES) + 5
 """How many recordings `write` adds for each of `each`."""
 
 
@@ -207,7 +206,7 @@ def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> t
             dataset.list_again()
         sound = dataset.add("video_claims_pixels", "kept")  # the stream itself says how large its pictures are
         _write_episode(sound, random, NUM_FRAMES)
-        files.claim_pixels(sound.video(random), random)
+        defects.claim_pixels(sound.video(random), random)
         for name, change, reasons in _PICTURES:
             _write_episode(dataset.add(name, "filter", reasons), random, NUM_FRAMES, change)
         _write_episode(dataset.add("still", "filter", ("static",)), random, NUM_FRAMES, _frozen, still=True)

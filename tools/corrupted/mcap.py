@@ -14,7 +14,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from tools.corrupted import files
+from tools.corrupted import defects
 from tools.corrupted.content import (
     FPS,
     HEIGHT,
@@ -24,7 +24,7 @@ from tools.corrupted.content import (
     joint_motion,
     pictures,
 )
-from tools.corrupted.labels import Kind, Label
+from tools.corrupted.defects import Kind, Label
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.mcap.exported import write_episode_mcap
 
@@ -98,15 +98,14 @@ def _claim_chunk(path: Path, random: np.random.Generator) -> None:
 
 
 FILE_KINDS = (
-    Kind("file_truncated", files.truncate, ("unreadable",)),
-    Kind("file_empty", files.empty, ("unreadable",)),
-    Kind("file_garbage", files.garbage, ("unreadable",)),
-    Kind("file_linked_out", files.link_out, ("path_traversal",)),
+    Kind("file_truncated", defects.truncate, ("unreadable",)),
+    Kind("file_empty", defects.empty, ("unreadable",)),
+    Kind("file_garbage", defects.garbage, ("unreadable",)),
+    Kind("file_linked_out", defects.link_out, ("path_traversal",)),
     Kind("chunk_claims_bytes", _claim_chunk, ("too_large",)),
 )
 
 
-KIND_COUNT = len(VALUE_KINDS) + len(MESSAGE_KINDS) + len(FILE_KINDS) + 2
 """How many recordings `write` adds for each of `each`."""
 
 
