@@ -10,7 +10,6 @@ from pathlib import Path
 
 from flows.exchange_commands import add_exchange_commands
 from flows.full_size_commands import add_plan_command, add_rehearse_command
-from flows.init_commands import add_init_command
 from tasks.execution.artifact_task import find_task, task_names
 from tasks.execution.command_line import add_config_arguments, add_task_arguments
 from tasks.execution.temporary_server import prepare_prefect
@@ -23,7 +22,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"worldline {metadata.version('worldline')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    add_init_command(commands)
+    _add_init(commands)
     pipeline = commands.add_parser("pipeline", help="run every step, from recordings to the report")
     pipeline.set_defaults(run=_pipeline)
     nightly = commands.add_parser("nightly", help="evaluate the shipped checkpoints and compare with earlier nights")
@@ -121,6 +120,25 @@ def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         parser.set_defaults(run=_serve)
 
 
+def _add_init(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    init = commands.add_parser(
+        "init",
+        help="look at recordings of your own and write a configuration for them",
+        description="Find out kind, robot, columns, units, cameras and rate of recordings, and write a commented file that extends"
+        " the preset my_robot. What cannot be known becomes a TODO line in it.",
+    )
+    init.add_argument(
+        "recordings",
+        metavar="PATH_OR_HUB_ID",
+        help="a folder, an MCAP file, or ORG/NAME of a LeRobotDataset on the hub",
+    )
+    init.add_argument(
+        "--output", type=Path, default=Path("my.yaml"), metavar="FILE", help="the file to write (default: my.yaml)"
+    )
+    init.add_argument("--json", action="store_true", help="print the findings as JSON")
+    init.set_defaults(run=_init)
+
+
 def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     calibrate = commands.add_parser("calibrate", help="find out whether recordings agree with their calibration")
     actions = calibrate.add_subparsers(dest="calibrate_command", required=True, metavar="ACTION")
@@ -207,6 +225,25 @@ def _task(arguments: argparse.Namespace) -> None:
 
     prepare_prefect(arguments.artifacts)
     print_artifact(run_task(find_task(arguments.step), arguments))
+
+
+def _init(arguments: argparse.Namespace) -> None:
+    import json
+
+    from worldline_core.discovery.configuration import write_config
+    from worldline_core.discovery.hub import fetch_sample, hub_id
+    from worldline_core.discovery.look import discover
+    from worldline_core.discovery.report import as_json, as_text
+
+    hub = None if (name := hub_id(arguments.recordings)) is None else fetch_sample(name)
+    found = discover(Path(arguments.recordings) if hub is None else hub.folder)
+    write_config(found, arguments.output, arguments.recordings)
+    commands = ([hub.command] if hub is not None else []) + [f"worldline task curate --config {arguments.output}"]
+    print(
+        json.dumps(as_json(found, arguments.output, commands), indent=1)
+        if arguments.json
+        else as_text(found, arguments.output, commands)
+    )
 
 
 def _record(arguments: argparse.Namespace) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -337,6 +339,48 @@ def test_a_collection_names_the_datasets_that_differ(tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
     (tmp_path / "raw/a").rename(tmp_path / "one/a")
     assert look(tmp_path / "one").source["path"] == str(tmp_path / "one/a")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda f: f["observation.state"].update(shape=[8], names=None), "fewer columns than the dataset says"),
+        (lambda f: f.pop("observation.state"), "has no joints"),
+        (lambda f: [f[key].update(info={"is_depth_map": True}) for key in list(f) if "images" in key], "no camera in colour"),
+    ],
+)  # fmt: skip
+def test_metadata_that_contradict_the_files_are_named(tmp_path: Path, change: Any, said: str) -> None:
+    write_so101(tmp_path / "raw")
+    info = json.loads((tmp_path / "raw/meta/info.json").read_text())
+    change(info["features"])
+    (tmp_path / "raw/meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(DataError, match=said):
+        look(tmp_path / "raw")
+
+
+@pytest.mark.parametrize(
+    ("frames", "fps", "note"),
+    [
+        ([np.tile(state[:1], (60, 1)) for state in so101_states()], 30, "No joint moves"),
+        ([state[:2] for state in so101_states()], 30, "No joint moves"),
+        ([np.where(np.arange(6) == 2, np.nan, state) for state in so101_states()], 30, None),
+        ([np.where(np.arange(60)[:, None] == 7, np.inf, state) for state in so101_states()], 30, None),
+    ],
+    ids=["still", "two-frames", "nan", "inf"],
+)
+def test_odd_recordings_are_looked_at(tmp_path: Path, frames: list[np.ndarray], fps: int, note: str | None) -> None:
+    finite = [np.nan_to_num(state, posinf=0.0) for state in frames]
+    videos = {"observation.images.front": [pictures(state[:, :5], "still") for state in finite]}
+    found = look(write_lerobot(tmp_path / "raw", {"observation.state": (SO_NAMES, frames)}, videos, fps=fps))
+    assert found.source["embodiment"] == "so101"
+    assert note is None or any(re.search(note, text) for text in found.notes)
+
+
+def test_a_rate_that_the_time_stamps_contradict_is_said(tmp_path: Path) -> None:
+    write_so101(tmp_path / "raw")
+    path = tmp_path / "raw/meta/info.json"
+    path.write_text(path.read_text().replace('"fps": 30', '"fps": 15'))
+    assert any("15 fps, the time stamps 30" in note for note in look(tmp_path / "raw").notes)
 
 
 def test_never_over_a_file_and_damaged_sets_are_one_error(tmp_path: Path) -> None:

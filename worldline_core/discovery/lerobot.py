@@ -47,6 +47,7 @@ _OLD_SIGNS, _OLD_ZEROS = (1, -1, 1, 1, 1), (0, 90, 90, 0, 0)
 """Of an SO-100 before LeRobot's change of calibration (PR 777): its arm stretched out is where shoulder and elbow are 0."""
 _DROID_VIDEOS = {"observation.images.exterior_1_left", "observation.images.exterior_2_left"}
 _FULL_TURN = "wrist_roll"
+_MOVES_RAD, _RATE_TOLERANCE = 0.02, 0.02
 _ALIKE = 0.5
 """Least correlation of a command with the state that follows it."""
 
@@ -68,6 +69,14 @@ class _Sample:
     def episode(self, index: int, columns: Sequence[Column]) -> np.ndarray:
         features = {c.feature: self.dataset.column(index, c.feature) for c in columns}
         flat = {name: v[:, None] if v.ndim == 1 else v for name, v in features.items()}
+        for column in columns:
+            if column.index >= flat[column.feature].shape[1]:
+                raise RejectedInputError(
+                    "length_mismatch", "Feature has fewer columns than the dataset says",
+                    where=f"{self.dataset.root}, episode {index}, {column.feature}",
+                    expected=f"more than {column.index}", got=flat[column.feature].shape[1],
+                    next_step="correct meta/info.json, or write the dataset again",
+                )  # fmt: skip
         return np.stack([flat[c.feature][:, c.index].astype(np.float64) for c in columns], axis=1)
 
 
@@ -98,10 +107,11 @@ def discover_lerobot(root: AnyPath) -> Discovery:
         found.notes.append(
             f"Only {found.episodes} of the {sample.listed} listed episodes can be read; curation quarantines the others."
         )
+    _times(found, sample)
     state, action = _vectors(dataset, _STATE), _vectors(dataset, _ACTION)
     arms, why = find_arms(state)
     if not arms:
-        _without_arms(found, why)
+        _without_arms(found, dataset, why)
     else:
         _with_arms(found, sample, "droid_franka" if droid else robot_type, arms, action, why)
     _views(found, sample, arms)
@@ -139,6 +149,17 @@ def _sample(dataset: LeRobotDataset) -> _Sample:
     return _Sample(dataset, sorted(readable), len(listed))
 
 
+def _times(found: Discovery, sample: _Sample) -> None:
+    """Compare the stated rate with the time stamps."""
+    steps = np.concatenate([np.diff(sample.dataset.column(i, "timestamp").reshape(-1)) for i in sample.indices])
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    if len(steps) and abs(np.median(steps) * sample.dataset.fps - 1) > _RATE_TOLERANCE:
+        rate = 1 / float(np.median(steps))
+        found.notes.append(
+            f"meta/info.json says {sample.dataset.fps:g} fps, the time stamps {rate:.4g}: curation refuses that (wrong_fps)."
+        )
+
+
 def _vectors(dataset: LeRobotDataset, prefix: str) -> list[Column]:
     """Columns of the feature of this name, where its names or its width say whose they are; else of those that begin with it."""
 
@@ -160,14 +181,18 @@ def _vectors(dataset: LeRobotDataset, prefix: str) -> list[Column]:
     return []
 
 
-def _without_arms(found: Discovery, why: str) -> None:
-    found.say(
-        ("embodiment",), NO_EMBODIMENT, f"no joints were recognised ({why}): the whole state is taken, for Stage I"
-    )
-    found.say(("angle_unit",), "rad", "of the whole state, which no robot's description reads")
-    found.notes.append(
-        "Without joints there are no action maps: declare `arms` (docs/sources.md) where the state has some."
-    )
+def _without_arms(found: Discovery, dataset: LeRobotDataset, why: str) -> None:
+    """The whole of the state, whatever its columns are."""
+    shape = dataset.features.get(_STATE, {}).get("shape")
+    if not isinstance(shape, list) or len(shape) != 1:
+        raise DataError(
+            "The dataset has no joints", where=f"{dataset.root}, meta/info.json", expected=f"a vector {_STATE}",
+            got=named(list(dataset.features), 12), next_step="its videos alone serve Stage I: worldline init on the folder videos",
+        )  # fmt: skip
+    found.say(("embodiment",), NO_EMBODIMENT, f"no joints were recognised: {why}")
+    found.say(("angle_unit",), "rad", "the whole state is taken as it is")
+    found.state_size = int(shape[0])
+    found.notes.append("No joints were recognised: declare `arms` (docs/sources.md) where the state has some.")
 
 
 def _with_arms(
@@ -207,6 +232,10 @@ def _with_arms(
         if any(arm.gripper is None for arm in arms):
             said = f"{match.name} fits ({match.evidence}), but no column is a gripper, which its state has"
             match, others = None, []
+    spans = [np.ptp(sample.episode(index, arm.joints), axis=0).max() for index in sample.indices for arm in arms]
+    if float(np.nan_to_num(spans).max()) * (1.0 if unit == "rad" else np.pi / 180) < _MOVES_RAD:
+        text = f"No joint moves in the {len(sample.indices)} episodes that were looked at: no controls can be learned from them."
+        found.notes.append(text)
     found.say(
         ("angle_unit",),
         unit,
@@ -466,7 +495,7 @@ def _watched(sample: _Sample, camera: str, arms: list[ArmColumns]) -> Seen | Non
         frames = np.arange(0, length, step)[:_PICTURES].tolist()
         try:
             pictures = _pictures(dataset, index, camera, frames)
-        except RejectedInputError:
+        except DataError:  # curation says why
             continue
         scale = max(float(np.ptp(values, axis=0).max()) for values in states.values()) or 1.0
         motion: dict[Side, np.ndarray] = {
