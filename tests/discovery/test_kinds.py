@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from published_robomind import write_franka
 from recorded_sets import motion, pictures, write_so101, write_video
@@ -18,6 +19,8 @@ from test_source_unitree_h5 import write_hdf5, write_transitions
 from flows.command_line import main
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.clip import decode_video
+from worldline_core.discovery.cameras import name_views, watch
 from worldline_core.discovery.configuration import write_config
 from worldline_core.discovery.findings import Discovery
 from worldline_core.discovery.look import discover, look
@@ -181,6 +184,20 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     assert (found["source"]["embodiment"], found["todo"], found["file"]) == ("so101", {}, "other.yaml")
     assert found["next"] == ["worldline task curate --config other.yaml"]
     assert {"key": ["angle_unit"], "sentence": found["evidence"][1]["sentence"]} in found["evidence"]
+
+
+@pytest.mark.slow
+def test_real_wrist_cameras_are_told_by_their_pictures_alone(shared_data: Path) -> None:
+    """DROID: two cameras outside, one on the wrist, here without names; one episode each, though `init` has several to look at."""
+    right = []
+    for file in sorted((shared_data / "droid_ctrl_world").glob("*/annotation/*/*.json")):
+        record = json.loads(file.read_text())
+        joints = np.array(record.get("joints") or record["observation.state.joint_position"][::3])[:48, :7]
+        frames = [decode_video(file.parents[2] / video["video_path"])[: len(joints)] for video in record["videos"]]
+        motion = np.abs(np.diff(joints, axis=0)).max(axis=1)
+        seen = {name: watch(f, {"right": motion[: len(f) - 1]}) for name, f in zip("acb", frames, strict=True)}
+        right.append(name_views("bac", ["right"], seen).views.get("b") == "right_wrist")
+    assert (len(right), sum(right)) >= (15, 14)
 
 
 SAMPLES = {
