@@ -2,11 +2,12 @@
 
 A start (body, scene, camera, things, instruction) is one bank of the EpisodeSet, an attempt one of its candidates. Of a
 candidate bank the outcomes go to ``sealed_outcomes.parquet`` only, so that whatever chooses among candidates cannot read them
-from the index. A compared policy is the source of its episodes.
+from the index; with them, where there are any, the facts measured in contact tasks and the sizes of misses. A compared policy is the source of its episodes.
 """
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,12 +24,12 @@ from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.progress import Progress
 from worldline_core.recorder.bodies import Robot
-from worldline_core.recorder.controllers import ScriptedPolicy
+from worldline_core.recorder.controllers import ScriptedPolicy, miss_of
 from worldline_core.recorder.looks import SCENE_PATTERN, look_of
 from worldline_core.recorder.record import SPLIT_STREAM, Embodiment, check_recorded, run_in_processes
 from worldline_core.recorder.rendering import prepare_rendering
-from worldline_core.recorder.scene import Family, Layout, sample_layout
-from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion
+from worldline_core.recorder.scene import CONTACT, Family, Layout
+from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, draw_layout
 from worldline_core.store.atomic import atomic_path
 
 SEALED_FILE = "sealed_outcomes.parquet"
@@ -89,7 +90,7 @@ class _AttemptsConfig(StrictModel):
         """Twenty initial states to try, each with the seed of its attempts."""
         for trial in range(20):
             entropy = (self.seed, robot.stream, SPLIT_STREAM[split], start.layout, trial)
-            yield entropy, sample_layout(robot, start.family, np.random.default_rng(entropy), look_of(start.scene))
+            yield entropy, draw_layout(robot, start.family, np.random.default_rng(entropy), look_of(start.scene))
 
     def camera_draws(self, start: BankSpec) -> np.random.Generator:
         """Draws of the same small camera shift for all attempts: they share the first picture."""
@@ -102,6 +103,7 @@ class RecordBanksConfig(_AttemptsConfig):
     Attributes:
         banks: one by one, or as a grid.
         masks: also store the exact pixels of the robot and of each thing; whoever chooses among videos needs none.
+        misses: share of the candidates that miss by any amount, as of `RecordConfig`.
         success_range: the share of a bank's candidates that succeed must be in this range; otherwise the next initial
             state is tried (at most 20).
     """
@@ -110,6 +112,7 @@ class RecordBanksConfig(_AttemptsConfig):
     candidates: int = Field(default=32, ge=2, le=512)
     video_crf: int = Field(default=22, ge=0, le=51)
     masks: bool = True
+    misses: float = Field(default=0.0, ge=0, le=1)
     success_range: tuple[float, float] = (0.25, 0.75)
 
     def specs(self) -> list[BankSpec]:
@@ -125,7 +128,8 @@ class RecordBanksConfig(_AttemptsConfig):
         for entropy, layout in self.layouts(recorder.scene.robot, spec, "bank"):
             motions: list[ExecutedMotion] = []
             for draw in range(4 * self.candidates):
-                motion = recorder.move(layout, np.random.default_rng((*entropy, draw + 1)), self.num_frames)
+                policy = miss_of(self.misses, spec.family, (*entropy, draw + 1))
+                motion = recorder.move(layout, np.random.default_rng((*entropy, draw + 1)), self.num_frames, policy)
                 if motion is not None:
                     motions.append(motion)
                 if len(motions) == self.candidates:
@@ -174,11 +178,13 @@ class RecordPoliciesConfig(_AttemptsConfig):
         raise DataError("No initial state is in reach of every policy", where=f"start {start.name}")
 
 
-def _record_start(task: tuple[BankSpec, RecordBanksConfig | RecordPoliciesConfig, Path]) -> dict[str, str]:
-    """Record the missing attempts of a start in a worker process; outcomes of all of them by name."""
+def _record_start(
+    task: tuple[BankSpec, RecordBanksConfig | RecordPoliciesConfig, Path],
+) -> dict[str, tuple[str, dict[str, float]]]:
+    """Record the missing attempts of a start in a worker process; outcomes and facts of all of them by name."""
     start, config, output = task
     sealed = isinstance(config, RecordBanksConfig)
-    recorder = EpisodeRecorder(start.embodiment)
+    recorder = EpisodeRecorder(start.embodiment, contact=start.family in CONTACT)
     layout, motions = config.draw(recorder, start)
     finished = EpisodeSetWriter.finished(output)
     writer = None if finished else EpisodeSetWriter(output, video_crf=config.video_crf)
@@ -198,13 +204,13 @@ def _record_start(task: tuple[BankSpec, RecordBanksConfig | RecordPoliciesConfig
             thing_labels=recording.thing_labels if masked else None,
         )
     recorder.close()
-    return {name: motion.outcome for name, motion in motions.items()}
+    return {name: (motion.outcome, motion.facts) for name, motion in motions.items()}
 
 
 def _record_starts(
     config: RecordBanksConfig | RecordPoliciesConfig, output: Path
-) -> list[tuple[BankSpec, dict[str, str]]]:
-    """Record all starts; finished episodes survive a kill. Returns the outcomes of each start by attempt."""
+) -> list[tuple[BankSpec, dict[str, tuple[str, dict[str, float]]]]]:
+    """Record all starts; finished episodes survive a kill. Returns outcome and facts of each attempt, by start."""
     prepare_rendering()
     specs, outcomes = config.specs(), []
     with Progress("record attempts", len(specs), "start") as progress:
@@ -224,15 +230,17 @@ def record_banks(config: RecordBanksConfig, output: Path) -> dict[str, Any]:
     Raises: UnavailableError without MuJoCo; DataError when a bank cannot be drawn, or the folder holds other episodes.
     """
     recorded = _record_starts(config, output)
+    known = any(facts for _, found in recorded for _, facts in found.values())
     rows = [
         {"episode_id": f"{spec.name}-{name}", "outcome": outcome}
+        | ({"facts": json.dumps(facts, sort_keys=True)} if known else {})
         for spec, found in recorded
-        for name, outcome in found.items()
+        for name, (outcome, facts) in found.items()
     ]
     with atomic_path(output / SEALED_FILE) as path:
         pq.write_table(pa.Table.from_pylist(sorted(rows, key=lambda row: row["episode_id"])), path)
     counts = {
-        spec.name: {"candidates": len(found), "successes": list(found.values()).count("success")}
+        spec.name: {"candidates": len(found), "successes": sum(outcome == "success" for outcome, _ in found.values())}
         for spec, found in recorded
     }
     return {"banks": len(recorded), "candidates": len(rows), "successes": counts}
@@ -246,7 +254,7 @@ def record_policies(config: RecordPoliciesConfig, output: Path) -> dict[str, Any
     recorded = _record_starts(config, output)
     table: dict[str, dict[str, dict[str, int]]] = defaultdict(dict)
     for spec, found in recorded:
-        for policy, outcome in found.items():
+        for policy, (outcome, _) in found.items():
             cell = table[policy].setdefault(spec.family, {"attempts": 0, "successes": 0})
             cell["attempts"] += 1
             cell["successes"] += outcome == "success"

@@ -6,6 +6,7 @@ is drawn; whether it went wrong is measured afterwards (``outcomes.outcome``).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
@@ -100,8 +101,11 @@ class ScriptedPolicy(StrictModel):
     miss: Miss | None = None
 
 
-def draw_miss(family: str, random: np.random.Generator) -> ScriptedPolicy:
-    """Draw the right plan with one miss of the task, its size even from nothing to the largest."""
+def miss_of(share: float, family: str, entropy: tuple[int, ...]) -> ScriptedPolicy | None:
+    """That share of the plans: the right one with a miss, its size even from nothing to the largest. None: no miss of this task's."""
+    random = np.random.default_rng((*entropy, 3))
+    if family not in MISSES or random.uniform() >= share:
+        return None
     kind = str(random.choice(list(MISSES[family])))
     return ScriptedPolicy(miss=Miss.model_validate({"kind": kind, "size": random.uniform(0, MISSES[family][kind])}))
 
@@ -298,14 +302,26 @@ def _idle(robot: Robot, layout: Layout, arm: int, random: np.random.Generator, d
 
 
 def plan_waypoints(
-    robot: Robot, layout: Layout, random: np.random.Generator, duration: float, *, mistakes: float | None = None
+    robot: Robot,
+    layout: Layout,
+    random: np.random.Generator,
+    duration: float,
+    *,
+    mistakes: float | None = None,
+    acting: Mapping[int, list[Waypoint]] | None = None,
 ) -> list[list[Waypoint]]:
     """Waypoints per arm for ``duration`` seconds.
 
     Args:
         mistakes: the share of plans that go wrong; by default each task's own.
+        acting: waypoints of the arms that act, where they are already planned.
     """
-    if layout.family == "carry":
+    if acting is not None:
+        plans = [
+            acting[arm] if arm in acting else _idle(robot, layout, arm, random, duration)
+            for arm in range(len(robot.arms))
+        ]
+    elif layout.family == "carry":
         plans = _carry(robot, layout, random, mistakes)
     else:
         plans = [

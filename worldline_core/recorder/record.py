@@ -21,11 +21,11 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.errors import DataError
 from worldline_core.progress import Progress
 from worldline_core.recorder.bodies import BODIES
-from worldline_core.recorder.controllers import ScriptedPolicy, draw_miss
+from worldline_core.recorder.controllers import ScriptedPolicy, miss_of
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.looks import LookName
 from worldline_core.recorder.rendering import prepare_rendering
-from worldline_core.recorder.scene import TASKS, Family
+from worldline_core.recorder.scene import CONTACT, TASKS, TWO_ARMED, Family
 from worldline_core.recorder.simulate import EpisodeRecorder, Job
 from worldline_core.scale.process import end_with_pool
 from worldline_core.store.atomic import write_json_atomic
@@ -68,8 +68,9 @@ class RecordGroup(StrictModel):
 
     @model_validator(mode="after")
     def _enough_arms(self) -> RecordGroup:
-        if "carry" in self.families and len(BODIES[self.embodiment].arms) < 2:
-            raise ValueError(f"carry needs two arms; {self.embodiment} has one")
+        for family in TWO_ARMED:
+            if family in self.families and len(BODIES[self.embodiment].arms) < 2:
+                raise ValueError(f"{family} needs two arms; {self.embodiment} has one")
         if self.look == "unseen" and self.split in ("train", "validation"):
             raise ValueError("unseen looks are for tests: split test or ood_test wanted, got " + self.split)
         return self
@@ -141,10 +142,8 @@ class RecordConfig(StrictModel):
 
     def policy(self, family: str, entropy: tuple[int, ...]) -> ScriptedPolicy | None:
         """How one episode is carried out; None: as planned."""
-        random = np.random.default_rng((*entropy, 3))
-        if random.uniform() < self.misses:
-            return draw_miss(family, random)
-        return self.variety and self.variety.draw(np.random.default_rng((*entropy, 2)))
+        miss = miss_of(self.misses, family, entropy)
+        return miss or (self.variety and self.variety.draw(np.random.default_rng((*entropy, 2))))
 
     @model_validator(mode="after")
     def _enough_to_spoil(self) -> RecordConfig:
@@ -183,12 +182,16 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
             )
             jobs.append((round(10 * position / group.count), job))
     # A tenth of every group in turn, so that a worker keeps its compiled model for a while.
-    jobs.sort(key=lambda item: (item[0], item[1].embodiment, item[1].split, item[1].episode_id))
+    jobs.sort(
+        key=lambda item: (
+            item[0], item[1].embodiment, item[1].family in CONTACT, item[1].split, item[1].episode_id
+        )
+    )  # fmt: skip
     return [job for _, job in jobs]
 
 
 # One recorder per process: a compiled model and its renderers are reused while the embodiment stays the same.
-_RECORDERS: dict[tuple[str, bool], EpisodeRecorder] = {}
+_RECORDERS: dict[tuple[str, bool, bool], EpisodeRecorder] = {}
 
 
 def _close_recorders() -> None:
@@ -200,7 +203,7 @@ def _close_recorders() -> None:
 def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
     """Record one episode into the set's parts; runs in a worker process."""
     job, config, output = task
-    key = (job.embodiment, job.held_out_camera)
+    key = (job.embodiment, job.held_out_camera, job.family in CONTACT)
     if key not in _RECORDERS:
         _close_recorders()
         _RECORDERS[key] = EpisodeRecorder(*key)

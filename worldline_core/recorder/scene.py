@@ -215,8 +215,12 @@ TRAY_HALF, HANDLE_HALF, HANDLE_APART = (0.048, 0.150, 0.010), (0.028, 0.028, 0.0
 HANDLES = {"left": HANDLE_APART, "right": -HANDLE_APART}
 # A button that is down by more than this share of its travel is pressed.
 BUTTON_DOWN = 0.5
-Family = Literal["lift", "place", "close", "press", "carry"]
-TASKS: tuple[Family, ...] = get_args(Family)
+HouseholdFamily = Literal["lift", "place", "close", "press", "carry"]
+ContactFamily = Literal["grip", "balance", "topple", "detour", "peg", "stack", "roll", "both", "level"]
+Family = HouseholdFamily | ContactFamily
+TASKS: tuple[HouseholdFamily, ...] = get_args(HouseholdFamily)
+CONTACT: tuple[ContactFamily, ...] = get_args(ContactFamily)
+TWO_ARMED = ("carry", "both", "level")
 # How many of each kind a scene can hold.
 KINDS = {"block": 2, "can": 2, "pad": 2, "button": 2, "drawer": 1, "tray": 1}
 # Height of a free thing's origin where it stands.
@@ -232,6 +236,8 @@ OBJECT_COLOURS: dict[str, tuple[float, float, float]] = {
     "purple": (0.60, 0.08, 0.80),
     "orange": (1.00, 0.48, 0.02),
 }
+# Of things that no instruction names.
+NEUTRAL_COLOURS = {"white": (0.93, 0.92, 0.88)}
 
 
 @dataclass(frozen=True)
@@ -260,7 +266,7 @@ class Layout:
     """Initial state and instruction of an episode.
 
     Attributes:
-        family: one of TASKS.
+        family: one of TASKS or CONTACT.
         arm: number of the arm that acts; of a carry, in which both act, the first.
         start: per arm (x, y, z, yaw, opening) of the tool and gripper at the first frame.
         target: what is lifted, placed, closed, pressed or carried.
@@ -280,7 +286,7 @@ class Layout:
 
     def acting(self) -> tuple[int, ...]:
         """Numbers of the arms that act."""
-        return tuple(range(len(self.start))) if self.family == "carry" else (self.arm,)
+        return tuple(range(len(self.start))) if self.family in TWO_ARMED else (self.arm,)
 
     def named(self) -> list[tuple[str, Thing]]:
         """Every thing with the name of its body: ``block_0``, ``block_1``, ..; the target is the first of its kind."""
@@ -295,7 +301,7 @@ class Layout:
 
     def rgba(self, thing: Thing) -> list[float]:
         """Colour of a thing in this look."""
-        return [*self.look.paint(OBJECT_COLOURS[thing.colour]), 1.0]
+        return [*self.look.paint((OBJECT_COLOURS | NEUTRAL_COLOURS)[thing.colour]), 1.0]
 
 
 def build_scene(robot: Robot) -> SceneModel:

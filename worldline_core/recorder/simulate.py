@@ -10,7 +10,7 @@ actions alone reproduce the motion.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -18,7 +18,9 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
-from worldline_core.recorder.bodies import BODIES, CENTRE, HELD_OUT_BODY
+from worldline_core.recorder.bodies import BODIES, CENTRE, HELD_OUT_BODY, Robot
+from worldline_core.recorder.contact_scene import apply_contact_layout, build_contact_scene, solid_labels
+from worldline_core.recorder.contact_tasks import CONTACT_TASKS, Ended
 from worldline_core.recorder.controllers import (
     ArmSolver,
     ScriptedPolicy,
@@ -30,10 +32,11 @@ from worldline_core.recorder.controllers import (
     shifted,
     tool_rotation,
 )
-from worldline_core.recorder.looks import HELD_OUT_CAMERA, SCENES, LookName, look_of, scenes, trains
+from worldline_core.recorder.looks import HELD_OUT_CAMERA, SCENES, Look, LookName, look_of, scenes, trains
 from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.rendering import SceneRenderer
 from worldline_core.recorder.scene import (
+    CONTACT,
     FRAME_RATE,
     SUBSTEPS,
     Layout,
@@ -48,7 +51,11 @@ from worldline_core.recorder.scene import (
 # Largest accepted distance between a planned tool position and what the arm can reach.
 REACH_TOLERANCE_M = 0.012
 # What a recorded episode calls a task: what changes a thing's state is one family, whatever is lifted another.
-_TASK_FAMILIES = {"close": "state_change", "press": "state_change", "carry": "lift"}
+_TASK_FAMILIES = {
+    **dict.fromkeys(("close", "press", "roll"), "state_change"),
+    **dict.fromkeys(("carry", "grip", "balance", "topple", "both", "level"), "lift"),
+    **dict.fromkeys(("detour", "peg", "stack"), "place"),
+}
 # Share of the training episodes in which a body's links have drawn colours instead of its own.
 REPAINTED = 0.4
 
@@ -72,7 +79,7 @@ class Job:
 class ExecutedMotion:
     """``state`` and ``action`` (N, J), full positions ``qpos`` (N, nq), and the measured outcome.
 
-    ``failure`` says what went wrong.
+    ``failure`` says what went wrong; ``facts``: what a contact task measured, and the size of a miss.
     """
 
     state: np.ndarray
@@ -80,6 +87,7 @@ class ExecutedMotion:
     qpos: np.ndarray
     outcome: str
     failure: str = ""
+    facts: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -95,6 +103,15 @@ class Recording:
     robot_masks: dict[str, np.ndarray]
     failure: str = ""
     thing_labels: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def draw_layout(robot: Robot, family: str, random: np.random.Generator, look: Look) -> Layout:
+    """Draw an initial state for any task."""
+    return (
+        CONTACT_TASKS[family].layout(robot, random, look)
+        if family in CONTACT
+        else sample_layout(robot, family, random, look)
+    )
 
 
 def motor_targets(scene: SceneModel, action: np.ndarray) -> np.ndarray:
@@ -160,15 +177,16 @@ def read_state(scene: SceneModel, data: Any) -> np.ndarray:
 class EpisodeRecorder:
     """Records episodes of one body; holds the compiled model and its renderers.
 
-    With ``held_out_camera`` the head camera is placed where it never is otherwise.
+    With ``held_out_camera`` the head camera is placed where it never is otherwise; ``contact``: the tasks are contact tasks.
 
     Raises: DataError for an unknown body.
     """
 
-    def __init__(self, body: str, held_out_camera: bool = False) -> None:
+    def __init__(self, body: str, held_out_camera: bool = False, contact: bool = False) -> None:
         if body not in BODIES:
             raise DataError("Unknown body", expected=" | ".join(sorted(BODIES)), got=body)
-        self.scene = build_scene(BODIES[body])
+        self.scene = build_contact_scene(BODIES[body]) if contact else build_scene(BODIES[body])
+        self.contact = contact
         self.held_out_camera = held_out_camera
         self._solver = ArmSolver(self.scene)
         self._data = self.new_data()
@@ -190,12 +208,20 @@ class EpisodeRecorder:
     def move(
         self, layout: Layout, random: np.random.Generator, num_frames: int, policy: ScriptedPolicy | None = None
     ) -> ExecutedMotion | None:
-        """Plan and execute, as well or badly as ``policy`` does; None when the plan leaves what the arms can reach."""
+        """Plan and execute, as well or badly as ``policy`` does; None when the plan leaves what the arms can reach.
+
+        Raises: DataError for a layout of the other kind of tasks.
+        """
+        self._check(layout)
         duration, mistakes = (num_frames - 1) / FRAME_RATE, None if policy is None else policy.mistakes
-        plans = plan_waypoints(self.scene.robot, layout, random, duration, mistakes=mistakes)
+        robot, acting = self.scene.robot, None
+        if self.contact:
+            knows = mistakes is not None and random.uniform() >= mistakes
+            acting = CONTACT_TASKS[layout.family].plan(robot, layout, random, knows)
+        plans = plan_waypoints(robot, layout, random, duration, mistakes=mistakes, acting=acting)
         if policy is not None:
             if policy.miss is not None:
-                missing(self.scene.robot, layout, plans, policy.miss, random)
+                missing(robot, layout, plans, policy.miss, random)
             for arm in layout.acting():
                 plans[arm] = shifted(plans[arm], np.array(policy.bias_m) + random.normal(0, policy.noise_m, 2))
         action = self.follow(plans, num_frames)
@@ -205,7 +231,22 @@ class EpisodeRecorder:
             action = late(action, policy.delay_frames)
             grippers = [number for number, name in enumerate(self.scene.state_names) if name.endswith("/gripper")]
             action[:, grippers] = late(action, policy.gripper_delay_frames)[:, grippers]
-        return self.replay(layout, action)
+        motion = self.replay(layout, action)
+        if policy is None or policy.miss is None:
+            return motion
+        return replace(motion, facts=motion.facts | {f"miss_{policy.miss.kind}": policy.miss.size})
+
+    def set_up(self, data: Any, layout: Layout) -> None:
+        """Put every thing at its place in ``data``, with its looks; raises as `move`."""
+        self._check(layout)
+        (apply_contact_layout if self.contact else apply_layout)(self.scene, data, layout)
+
+    def _check(self, layout: Layout) -> None:
+        if (layout.family in CONTACT) != self.contact:
+            raise DataError(
+                "The scene lacks the task's things", where=layout.family,
+                expected="a contact task" if self.contact else "no contact task",
+            )  # fmt: skip
 
     def follow(self, plans: list[list[Waypoint]], num_frames: int) -> np.ndarray | None:
         """Actions (N, J) that lead every arm along its waypoints; None when these leave what the arms can reach."""
@@ -225,8 +266,11 @@ class EpisodeRecorder:
 
     def replay(self, layout: Layout, action: np.ndarray) -> ExecutedMotion:
         """Execute recorded actions (N, J) from the layout's initial state."""
-        apply_layout(self.scene, self._data, layout)
+        self.set_up(self._data, layout)
         state, qpos = execute(self.scene, self._data, action)
+        if self.contact:
+            failure, facts = CONTACT_TASKS[layout.family].judge(Ended(self.scene, self._data, qpos), layout)
+            return ExecutedMotion(state, action, qpos, "failure" if failure else "success", failure, facts)
         tool = self.tool_positions(layout.arm, qpos)
         return ExecutedMotion(state, action, qpos, *outcome(self.scene, self._data, layout, qpos, tool))
 
@@ -246,10 +290,11 @@ class EpisodeRecorder:
         if self._renderer is None:
             self._renderer = SceneRenderer(self.scene)
         # Another layout may have been executed since: this one decides where objects stand and what they look like.
-        apply_layout(self.scene, self._data, layout)
+        self.set_up(self._data, layout)
         self._set_scene(self._renderer, scene_id, jitter)
+        labels = (solid_labels if self.contact else thing_labels)(self.scene, layout)
         frames, masks, things, cameras = self._renderer.render(
-            motion.qpos, lambda qpos: light_buttons(self.scene, layout, qpos), thing_labels(self.scene, layout)
+            motion.qpos, lambda qpos: light_buttons(self.scene, layout, qpos), labels
         )
         drawn = scene_id not in SCENES
         held_out = {
@@ -288,7 +333,7 @@ class EpisodeRecorder:
         random = np.random.default_rng(job.entropy)
         scene_id = str(random.choice(scenes(job.look, job.split in ("train", "validation"))))
         for _ in range(50):
-            layout = sample_layout(self.scene.robot, job.family, random, look_of(scene_id))
+            layout = draw_layout(self.scene.robot, job.family, random, look_of(scene_id))
             motion = self.move(layout, random, num_frames, job.policy)
             if motion is not None:
                 return layout, motion, scene_id, random

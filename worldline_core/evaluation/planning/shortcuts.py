@@ -83,6 +83,25 @@ def _reach(drawn: Sequence[EpisodeTracks], instruction: str, picture: np.ndarray
     if first.camera_motion[column] == "absent":
         return None
     height = float(np.median(tools[..., 2].min(axis=(1, 2))))
+    things = named_places(
+        instruction, picture, height, first.K[column], first.T_base_camera[0, column], first.image_size
+    )
+    return Reach(tools, gripper, things) if things else None
+
+
+def named_places(
+    instruction: str,
+    picture: np.ndarray,
+    height: float,
+    K: np.ndarray,
+    T_base_camera: np.ndarray,
+    image_size: tuple[int, ...],
+) -> tuple[np.ndarray, ...]:
+    """Places (3) of the things that an instruction names, where rays through them meet a height; up to the first that is not seen.
+
+    Args:
+        picture: (1, H, W, 3). K: (3, 3), of images of image_size (h, w). T_base_camera: (4, 4).
+    """
     things = []
     for thing in named_things(instruction):
         share = thing_share(picture, thing.colour, own_colour(picture, thing.colour))[0]
@@ -90,12 +109,11 @@ def _reach(drawn: Sequence[EpisodeTracks], instruction: str, picture: np.ndarray
             break
         grid = np.mgrid[: share.shape[0], : share.shape[1]][::-1]
         pixel = (grid * share).sum(axis=(1, 2)) / share.sum()
-        pixel = (pixel + 0.5) * np.array(first.image_size[::-1]) / np.array(share.shape[::-1]) - 0.5
-        T_base_camera = first.T_base_camera[0, column].astype(np.float64)
-        ray = T_base_camera[:3, :3] @ np.linalg.solve(first.K[column].astype(np.float64), [*pixel, 1.0])
-        centre = T_base_camera[:3, 3]
-        things.append(centre + ray * (height - centre[2]) / ray[2])
-    return Reach(tools, gripper, tuple(things)) if things else None
+        pixel = (pixel + 0.5) * np.array(image_size[::-1]) / np.array(share.shape[::-1]) - 0.5
+        pose = T_base_camera.astype(np.float64)
+        ray = pose[:3, :3] @ np.linalg.solve(K.astype(np.float64), [*pixel, 1.0])
+        things.append(pose[:3, 3] + ray * (height - pose[2, 3]) / ray[2])
+    return tuple(things)
 
 
 def sampled_commands(facts: BankFacts) -> Float[np.ndarray, "c f"]:
