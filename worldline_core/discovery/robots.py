@@ -19,6 +19,8 @@ _SAME = {
     "agilex": "piper_pair", "cobotmagic": "piper_pair", "so100": "so101", "so": "so101", "panda": "franka_panda", "franka": "franka_panda", "fr3": "franka_panda",
 }  # fmt: skip
 """Name in a dataset -> the description that stands for it where there is none of that name itself."""
+_STRANGERS = ("koch", "omx")
+"""Arms with the joint names of an SO-101 and other links: only a description of that name will do."""
 TOLERANCE_RAD = 0.2
 
 
@@ -50,12 +52,15 @@ def match_robot(
     """
     fitting: list[tuple[float, Match]] = []
     considered = 0
+    stranger = any(name in "".join(words_of(robot_type)) for name in _STRANGERS)
     for name in embodiment_names():
         robot = load_embodiment(name)
         if [len(arm.joints) for arm in robot.arms] != [len(arm.joints) for arm in arms]:
             continue
         considered += 1
         named_alike = _called(robot_type, name)
+        if stranger and not named_alike:
+            continue
         words_alike = _joint_names_agree(arms, robot.arms)
         fits, signs = _within_limits(robot.arms, arms, angles)
         if (not fits and not named_alike) or (signs and not named_alike and not words_alike):
@@ -78,6 +83,8 @@ def match_robot(
             else "within its limits with joints of the other sign"
         ]
         fitting.append((score, Match(name, "; ".join(reasons), signs, fits)))
+    if not fitting and stranger:
+        return None, [], f"nobody describes a {named([robot_type])}"
     if not fitting:
         count = "+".join(str(len(arm.joints)) for arm in arms)
         return (
