@@ -192,10 +192,14 @@ def test_episodes_begin_at_named_frames_with_what_came_before(
         ({"start": 0}, r"No recording of this name"),
         *(({"frame": frame}, rf"No such frame.*0 to 32.*got: {frame}") for frame in (33, 10**6, -1, 1.5, True, "2")),
         ({"frame": [1, 2, 3]}, r"Not the starts.*where: frame.*one, or 2"),
-        ({"start": names[0], "frmae": 3}, r"Unknown options of a reset.*got: frmae"),
+        *(
+            ({"start": names[0], typo: 3}, rf"Unknown options of a reset.*got: {typo}")
+            for typo in ("frmae", "frames", "Start")
+        ),
     ):
         with pytest.raises(DataError, match=rf"(?s){said}"):
             environment.reset(seed=0, options=asked)
+    environment.reset(seed=0, options={"lerobot_new_rollout": True, "reset_mask": None})  # of others
     with pytest.raises(DataError, match="No such frame"):
         WorldLineEnv(**options, start=names[0], frame=33)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import gymnasium
@@ -116,7 +117,7 @@ def each_start(
     Args:
         options: of a reset: ``start`` and ``frame``, one for all or a list for each; where there is none or None, the usual one.
 
-    Raises: DataError for other options, or another number of them.
+    Raises: DataError for another number of them, or names that are nearly these.
     """
     given = dict(options or {})
     columns: list[list[Any]] = []
@@ -126,6 +127,8 @@ def each_start(
         if len(each) != count:
             raise DataError("Not the starts of the episodes", where=name, expected=f"one, or {count}", got=asked)
         columns.append([value if one is None else one for one in each])
-    if given:
-        raise DataError("Unknown options of a reset", expected="start, frame", got=", ".join(map(str, given)))
+    # Wrappers and LeRobot give options of their own, so that only what looks misspelt is refused.
+    misspelt = [name for name in given if get_close_matches(str(name), ("start", "frame"), cutoff=0.75)]
+    if misspelt:
+        raise DataError("Unknown options of a reset", expected="start, frame", got=", ".join(misspelt))
     return list(zip(*columns, strict=True))
