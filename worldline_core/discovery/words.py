@@ -18,9 +18,11 @@ _ELSEWHERE = frozenset(
     eef ee tcp pose cartesian x y z w rx ry rz qx qy qz qw euler quat quaternion rot rotation orientation orient
     xyz rpy vel velocity velocities speed effort efforts torque torques current acc acceleration imu base chassis
     wheel hip knee ankle leg foot remote mobile odom temperature theta stick button timestamp frame done reward
-    success delta
+    success delta shadow
     """.split()  # noqa: SIM905
 )
+_ANGLES = ({"roll"}, {"pitch"}, {"yaw"})
+"""Words that alone are of a pose; of a joint they say how it turns (wrist_roll)."""
 _BODY = {"waist", "torso", "head", "neck", "spine", "body", "trunk"}
 LEADERS, FOLLOWERS = {"leader", "master"}, {"follower", "puppet", "slave"}
 _NOISE = frozenset(
@@ -46,7 +48,7 @@ def part_of(words: Sequence[str]) -> Part:
     found = set(words)
     if found & _FINGERS and found & {"hand", "finger", *_FINGERS - {"index", "ring", "middle"}}:
         return "finger"
-    if found & _ELSEWHERE:
+    if found & _ELSEWHERE or set(plain(words)) in _ANGLES:
         return "other"
     if found & _GRIPPER or ("finger" in found) or ("hand" in found and "joint" not in found):
         return "gripper"
