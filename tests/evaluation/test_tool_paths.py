@@ -47,6 +47,7 @@ def places_of(tracks: EpisodeTracks) -> np.ndarray:
     return np.where(tracks.valid[:, 0, :, None], tracks.uv[:, 0], np.nan)
 
 
+@pytest.mark.slow
 def test_tools_are_found_in_exact_masks_where_kinematics_says_they_are(recorded):
     own, delayed, still = [], [], []
     for tracks, masks in recorded:

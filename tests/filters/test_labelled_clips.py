@@ -31,7 +31,13 @@ def findings_of(clip: Clip) -> list[Finding]:
     return inspect(FilterConfig(), measure(clip.episode, thumbnails))
 
 
-@pytest.mark.parametrize("name", FAULTS)
+LATE = ("late_states", "late_pictures")
+"""Faults that the doctor finds by a search of about a second; test_filter_episodes has one of them too."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in LATE else []) for name in FAULTS]
+)
 def test_every_fault_gets_its_reason(recording: Clip, name: str) -> None:
     clip = FAULTS[name](recording, np.random.default_rng(3))
     assert clip.bad.any()
