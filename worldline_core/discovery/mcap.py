@@ -84,7 +84,7 @@ def _of_this_project(root: AnyPath, files: Sequence[AnyPath], episode_id: str) -
 
 
 def _kind(schema: str) -> Kind | None:
-    return SCHEMA_KINDS.get(schema.replace("/msg/", "/"))
+    return SCHEMA_KINDS.get(schema.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove."))
 
 
 def _of_topics(root: AnyPath, files: Sequence[AnyPath], file: McapFile) -> Discovery:
@@ -161,8 +161,11 @@ def _times(stream: Stream) -> np.ndarray:
 
 
 def _columns(stream: Stream) -> list[Column]:
-    """The joints that all messages of the topic have."""
-    names = list(dict.fromkeys(name for value in stream.values[:50] for name in value.names))
+    """The joints of the topic whose positions are stated."""
+    read = (
+        (name, place) for value in stream.values[:50] for name, place in zip(value.names, value.position, strict=False)
+    )
+    names = list(dict.fromkeys(name for name, place in read if np.isfinite(place)))
     return [Column(stream.topic, i, name, words_of(name)) for i, name in enumerate(names)]
 
 
@@ -195,26 +198,14 @@ def _views(
     found: Discovery, pictures: Sequence[str], kinds: dict[str, Kind], streams: dict[str, Stream], sides: list[Side]
 ) -> None:
     chosen = name_views(pictures, sides, {})
-    frames = {
-        t.child
-        for s in streams.values()
-        if s.kind == "transforms"
-        for value in s.values
-        for t in (value if isinstance(value, tuple | list) else [value])
-    }
-    parents = {
-        t.parent
-        for s in streams.values()
-        if s.kind == "transforms"
-        for value in s.values
-        for t in (value if isinstance(value, tuple | list) else [value])
-    }
+    moved = [each for s in streams.values() if s.kind == "transforms" for value in s.values for each in value]
+    frames, parents = {each.child for each in moved}, {each.parent for each in moved}
     transforms = [topic for topic, kind in kinds.items() if kind == "transforms"]
     calibrations = [topic for topic, kind in kinds.items() if kind == "calibration"]
     views: dict[str, Any] = {}
     for topic, view in chosen.views.items():
         entry: dict[str, Any] = {"image": topic}
-        near = [c for c in calibrations if _shared(c, topic) >= 1]
+        near = [c for c in calibrations if _shared(c, topic) >= 1 or len(calibrations) == len(pictures) == 1]
         frame = streams[topic].frame if topic in streams else ""
         if near and frame in frames:
             entry["calibration"] = max(near, key=lambda c: _shared(c, topic))
