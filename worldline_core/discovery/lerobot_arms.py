@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
+from worldline_core.data.sources.lerobot import AngleUnit
 from worldline_core.discovery.columns import ArmColumns, Column, find_arms
 from worldline_core.discovery.findings import Discovery, Question, named
 from worldline_core.discovery.lerobot_sample import Sample
-from worldline_core.discovery.robots import Match, is_lerobot_arm, joint_order, match_robot
+from worldline_core.discovery.robots import STRANGERS, Match, is_lerobot_arm, joint_order, match_robot
 from worldline_core.discovery.units import gripper_readings, joint_unit
 from worldline_core.discovery.words import words_of
 from worldline_core.errors import DataError
@@ -36,8 +37,9 @@ class ArmDescription:
         self._lerobot = is_lerobot_arm(robot_type, arms)
         self._joints = [sample.values(arm.joints) for arm in arms]
         words = [column.words for arm in arms for column in arm.joints]
+        usual: AngleUnit = "range_m100_100" if any(name in robot_type.lower() for name in STRANGERS) else "deg"
         self._unit, self._unit_evidence, self._doubtful = joint_unit(
-            np.concatenate(self._joints, axis=1), words, lerobot=self._lerobot
+            np.concatenate(self._joints, axis=1), words, usual if self._lerobot else None
         )
 
     def describe(self, action: list[Column], why: str) -> None:
@@ -93,9 +95,7 @@ class ArmDescription:
         hint = "; an older calibration of LeRobot: look at signs and zeros" if old else ""
         self._found.say(("angle_unit",), self._unit, self._unit_evidence + hint)
         if self._doubtful:
-            self._found.notes.append(
-                "angle_unit: degrees are likelier, range_m100_100 would fit as well: compare a few poses with pictures."
-            )
+            self._found.notes.append("angle_unit: deg and range_m100_100 both fit: compare a few poses with pictures.")
         if match is not None:
             self._found.say(("embodiment",), match.name, match.evidence)
             robot = load_embodiment(match.name)

@@ -19,8 +19,9 @@ _SAME = {
     "agilex": "piper_pair", "cobotmagic": "piper_pair", "so100": "so101", "so": "so101", "panda": "franka_panda", "franka": "franka_panda", "fr3": "franka_panda",
 }  # fmt: skip
 """Name in a dataset -> the description that stands for it where there is none of that name itself."""
-_STRANGERS = ("koch", "omx")
-"""Arms with the joint names of an SO-101 and other links: only a description of that name will do."""
+STRANGERS = ("koch", "omx")
+"""Arms with the joint names of an SO-101 and other links: only a description of that name will do. LeRobot records them in -100..100
+by default, the others in degrees (its 0.6)."""
 TOLERANCE_RAD = 0.2
 
 
@@ -52,7 +53,7 @@ def match_robot(
     """
     fitting: list[tuple[float, Match]] = []
     considered = 0
-    stranger = any(name in "".join(words_of(robot_type)) for name in _STRANGERS)
+    stranger = any(name in "".join(words_of(robot_type)) for name in STRANGERS)
     for name in embodiment_names():
         robot = load_embodiment(name)
         if [len(arm.joints) for arm in robot.arms] != [len(arm.joints) for arm in arms]:

@@ -28,12 +28,14 @@ RANGES: tuple[tuple[float, float], ...] = (
 """Usual readings of grippers: shares, per cent, metres of a finger or between both, steps of some makers."""
 
 
-def joint_unit(values: np.ndarray, names: Sequence[Sequence[str]], *, lerobot: bool) -> tuple[AngleUnit, str, bool]:
+def joint_unit(
+    values: np.ndarray, names: Sequence[Sequence[str]], usual: AngleUnit | None
+) -> tuple[AngleUnit, str, bool]:
     """The unit of joint readings (N, J), the evidence, and whether another one would fit as well.
 
     Args:
         names: words of each column.
-        lerobot: the arm is one of LeRobot's own, which records degrees, or -100..100 of each joint's range.
+        usual: what LeRobot records by default of this arm, where it is one of its own: degrees, or -100..100 of each range.
     """
     words = {word for name in names for word in name}
     most = float(np.abs(values).max())
@@ -43,7 +45,7 @@ def joint_unit(values: np.ndarray, names: Sequence[Sequence[str]], *, lerobot: b
         return "deg", f"the names say deg; readings to {most:.4g}", False
     if most <= MOST_RADIANS:
         return "rad", f"no reading is above {most:.3g}, which in degrees would hardly be a motion", False
-    if not lerobot:
+    if usual is None:
         return "deg", f"readings to {most:.4g}: more than a turn of a joint in radians", False
     if most > 100.5:
         return "deg", f"readings to {most:.4g}: beyond -100..100, LeRobot's other unit", False
@@ -60,8 +62,8 @@ def joint_unit(values: np.ndarray, names: Sequence[Sequence[str]], *, lerobot: b
             False,
         )
     return (
-        "deg",
-        f"readings to {most:.4g}: degrees, as LeRobot records since 0.5, or -100..100 of a range; both fit",
+        usual,
+        f"readings to {most:.4g}: deg and range_m100_100 both fit; LeRobot's default for this arm is taken",
         True,
     )
 
