@@ -130,15 +130,9 @@ def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project
     (video,) = (path for path in videos if "backbone" in json.loads(path.read_text())["methods"])
     assert {"lpips", "robot_iou", "psnr"} <= set(json.dumps(json.loads(video.read_text())).replace('"', " ").split())
     assert manifests["evaluate_policy"][0]["config"]["judge"] == "qwen3_vl"
-    for rollout in whole:  # two recordings of three views, two of two; Stage II trains three together
-        found = rollout["metrics"]
-        if found["checkpoint_kind"] in ("stage2", "causal"):
-            assert (found["episodes"], found["left_out"]["missing_view"]) == (2, 2)
-        else:
-            assert (found["episodes"], found["without_view"]) == (
-                4,
-                {"left_wrist": 2 * len(rollout["config"]["seeds"])},
-            )
+    for rollout in whole:  # two recordings of three views, two of two
+        found, seeds = rollout["metrics"], len(rollout["config"]["seeds"])
+        assert (found["episodes"], found["without_view"]) == (4, {"left_wrist": 2 * seeds})
 
 
 @pytest.mark.slow
