@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 
@@ -45,7 +46,10 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
         description="A run is the folder of an evaluation or a report, or HISTORY:NIGHT (artifacts/nightly:2026-11-21).",
     )  # fmt: skip
     compare.add_argument("first", metavar="RUN_A")
-    compare.add_argument("second", metavar="RUN_B")
+    compare.add_argument(
+        "second", metavar="RUN_B", nargs="?",
+        help="without: what calibrating gains within the first, by rollouts of one checkpoint with cameras and without",
+    )  # fmt: skip
     compare.add_argument("--methods", nargs=2, metavar=("A", "B"), help="this method of the first, that of the second")
     compare.add_argument("--metric", action="append", default=[], metavar="NAME", help="only this one (repeatable)")
     compare.add_argument("--json", action="store_true", help="print JSON")
@@ -85,10 +89,17 @@ def _card(arguments: argparse.Namespace) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    from worldline_core.report.comparison import as_table, compare_runs
+    from worldline_core.report.comparison import as_table, compare_runs, drawn_and_not
 
-    methods = None if arguments.methods is None else (arguments.methods[0], arguments.methods[1])
-    rows = compare_runs(arguments.first, arguments.second, methods, arguments.metric)
+    pairs = [None if arguments.methods is None else (arguments.methods[0], arguments.methods[1])]
+    if arguments.second is None and arguments.methods is None:
+        pairs = drawn_and_not(arguments.first)
+        print(
+            "What calibrating gains: maps drawn through the cameras - control vectors alone, of one checkpoint",
+            file=sys.stderr,
+        )
+    second = arguments.second or arguments.first
+    rows = [row for methods in pairs for row in compare_runs(arguments.first, second, methods, arguments.metric)]
     if arguments.json:
         import json
         from dataclasses import asdict

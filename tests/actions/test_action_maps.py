@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from worldline_core.actions.action_maps import (
+    ControlDrawing,
     control_frames,
     grid_sigma,
     latent_frame_indices,
@@ -72,6 +75,32 @@ def test_a_gripper_that_closes_and_opens_between_latent_frames_is_seen_in_the_wh
     # Frame 6 is the third of latent frame 2's: 8, 7, 6, 5; the gripper is the ninth channel.
     assert changed.nonzero().tolist() == [[2 * 9 + 8, 2]]
     assert torch.equal(maps(still, 4)[:, :, :9], maps(still, 1))
+
+
+@pytest.mark.parametrize("per_latent_frame", [1, 4])
+def test_every_view_takes_its_map_or_the_vector(per_latent_frame):
+    """Maps alone are the rendered ones bit by bit; the vector is in every cell, with 1 behind it, and zeros are no controls."""
+    tracks, size, grid = batch(t=3 * per_latent_frame), (480, 640), (30, 40)
+    maps = stack_controls(render_action_maps(tracks, size, grid), per_latent_frame)
+    assert torch.equal(ControlDrawing(grid, 10.0, frames=per_latent_frame).draw(tracks, size), maps)
+    native = torch.randn(2, 3 * per_latent_frame, 5, generator=torch.Generator().manual_seed(1))
+    camera = torch.tensor([[True, False, True], [True, True, True]])[:, None].expand(2, 3 * per_latent_frame, 3)
+    given = replace(tracks, native=native, camera=camera)
+    by_vector = torch.tensor([[False, False, True], [False, False, False]])
+    both = (
+        ControlDrawing(grid, 10.0, 5, per_latent_frame)
+        .draw(given, size, by_vector)
+        .unflatten(2, (per_latent_frame, 15))
+    )
+    vectors = ControlDrawing(grid, None, 5, per_latent_frame).draw(given, size).unflatten(2, (per_latent_frame, 6))
+    assert vectors.shape[-2:] == (1, 1)
+    assert torch.equal(vectors[:, 0, 0, :5, 0, 0, 0], native[:, 0])
+    for clip in range(2):
+        for view in range(3):
+            vector = clip == 0 and view > 0
+            drawn = torch.zeros_like(both[clip, view, :, :9]) if vector else maps.unflatten(2, (-1, 9))[clip, view]
+            assert torch.equal(both[clip, view, :, :9], drawn)
+            assert torch.equal(both[clip, view, :, 9:], vectors[clip, view].expand(-1, -1, -1, *grid) * vector)
 
 
 @pytest.mark.parametrize("num_frames", [0, 16, 34])

@@ -101,8 +101,7 @@ def test_a_declaration_that_does_not_apply_is_quarantined(tmp_path: Path, shippe
 def test_the_shipped_recordings_pass_and_their_injected_defects_are_named(tmp_path: Path, project_root: Path) -> None:
     root = project_root / "artifacts" / "shipped" / "recordings"
     defects = json.loads((root / "injected_defects.json").read_text())
-    config = FilterConfig(required_views=None)
-    filter_episodes(config, {"episodes": root}, tmp_path / "out")
+    filter_episodes(FilterConfig(), {"episodes": root}, tmp_path / "out")
     filtered = EpisodeSet.open(tmp_path / "out")
     refused = {row.episode_id.split("@")[0]: row.stage2_reason for row in filtered.rows if row.stage2_reason}
     refused |= {row.episode_id: row.reason for row in filtered.quarantine()}

@@ -258,10 +258,7 @@ def test_views_and_calibration_can_be_demanded(tmp_path: Path, sample: Make) -> 
     assert reasons_of(tmp_path / "out") == {"episode-001": "missing_view", "episode-002": "missing_calibration"}
     assert EpisodeSet.open(tmp_path / "out").rows[0].views == ("head", "left_wrist")
     curate(config(raw), {}, tmp_path / "all")
-    rows = {row.episode_id: row for row in EpisodeSet.open(tmp_path / "all").rows}
-    assert rows["episode-000"].stage2_ok
-    assert rows["episode-001"].stage2_reason == "missing_view"
-    assert rows["episode-002"].stage2_reason == "missing_calibration"
+    assert all(row.stage2_ok for row in EpisodeSet.open(tmp_path / "all").rows)  # any views, one camera at least
 
 
 def test_unsteady_frame_times_are_a_wrong_rate(tmp_path: Path, sample: Make) -> None:

@@ -56,7 +56,7 @@ def test_recordings_of_an_own_robot_carry_it(working_folder: Path, folder: str, 
     counts, curated = run(working_folder, source(working_folder / "raw", embodiment=named, arms=[ARM]))
     assert (counts["kept"], {row.embodiment for row in curated.rows}) == (2, {"my_arm"})
     filter_episodes(
-        FilterConfig(required_views=None, min_segment_frames=5),
+        FilterConfig(min_segment_frames=5),
         {"episodes": working_folder / "out"},
         working_folder / "filtered",
     )

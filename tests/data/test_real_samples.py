@@ -117,7 +117,7 @@ def test_unitree(tmp_path: Path, shared_data: Path) -> None:
     )
     assert (counts["found"], counts["kept"], counts["reasons"]) == (100, 2, {"missing_file": 98})
     assert [row.num_frames for row in curated.rows] == [221, 277]
-    assert [row.stage2_reason for row in curated.rows] == ["missing_view", "missing_view"]
+    assert [row.stage2_reason for row in curated.rows] == ["missing_calibration", "missing_calibration"]
 
 
 @pytest.mark.slow

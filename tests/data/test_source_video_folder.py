@@ -233,12 +233,12 @@ def test_from_a_folder_of_videos_to_a_step_of_stage_1(tmp_path: Path, project_ro
 
     tokenizer = project_root / "artifacts" / "shipped" / "models" / "tokenizer"
     inputs = {"episodes": tmp_path / "set", "tokenizer": tokenizer}
-    encode_latents(EncodeLatentsConfig(primary_alone=True), inputs, tmp_path / "latents")
+    encode_latents(EncodeLatentsConfig(), inputs, tmp_path / "latents")
     store = LatentStore.open(tmp_path / "latents")
     assert store.row("web-moving").views == ("head",)
     assert len(store.row("episode-000").views) == 3
     episodes = EpisodeSet.open(tmp_path / "set")
-    assert {row.episode_id for row in training_rows(store, episodes, stage=2, needed=("head",))} == {"episode-000"}
+    assert {row.episode_id for row in training_rows(store, episodes, stage=2, views=("head",))} == {"episode-000"}
     assert len(training_rows(store, episodes, stage=1)) == 3
 
     model = {

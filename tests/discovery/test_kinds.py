@@ -48,9 +48,8 @@ def test_a_folder_of_videos(tmp_path: Path) -> None:
     for n in range(3):
         write_video(tmp_path / f"raw/{n}/clip.mp4", pictures(motion(5, 40, n), "still", n), 10)
     (tmp_path / "raw/captions.csv").write_text("video,caption\n")
-    found, config, counts = init(tmp_path / "raw", tmp_path)
+    found, _, counts = init(tmp_path / "raw", tmp_path)
     assert (found.kind, found.state_size, counts["kept"]) == ("video_folder", None, 3)
-    assert config.encode_latents.primary_alone
     assert any("captions.csv" in note for note in found.notes)
 
 

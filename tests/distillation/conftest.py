@@ -63,7 +63,7 @@ def write_latents(root: Path) -> None:
 
 
 def tracks_of(name: str) -> EpisodeTracks:
-    """One arm that moves to the right, one metre in front of the head camera; the right wrist is not calibrated."""
+    """One arm that moves to the right, one metre in front of the head camera; the right wrist's camera matrix is unusable."""
     random = np.random.default_rng(len(name))
     K = np.stack([np.array([[32.0, 0, 15.5], [0, 32.0, 15.5], [0, 0, 1]])] * 3)
     K[2] = np.nan
@@ -79,7 +79,7 @@ def tracks_of(name: str) -> EpisodeTracks:
         arms=("right",),
         image_size=IMAGE,
         controls="action",
-        camera_motion=("static", "recorded", "absent"),
+        camera_motion=("static", "recorded", "recorded"),
         uv=random.uniform(0, 32, (*shape, 2)).astype(np.float32),
         depth=np.ones(shape, np.float32),
         rot6d=np.ones((*shape, 6), np.float32),

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from tests.distillation.conftest import write_inputs  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.episode_tracks import ActionTracks, write_index
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.distillation import teacher_trajectories
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill import distill
@@ -36,7 +37,7 @@ from worldline_core.rollout.rollout import long_rollout
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.artifact_files import digest_file, folder_files
 from worldline_core.training.clip_loader import ClipLoader
-from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.clip_sampler import Clip, ClipBatch
 from worldline_core.training.clip_source import LatentStore
 
 
@@ -303,7 +304,7 @@ def test_controls_of_whole_intervals_reach_every_step(
     save_checkpoint(inputs["stage2"], make_model(0, action_frames=4), kind="stage2", action_contract=contract)
     distill(config(), inputs, tmp_path / "out")
     model, info = load_checkpoint(tmp_path / "out", expect_kind="causal")
-    assert (info.contract, model.config.map_channels) == (contract, 36)
+    assert (info.contract, model.config.control_channels) == (contract, 36)
 
 
 @pytest.mark.parametrize(
@@ -360,15 +361,17 @@ def test_trajectories_are_read_as_written_and_refused_when_other(tmp_path: Path)
     nodes = torch.randn(2, 5, 3, 4, 4, 2, 2, generator=torch.Generator().manual_seed(0))
     mask = torch.ones(2, 3, 5, 2, 2)
 
-    def make(number: int) -> tuple[list[Clip], dict[str, torch.Tensor]]:
-        return [Clip("a", number, 17, 1), Clip("b", number, 17, 1)], {"nodes": nodes + number, "mask": mask}
+    def make(number: int) -> tuple[ClipBatch, dict[str, torch.Tensor]]:
+        clips = (Clip("a", number, 17, 1), Clip("b", number, 17, 1, ("head",)))
+        return ClipBatch(clips, VIEWS), {"nodes": nodes + number, "mask": mask}
 
     with pytest.raises(ArtifactError, match="Not a folder of finished"):
         TrajectoryStore.open(tmp_path)
     write_trajectories(tmp_path, 2, make, {"seed": 1})
     store = TrajectoryStore.open(tmp_path)
     assert len(store) == 4
-    assert store.clips([3, 0]) == (Clip("b", 1, 17, 1), Clip("a", 0, 17, 1))
+    assert store.clips([3, 0]) == (Clip("b", 1, 17, 1, ("head",)), Clip("a", 0, 17, 1))
+    assert store.views == [VIEWS] * 4
     torch.testing.assert_close(store.read("nodes", [3, 0]), torch.stack((nodes[1] + 1, nodes[0])), rtol=2e-3, atol=2e-3)
     assert store.read("mask", [1]).dtype == torch.float32
     with pytest.raises(ArtifactError, match=r"(?s)lacks a tensor.*shard-00000.*latents"):

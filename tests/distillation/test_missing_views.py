@@ -16,8 +16,10 @@ from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObj
 from worldline_core.distillation.distill import distill
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
+from worldline_core.distillation.teacher_trajectories import TrajectoryStore
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
-from worldline_core.model.checkpoint import read_checkpoint_info, save_checkpoint
+from worldline_core.errors import DataError
+from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
 from worldline_core.model.tokenizers import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TrainedClips, WorldModelConfig
@@ -26,7 +28,6 @@ from worldline_core.training.clip_loader import Batch
 from worldline_core.training.encode_latents import encode_latents
 
 HEAD, RIGHT = ("head",), ("head", "right_wrist")
-OPTIONAL = ["left_wrist", "right_wrist"]
 EPISODES = tuple(
     (f"{name}-{number}", split, 17, views, views)
     for name, split, views in (("three", "train", VIEWS), ("two", "validation", RIGHT), ("one", "test", HEAD))
@@ -42,7 +43,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable) ->
     video = torch.stack([torch.from_numpy(recorded(s)) for s in range(4)]).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
     tokenizer = fit_patch_tokenizer([video], channels=8, refinement_width=4, refinement_depth=1)
     tokenizer.save(root / "tokenizer")
-    encode_latents(EncodeLatentsConfig(image_size=SIZE, optional_views=tuple(OPTIONAL)), made, root / "latents")
+    encode_latents(EncodeLatentsConfig(image_size=SIZE), made, root / "latents")
     model = WorldModel(
         WorldModelConfig(
             latent_channels=8, hidden_size=24, num_layers=1, num_heads=2, num_kv_heads=1, head_dim=12,
@@ -56,12 +57,12 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable) ->
     return {**made, "latents": root / "latents", "stage2": root / "stage2"}
 
 
-def config(kind: str, splits: list[str], optional: list[str]) -> DistillConfig:
+def config(kind: str, splits: list[str], **clips: Any) -> DistillConfig:
     trainer = {"batch_size": 1, "precision": "fp32", "log_every": 6, "validation_batches": 1}
     source = {"kind": kind} | ({"image_size": SIZE} if kind == "frames" else {})
     return DistillConfig.model_validate(
         {
-            "input": source, "clips": {"lengths": [17], "optional_views": optional}, "splits": splits,
+            "input": source, "clips": {"lengths": [17], **clips}, "splits": splits,
             "validation_splits": splits[-1:], "block_size": 2,
             "teacher_forcing": {"trainer": {**trainer, "steps": 16}},
             "trajectory_regression": {
@@ -91,7 +92,7 @@ def test_every_step_sees_every_set_of_views(
 
     for objective in (TeacherForcingObjective, TrajectoryObjective, DistributionMatchingObjective):
         watch(objective)
-    counts = distill(config(kind, ["train", "validation", "test"], OPTIONAL), inputs, tmp_path)
+    counts = distill(config(kind, ["train", "validation", "test"]), inputs, tmp_path)
     assert counts["kept"] == 6
     for batches in seen.values():
         assert {batch.views for batch in batches} == {VIEWS, RIGHT, HEAD}
@@ -106,13 +107,23 @@ def test_every_step_sees_every_set_of_views(
 
 
 @pytest.mark.slow
-def test_nothing_changes_where_no_view_is_missing(inputs: dict[str, Path], tmp_path: Path) -> None:
-    for name, optional in (("needed", []), ("optional", OPTIONAL)):
-        distill(config("latents", ["train"], optional), inputs, tmp_path / name)
-    weights = [(tmp_path / name / "model.safetensors").read_bytes() for name in ("needed", "optional")]
-    assert weights[0] == weights[1]
+def test_subsets_of_complete_recordings_are_distilled_and_known(inputs: dict[str, Path], tmp_path: Path) -> None:
+    model, info = load_checkpoint(inputs["stage2"])
+    sets = (VIEWS, ("head", "left_wrist"), RIGHT, HEAD)
+    trained = TrainedClips(view_sets=sets, strides=(1,))
+    save_checkpoint(tmp_path / "all", model, kind="stage2", action_contract=info.contract, trained=trained)
+    made = inputs | {"stage2": tmp_path / "all"}
+    weights = {"joint": 0.4, "subset": 0.6}
+    distill(config("latents", ["train"], view_weights=weights), made, tmp_path / "out")
+    assert read_checkpoint_info(tmp_path / "out").view_sets == sets
+    store = TrajectoryStore.open(tmp_path / "out" / "run" / "trajectories")
+    assert len(set(store.views)) > 2
+    with pytest.raises(
+        DataError, match=r"(?s)not trained on these views together.*expected: head \+ left_wrist \+ right_wrist or"
+    ):
+        distill(config("latents", ["train"], view_weights=weights), inputs, tmp_path / "refused")
 
 
 def test_a_model_that_saw_no_left_wrist_says_so(inputs: dict[str, Path], tmp_path: Path) -> None:
-    distill(config("latents", ["validation"], ["left_wrist"]), inputs, tmp_path)
+    distill(config("latents", ["validation"]), inputs, tmp_path)
     assert read_checkpoint_info(tmp_path).trained == TrainedClips(view_sets=(RIGHT,), strides=(1,))

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.episode_set_writer import part_name
@@ -158,7 +158,8 @@ def filtered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, dict
     with EpisodeSetWriter(root / "curated", video_crf=6, pixel_format="yuv444p") as writer:
         for number in range(9):
             writer.add(*spoil(number))
-    counts = filter_episodes(FilterConfig(), {"episodes": root / "curated"}, root / "filtered")
+    config = FilterConfig(required_views=VIEWS)
+    counts = filter_episodes(config, {"episodes": root / "curated"}, root / "filtered")
     return root / "curated", root / "filtered", counts
 
 
@@ -219,7 +220,7 @@ def test_a_restart_gives_the_same_bytes(filtered: tuple[Path, Path, dict[str, An
         if path.stem not in map(part_name, ("e00", "e01", "e07")):
             (verdicts / path.name).write_bytes(path.read_bytes())
     assert len(list(verdicts.iterdir())) == 6
-    assert filter_episodes(FilterConfig(), {"episodes": curated}, again) == counts
+    assert filter_episodes(FilterConfig(required_views=VIEWS), {"episodes": curated}, again) == counts
     for name in ("index.parquet", "quarantine.parquet", "findings.parquet"):
         assert (again / name).read_bytes() == (output / name).read_bytes()
 

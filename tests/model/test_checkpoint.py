@@ -88,13 +88,17 @@ def test_what_does_not_fit_the_caller_is_refused(folder: Path, tmp_path: Path) -
         save_checkpoint(tmp_path, build(), kind="causal", action_contract=CONTRACT)
 
 
+def taking(frames: int) -> Callable[[WorldModelConfig], WorldModelConfig]:
+    return lambda config: config.model_copy(update={"action_frames": frames})
+
+
 @torch.no_grad()
 def test_a_model_that_takes_the_controls_of_whole_intervals_computes_what_it_computed_before(
     tmp_path: Path, make_model: Callable[..., WorldModel]
 ) -> None:
     save_checkpoint(tmp_path / "own", make_model(), kind="stage2", action_contract=CONTRACT)
     own, _ = load_checkpoint(tmp_path / "own")
-    interval, _ = load_checkpoint(tmp_path / "own", action_frames=4)
+    interval, _ = load_checkpoint(tmp_path / "own", adapt=taking(4))
     latents, maps = torch.randn(2, 3, 4, 5, 4, 4), torch.randn(2, 3, 36, 5, 4, 4)
     sigma = torch.tensor([0.3, 0.9])
     before = own(latents, sigma, action_maps=maps[:, :, :9]).velocity
@@ -104,9 +108,9 @@ def test_a_model_that_takes_the_controls_of_whole_intervals_computes_what_it_com
     gradient = interval.action_encoder.proj.weight.grad
     assert bool((gradient.unflatten(1, (4, -1)).abs().amax(dim=(0, 2)) > 0).all())
     save_checkpoint(tmp_path / "all", interval, kind="stage2", action_contract=CONTRACT)
-    assert load_checkpoint(tmp_path / "all")[1].config.map_channels == 36
+    assert load_checkpoint(tmp_path / "all")[1].config.control_channels == 36
     with pytest.raises(CheckpointError, match=r"(?s)takes the controls of more frames.*action_frames 4"):
-        load_checkpoint(tmp_path / "all", action_frames=1)
+        load_checkpoint(tmp_path / "all", adapt=taking(1))
 
 
 def rewrite(folder: Path, change: Callable[[dict[str, torch.Tensor]], None]) -> None:

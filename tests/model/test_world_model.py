@@ -157,7 +157,7 @@ def test_shapes_that_do_not_fit_are_refused(build: Build) -> None:
     model = build()
     with pytest.raises(DataError, match="Latents have the wrong shape"):
         model(latents[:, :2], sigma)
-    with pytest.raises(DataError, match="Action maps have the wrong shape"):
+    with pytest.raises(DataError, match="Controls have the wrong shape"):
         model(latents, sigma, action_maps=maps[:, :, :, :2])
     with pytest.raises(ConfigError, match="Unknown or repeated view"):
         model(latents, sigma, views=("head", "left_wrist", "tail"))

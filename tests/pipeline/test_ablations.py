@@ -75,7 +75,7 @@ def test_each_variant_changes_what_it_says_and_nothing_else(calls: dict[str, Tas
         return {key: own.get(key) for key in own.keys() | before.keys() if own.get(key) != before.get(key)}
 
     assert changed("success_only") == {"outcomes": ("success",)}
-    assert changed("native_film") == {"native_size": 32}
+    assert changed("native_film") == {"native_size": 32, "vector_share": 1.0}
     assert changed("no_regularization") == {"relational": None}
     assert changed("head_only") == {"clips": {**full.config.model_dump()["clips"], "view_weights": {"head": 1.0}}}
     assert set(changed("no_action_free")) == {"trainer"}

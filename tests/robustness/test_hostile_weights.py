@@ -150,7 +150,8 @@ CLIP = {"episode_id": "a", "start": 0, "num_frames": 5, "stride": 1}
 
 def write_shard(path: Path, clips: object = (CLIP,), **tensors: torch.Tensor) -> None:
     whole = {"nodes": torch.zeros(1, 2, 1, 1, 1, 2, 2).half(), "mask": torch.zeros(1, 1, 2, 2, 2).byte()} | tensors
-    save_file(whole, path, metadata={"clips": clips if isinstance(clips, str) else json.dumps(clips)})
+    listed = clips if isinstance(clips, str) else json.dumps(clips)
+    save_file(whole, path, metadata={"clips": listed, "views": '["head"]'})
 
 
 @pytest.fixture

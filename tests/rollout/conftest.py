@@ -14,10 +14,9 @@ from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, wr
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.model.checkpoint import save_checkpoint
-from worldline_core.model.layers import new_action_branch
 from worldline_core.model.tokenizers import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec, WorldModelConfig
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec, NativeVectors, WorldModelConfig
 
 SIZE = (32, 48)
 SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=1, anchor_blocks=None, sigmas=CAUSAL_SIGMAS)
@@ -108,12 +107,28 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable, ma
     save_checkpoint(root / "base", both, kind="base", action_contract=None, metadata=facts)
     save_checkpoint(root / "silent", both, kind="base", action_contract=None)
     save_checkpoint(root / "foreign", both, kind="base", action_contract=None, metadata=facts | {"tokenizer": "0123"})
-    film = config.model_copy(update={"action_conditioning": "native_film", "action_channels": 14})
-    model.config, model.action_encoder = film, new_action_branch(film)
-    torch.nn.init.normal_(model.action_encoder.proj[0].weight, generator=generator)
-    save_checkpoint(
-        root / "film", model, kind="stage2", action_contract=contract.model_copy(update={"sigma_px_ref": None})
-    )
+    vectors = NativeVectors(embodiments=("aloha_viperx", "ur5e_pair"), share=1.0)
+    for name, takes, kind in (
+        ("film", "vectors", "stage2"),
+        ("either", "either", "stage2"),
+        ("either_causal", "either", "causal"),
+    ):
+        driven = contract if takes == "either" else contract.model_copy(update={"sigma_px_ref": None})
+        update = {"action_conditioning": takes, "native_size": 14}
+        film = WorldModel(config.model_copy(update=update))
+        film.load_state_dict(
+            {key: value for key, value in model.state_dict().items() if takes == "either" or "action_" not in key},
+            strict=False,
+        )
+        torch.nn.init.normal_(film.action_film.proj[0].weight, generator=torch.Generator().manual_seed(2))
+        save_checkpoint(
+            root / name,
+            film,
+            kind=kind,
+            action_contract=driven,
+            vectors=vectors,
+            causal=SPEC if kind == "causal" else None,
+        )
     return {
         "episodes": root / "episodes",
         "tracks": root / "tracks",

@@ -277,7 +277,8 @@ def test_recordings_of_another_rate_are_left_out(mixed: dict[str, Path]) -> None
     class Any3:
         views: tuple[str, ...] = VIEWS
         view_sets = SETS
-        frames_per_unit, needs_cameras = 16, True
+        frames_per_unit, takes_maps = 16, True
+        vector_robots: tuple[str, ...] | None = ()
 
         def unit(self, frames: int) -> int:
             return 16

@@ -103,7 +103,8 @@ def test_the_seed_and_the_controls_decide(observed: Observation, causal: WorldLi
 def test_controls_of_whole_intervals_drive_a_model_that_has_not_learnt_from_them_as_before(
     observed: Observation, causal: WorldLine, models: Path
 ) -> None:
-    model, info = load_checkpoint(models / "causal", action_frames=4)
+    adapt = lambda config: config.model_copy(update={"action_frames": 4})  # noqa: E731
+    model, info = load_checkpoint(models / "causal", adapt=adapt)
     world = WorldLine(model, info.model_copy(update={"config": model.config}), causal.tokenizer)
     given = (observed.images, observed.controls, observed.cameras)
     before, after = (simulator.predict(*given, embodiment="ur5e_silver") for simulator in (causal, world))
@@ -114,7 +115,7 @@ def test_weights_in_bfloat16_predict_nearly_the_same(observed: Observation, caus
     half = WorldLine.from_pretrained(models / "causal", weights="bfloat16")
     assert half.model.proj_in.weight.dtype == torch.bfloat16
     images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
-    size = (1, len(causal.views), causal.info.config.map_channels, 1 + causal.causal.block_size)
+    size = (1, len(causal.views), causal.info.config.control_channels, 1 + causal.causal.block_size)
     maps = torch.randn(*size, *causal.contract.grid_size, generator=torch.Generator().manual_seed(0))
     (expected,), (found,) = (line.session(torch.stack(images)[None], [42]).step(maps) for line in (causal, half))
     for view, frames in expected.items():
@@ -126,7 +127,7 @@ def test_decoding_one_block_while_the_next_is_sampled_changes_nothing(
     observed: Observation, causal: WorldLine, anchor_blocks: int | None
 ) -> None:
     images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
-    size = (1, len(causal.views), causal.info.config.map_channels, 1 + causal.causal.block_size)
+    size = (1, len(causal.views), causal.info.config.control_channels, 1 + causal.causal.block_size)
     generator = torch.Generator().manual_seed(0)
     maps = [torch.randn(*size, *causal.contract.grid_size, generator=generator) for _ in range(4)]
     spec = causal.causal.model_copy(update={"anchor_blocks": anchor_blocks})
@@ -153,7 +154,7 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
 
     refused(r"(?s)1 \+ k \* 16 rows.*got: 16", controls=observed.controls[:16])
     refused("not trained on these views together", images={"left_wrist": observed.images["left_wrist"]})
-    refused("cameras are not those of the images", cameras={})
+    refused("No camera of the view head, left_wrist, right_wrist: the model takes action maps alone", cameras={})
     refused("RGB and of one size", images=observed.images | {"head": observed.images["head"][:8]})
     refused(r"(?s)camera without a pose.*head", cameras=observed.cameras | {"head": Camera(observed.cameras["head"].K)})
     refused(

@@ -9,13 +9,10 @@ from typing import Any
 
 import pytest
 import torch
-from pydantic import ValidationError
 
 from tests.rollout.conftest import SIZE, recorded, write_recordings
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
-from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
 from worldline_core.model.tokenizers import fit_patch_tokenizer
@@ -34,7 +31,6 @@ from worldline_core.training.stage2 import train_stage2
 from worldline_core.training.training_config import Stage2Config
 
 HEAD, RIGHT = ("head",), ("head", "right_wrist")
-OPTIONAL = ("left_wrist", "right_wrist")
 EPISODES = tuple(
     (f"{name}-{number}", "train", 17, views, views)
     for name, views in (("three", VIEWS), ("two", RIGHT), ("one", HEAD))
@@ -58,8 +54,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     )  # fmt: skip
     model.initialise(torch.Generator().manual_seed(0))
     save_checkpoint(root / "base", model, kind="base", action_contract=None)
-    config = EncodeLatentsConfig(image_size=SIZE, optional_views=OPTIONAL)
-    counts = encode_latents(config, {**made, "tokenizer": root / "tokenizer"}, root / "latents")
+    counts = encode_latents(
+        EncodeLatentsConfig(image_size=SIZE), {**made, "tokenizer": root / "tokenizer"}, root / "latents"
+    )
     assert (counts["kept"], counts["left_out"]) == (6, {})
     return {**made, "tokenizer": root / "tokenizer", "latents": root / "latents", "stage1": root / "base"}
 
@@ -67,7 +64,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def stage2(**changes: Any) -> Stage2Config:
     values: dict[str, Any] = {
         "trainer": {"steps": 12, "batch_size": 2, "log_every": 1, "ema_decay": 0.9},
-        "clips": {"lengths": [9, 17], "optional_views": OPTIONAL},
+        "clips": {"lengths": [9, 17]},
         "relational": None,
     }
     return Stage2Config.model_validate(values | changes)
@@ -79,7 +76,7 @@ def rows(store: LatentStore) -> list[ClipRow]:
 
 def test_batches_hold_clips_of_one_set_of_views(inputs: dict[str, Path]) -> None:
     store = LatentStore.open(inputs["latents"])
-    config = ClipSampling(lengths=(9,), optional_views=OPTIONAL)
+    config = ClipSampling(lengths=(9,))
     sampler = ClipSampler(rows(store), config, views=VIEWS, splits=["train"], start_step=4, batch_size=2, seed=3)
     drawn: Counter[str] = Counter()
     for index in range(600):
@@ -102,15 +99,31 @@ def test_batches_hold_clips_of_one_set_of_views(inputs: dict[str, Path]) -> None
 
 def test_single_views_are_drawn_where_they_are(inputs: dict[str, Path]) -> None:
     store = LatentStore.open(inputs["latents"])
-    config = ClipSampling(lengths=(9,), optional_views=OPTIONAL, view_weights={"joint": 0.4, "left_wrist": 0.6})
+    config = ClipSampling(lengths=(9,), view_weights={"joint": 0.4, "left_wrist": 0.6})
     sampler = ClipSampler(store.rows, config, views=VIEWS, splits=["train"], start_step=4, batch_size=2, seed=3)
     batches = [sampler.clips(index) for index in range(200)]
     assert {batch.views for batch in batches} == {VIEWS, RIGHT, HEAD, ("left_wrist",)}
     for batch in batches:
         assert all(set(batch.views) <= set(store.row(clip.episode_id).views) for clip in batch.clips)
-    assert config.needed_views(VIEWS) == HEAD
-    assert ClipSampling(view_weights={"head": 1.0, "joint": 0.0}).needed_views(VIEWS) == HEAD
-    assert ClipSampling().needed_views(VIEWS) == VIEWS
+    assert config.shown_views(VIEWS) == ClipSampling().shown_views(VIEWS) == VIEWS
+    assert ClipSampling(view_weights={"head": 1.0, "joint": 0.0}).shown_views(VIEWS) == HEAD
+
+
+def test_subsets_are_drawn_for_a_share_of_the_steps_and_known_by_it(inputs: dict[str, Path]) -> None:
+    store = LatentStore.open(inputs["latents"])
+    three = [row for row in store.rows if row.views == VIEWS]
+
+    def sampler(share: float, rows: list[Any] = three) -> ClipSampler:
+        config = ClipSampling(lengths=(9,), view_weights={"joint": 1 - share, "subset": share})
+        return ClipSampler(rows, config, views=VIEWS, splits=["train"], start_step=4, batch_size=2, seed=3)
+
+    drawn = Counter(sampler(0.3).clips(index).views for index in range(600))
+    assert set(drawn) == {VIEWS, HEAD, RIGHT, ("head", "left_wrist")}
+    assert all(0.06 < drawn[views] / 600 < 0.14 for views in drawn if views != VIEWS)
+    assert set(sampler(0.3).trained(VIEWS).view_sets) == set(drawn)  # type: ignore[union-attr]
+    assert sampler(0.02).trained(VIEWS) is None  # a set that fewer than 1 % of the steps show is not known
+    one = sampler(0.3, [row for row in store.rows if row.views == HEAD])
+    assert {one.clips(index).views for index in range(20)} == {HEAD}
 
 
 def test_a_clip_is_trained_in_a_batch_as_it_would_be_alone(inputs: dict[str, Path]) -> None:
@@ -172,12 +185,7 @@ def test_a_model_of_the_head_alone_trains_on_any_recording_and_rolls_out_the_hea
     assert {row.view for row in RolloutSet.open(tmp_path / "out").rows} == {"head"}
 
 
-def test_recordings_that_lack_a_view_are_left_out_where_it_is_needed(inputs: dict[str, Path], tmp_path: Path) -> None:
-    counts = encode_latents(EncodeLatentsConfig(image_size=SIZE), inputs, tmp_path / "latents")
-    assert (counts["kept"], counts["left_out"]) == (2, {"missing_view": 4})
-    assert len(EpisodeSet.open(inputs["episodes"])) == 6
-    with pytest.raises(ValidationError, match="one of the `views` must be in every recording"):
-        DistillConfig(clips=ClipSampling(optional_views=VIEWS, lengths=(17,)))
+def test_a_view_that_is_no_slot_of_the_model_is_refused() -> None:
     with pytest.raises(ConfigError, match="Unknown or repeated view"):
         WorldModel(WorldModelConfig(view_offsets=(0.0, 8.0), views=RIGHT))(
             torch.zeros(1, 1, 32, 2, 4, 6), torch.ones(1), views=("left_wrist",)

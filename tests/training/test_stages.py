@@ -8,16 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
-from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
+from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
-from worldline_core.model.world_model_config import ActionContract, CausalSpec
+from worldline_core.model.world_model_config import ActionContract, CausalSpec, NativeVectors
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import stage as stage_module
 from worldline_core.training.clip_source import training_rows
+from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.stage1 import stage1_groups, train_stage1
 from worldline_core.training.stage2 import stage2_groups, train_stage2
 from worldline_core.training.training_config import Stage1Config, Stage2Config, TeacherConfig
@@ -143,26 +146,70 @@ def test_what_stage2_trains(model_config: MakeConfig) -> None:
     assert both[0] | both[1] | set(action.parameters) == {name for name, _ in model.named_parameters()}
 
 
-def test_native_control_vectors_take_the_place_of_maps(
-    world: Any, stage1_folder: Path, make_contract: Callable[..., ActionContract], tmp_path: Path
-) -> None:
+def test_native_control_vectors_take_the_place_of_maps(world: Any, stage1_folder: Path, tmp_path: Path) -> None:
     """The paper's ablation: a Stage I model with maps becomes a Stage II model with FiLM, driven by its own vectors."""
     inputs = {**world.inputs, "stage1": stage1_folder}
-    result = train_stage2(stage2(30, native_size=3, action_dropout=0.0), inputs, tmp_path / "film")
+    alone = {"native_size": 3, "vector_share": 1.0, "action_dropout": 0.0}
+    result = train_stage2(stage2(30, **alone), inputs, tmp_path / "film")
     model, info = load_checkpoint(tmp_path / "film", expect_kind="stage2")
-    assert info.config.native_size == 3
-    assert all(layer.weight.abs().max() > 0 for layer in model.action_encoder.proj)  # type: ignore[union-attr]
+    assert (info.config.native_size, info.config.takes_maps, model.action_encoder) == (3, False, None)
+    assert info.vectors == NativeVectors(embodiments=("square",), share=1.0)
+    assert all(layer.weight.abs().max() > 0 for layer in model.action_film.proj)  # type: ignore[union-attr]
     assert result["validation/loss"] != result["validation/loss_shuffled_actions"]
-    train_stage2(stage2(2, native_size=3), inputs | {"stage1": tmp_path / "film"}, tmp_path / "on")
+    train_stage2(stage2(2, **alone), inputs | {"stage1": tmp_path / "film"}, tmp_path / "on")
     without = {name: folder for name, folder in inputs.items() if name != "tracks"}
-    bare = train_stage2(stage2(30, native_size=3, action_dropout=0.0), without, tmp_path / "bare")
+    bare = train_stage2(stage2(30, **alone | {"vector_share": 0.3}), without, tmp_path / "bare")
+    assert not load_checkpoint(tmp_path / "bare")[1].config.takes_maps  # nothing can be drawn
     assert bare["validation/loss"] == result["validation/loss"]  # vectors are the same, with cameras or without
     with pytest.raises(ConfigError, match=r"(?s)drawn from action tracks.*run render_actions"):
         train_stage2(stage2(2), without, tmp_path / "maps")
     with pytest.raises(DataError, match=r"(?s)driven by control vectors.*up to 1 numbers.*got: 2"):
         train_stage2(stage2(2, native_size=1), inputs, tmp_path / "small")
-    with pytest.raises(CheckpointError, match=r"(?s)native_size.*expected: 3"):
+    with pytest.raises(CheckpointError, match=r"(?s)driven otherwise.*vectors, native_size 3.*maps, native_size None"):
         train_stage2(stage2(2), inputs | {"stage1": tmp_path / "film"}, tmp_path / "maps")
+
+
+@pytest.mark.parametrize("action_frames", [1, 4])
+def test_a_model_of_maps_also_learns_vectors_and_says_whose(
+    world: Any, stage1_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, action_frames: int
+) -> None:
+    """Views of one batch take one or the other; a view without a camera always the vector, a model of maps alone never shows it."""
+    seen: list[torch.Tensor] = []
+    loss = FlowMatchingObjective.loss
+
+    def watched(objective: FlowMatchingObjective, batch: Any, *rest: Any) -> Any:
+        seen.append(batch.action_maps.unflatten(2, (action_frames, -1)).abs().amax(dim=(2, 4, 5, 6)))  # b v channels
+        return loss(objective, batch, *rest)
+
+    monkeypatch.setattr(FlowMatchingObjective, "loss", watched)
+    inputs = {**world.inputs, "stage1": stage1_folder}
+    config = stage2(20, native_size=3, vector_share=0.4, action_dropout=0.0, action_frames=action_frames)
+    train_stage2(config, inputs, tmp_path / "both")
+    info = load_checkpoint(tmp_path / "both")[1]
+    assert (info.config.action_conditioning, info.vectors) == (
+        "either", NativeVectors(embodiments=("square",), share=0.4),
+    )  # fmt: skip
+    given, drawn = (torch.cat(seen)[:, :, part].amax(dim=2) > 0 for part in (slice(-1, None), slice(9)))
+    assert bool((given != drawn).all())
+    assert 0.25 < float(given.float().mean()) < 0.55
+    train_stage2(config, inputs | {"stage1": tmp_path / "both"}, tmp_path / "on")
+    gained = stage2(2, native_size=3, action_frames=action_frames)
+    train_stage2(stage2(2, action_frames=action_frames), inputs, tmp_path / "maps")
+    train_stage2(gained, inputs | {"stage1": tmp_path / "maps"}, tmp_path / "gained")
+    assert load_checkpoint(tmp_path / "gained")[1].config.action_conditioning == "either"
+
+    index = pq.read_table(inputs["tracks"] / "index.parquet")
+    motion = [["static", "absent", "kinematics"]] * len(index)
+    shutil.copytree(inputs["tracks"], tmp_path / "tracks")
+    column = index.column_names.index("camera_motion")
+    pq.write_table(index.set_column(column, "camera_motion", pa.array(motion)), tmp_path / "tracks" / "index.parquet")
+    seen.clear()
+    made = inputs | {"tracks": tmp_path / "tracks"}
+    train_stage2(config, made, tmp_path / "partly")
+    assert bool((torch.cat(seen)[:, 1, -1] == 1).all())
+    assert not torch.cat(seen)[:, 1, :9].any()
+    train_stage2(stage2(2, action_frames=action_frames), made, tmp_path / "two_views")
+    assert read_checkpoint_info(tmp_path / "two_views").view_sets == (("head", "right_wrist"),)
 
 
 def test_only_episodes_of_some_outcomes_can_be_trained_on(world: Any, stage1_folder: Path, tmp_path: Path) -> None:

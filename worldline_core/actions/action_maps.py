@@ -16,9 +16,11 @@ paper's 30 x 40; a grid of 8 x 12 needs 33..37).
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import torch
-from einops import rearrange
-from jaxtyping import Float
+from einops import rearrange, repeat
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from worldline_core.actions.actions_config import REFERENCE_CANVAS, SIGMA_PX_REFERENCE, TEMPORAL_FACTOR
@@ -57,7 +59,7 @@ def control_frames(num_frames: int, per_latent_frame: int = 1) -> list[int]:
 def stack_controls(
     maps: Float[Tensor, "b v c frames h w"], per_latent_frame: int
 ) -> Float[Tensor, "b v channels t h w"]:
-    """Maps of :func:`control_frames`, those of one latent frame stacked as channels: the first nine are of frame 4 j."""
+    """Channels of :func:`control_frames`, those of one latent frame stacked: the first ones are of frame 4 j."""
     return rearrange(maps, "b v c (t k) h w -> b v (k c) t h w", k=per_latent_frame)
 
 
@@ -115,6 +117,49 @@ def render_action_maps(
         rearrange(columns.to(dtype), "b t v a w -> (b t v) a w"),
     )
     return rearrange(maps, "(b t v) (c h) w -> b v c t h w", b=clips, v=views, c=NUM_CHANNELS)
+
+
+@dataclass(frozen=True)
+class ControlDrawing:
+    """Controls as a model takes them: action maps, control vectors, or in each view of a clip one of the two.
+
+    Channels of a control frame: the nine of the maps, then the vector (the same in every cell) and 1 where it is given. A
+    view whose camera is not known takes the vector. Zeros are no controls.
+
+    Attributes:
+        grid_size: (rows, columns) of the latent.
+        sigma_px_ref: width of the Gaussian; None: a model without maps.
+        native_size: of the vectors; None: a model without vectors.
+        frames: control frames that a latent frame takes.
+    """
+
+    grid_size: tuple[int, int]
+    sigma_px_ref: float | None
+    native_size: int | None = None
+    frames: int = 1
+
+    def draw(
+        self, tracks: TrackBatch, image_size: tuple[int, int], by_vector: Bool[Tensor, "b v"] | None = None
+    ) -> Float[Tensor, "b v channels t h w"]:
+        """Controls of the latent frames whose `control_frames` the tracks hold.
+
+        Args:
+            by_vector: views that take the vector though their camera is known.
+        """
+        parts: list[Tensor] = []
+        vector = torch.zeros_like(tracks.valid.any(dim=-1)) if tracks.camera is None else ~tracks.camera
+        if by_vector is not None:
+            vector = vector | by_vector[:, None]
+        if self.sigma_px_ref is not None:
+            drawn = replace(tracks, valid=tracks.valid & ~vector[..., None])
+            parts.append(render_action_maps(drawn, image_size, self.grid_size, self.sigma_px_ref))
+        if self.native_size is not None and tracks.native is not None:
+            given = torch.ones_like(vector) if self.sigma_px_ref is None else vector
+            numbers = torch.cat((tracks.native, torch.ones_like(tracks.native[..., :1])), dim=-1)
+            rows, columns = (1, 1) if self.sigma_px_ref is None else self.grid_size
+            shown = repeat(numbers, "b t c -> b v c t h w", v=given.shape[2], h=rows, w=columns)
+            parts.append(shown * rearrange(given, "b t v -> b v 1 t 1 1"))
+        return stack_controls(torch.cat(parts, dim=2), self.frames)
 
 
 def _profile(centre: Float[Tensor, "*b"], size: int, sigma: float) -> Float[Tensor, "*b size"]:

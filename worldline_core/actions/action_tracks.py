@@ -175,6 +175,7 @@ def compute_tracks(
     *,
     controls: Controls = "action",
     without_mount: Fallback = "recorded",
+    image_size: tuple[int, int] | None = None,
 ) -> tuple[EpisodeTracks, dict[str, int]]:
     """Tracks of every frame, view and arm of an episode, and counts of what was masked or clipped.
 
@@ -185,6 +186,7 @@ def compute_tracks(
         kinematics: of the episode's embodiment; not needed for a measured state with recorded tool poses.
         controls: whether commands or the measured state are projected.
         without_mount: what a moving wrist camera without a known mount follows.
+        image_size: (height, width) of the pictures; None: that of the cameras, of which there must be one.
 
     Raises:
         MissingActionsError: commands are asked for, and none are recorded; or the episode is a plain video.
@@ -194,7 +196,7 @@ def compute_tracks(
     """
     where = f"episode {episode.episode_id}"
     _check_recorded(episode, controls, where)
-    image_size = _image_size(episode, where)
+    image_size = image_size or _image_size(episode, where)
     outside_limits = 0
     wrist_cameras: dict[str, Tensor] = {}
     recorded = None if episode.T_base_ee is None else _recorded_tools(episode.T_base_ee, where)

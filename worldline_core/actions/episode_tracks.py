@@ -19,18 +19,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from einops import repeat
 from jaxtyping import Bool, Float
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
+from worldline_core.data.episodes.episode import VIEWS, Episode
+from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.store.artifact_files import how_to_rebuild
 from worldline_core.store.atomic import write_arrays_atomic, write_table_atomic
 
-HEAD_VIEW = "head"
+HEAD_VIEW, NO_CALIBRATION = "head", "no_calibration"
 SHARD_FILE, INDEX_FILE = "tracks-{:05d}.safetensors", "index.parquet"
 SAMPLES = ("uv", "depth", "rot6d", "gripper", "valid")
 """Arrays with one entry per frame, view and arm: what action maps are rendered from."""
@@ -91,6 +92,11 @@ class EpisodeTracks:
         return len(self.depth)
 
     @property
+    def calibrated_views(self) -> tuple[str, ...]:
+        """Views whose camera is known."""
+        return _calibrated(self.views, self.camera_motion)
+
+    @property
     def controls_label(self) -> str:
         """The kind of the projected controls in words: commands, or what was measured where none were recorded."""
         return {"action": "commands", "state": "measured joints", "ee_pose": "measured tool poses"}[self.controls]
@@ -117,45 +123,88 @@ class EpisodeTracks:
 
 @dataclass(frozen=True)
 class TrackBatch:
-    """Tracks of several clips as tensors on one device; episodes with fewer arms are padded with invalid ones."""
+    """Tracks of several clips as tensors on one device; episodes with fewer arms are padded with invalid ones.
+
+    ``native``: their control vectors padded with zeros, and ``camera``: which views have one; for models that take vectors.
+    """
 
     uv: Float[Tensor, "b t v a 2"]
     depth: Float[Tensor, "b t v a"]
     rot6d: Float[Tensor, "b t v a 6"]
     gripper: Float[Tensor, "b t v a"]
     valid: Bool[Tensor, "b t v a"]
+    native: Float[Tensor, "b t d"] | None = None
+    camera: Bool[Tensor, "b t v"] | None = None
 
     def to(self, device: torch.device | str) -> TrackBatch:
         """The same batch on another device."""
-        return TrackBatch(*(getattr(self, name).to(device) for name in SAMPLES))
+        moved: dict[str, Any] = {
+            name: None if value is None else value.to(device) for name, value in vars(self).items()
+        }
+        return TrackBatch(**moved)
 
 
-def collate_tracks(clips: Sequence[EpisodeTracks], views: Sequence[str] | None = None) -> TrackBatch:
+def drawn_size(clips: Sequence[EpisodeTracks]) -> tuple[int, int]:
+    """(height, width) that the pixels of clips belong to: of those with a camera, if any."""
+    return next((clip.image_size for clip in clips if clip.calibrated_views), clips[0].image_size)
+
+
+def collate_tracks(
+    clips: Sequence[EpisodeTracks], views: Sequence[str] | None = None, native_size: int | None = None
+) -> TrackBatch:
     """Stack clips of equal length, views in the given order (default: the views of the first clip).
 
-    Raises: DataError when a clip lacks a view, or the clips differ in length or frame size.
+    Args:
+        native_size: of the control vectors; None: without them.
+
+    Raises: DataError when a clip lacks a view or has no vector of this size, or the clips differ in length or frame size.
     """
     if not clips:
         raise DataError("No action tracks to collate", expected="at least one clip", got="none")
-    order = tuple(views or clips[0].views)
+    order, size = tuple(views or clips[0].views), drawn_size(clips)
     num_arms = max(len(clip.arms) for clip in clips)
     columns: dict[str, list[np.ndarray]] = {name: [] for name in SAMPLES}
+    if native_size is not None:
+        columns |= {"native": [_native(clip, order, native_size) for clip in clips], "camera": []}
     for clip in clips:
         missing = [view for view in order if view not in clip.views]
-        if missing or clip.num_frames != clips[0].num_frames or clip.image_size != clips[0].image_size:
+        other_size = clip.image_size != size and bool(clip.calibrated_views)
+        if missing or clip.num_frames != clips[0].num_frames or other_size:
             raise DataError(
                 "Action tracks do not fit together in one batch",
                 where=f"episode {clip.episode_id}",
-                expected=f"views {order}, {clips[0].num_frames} frames of {clips[0].image_size}",
+                expected=f"views {order}, {clips[0].num_frames} frames of {size}",
                 got=f"views {clip.views}, {clip.num_frames} frames of {clip.image_size}",
             )
+        if native_size is not None:
+            known = np.array([view in clip.calibrated_views for view in order])
+            columns["camera"].append(np.tile(known, (clip.num_frames, 1)))
         index = [clip.views.index(view) for view in order]
-        for name, column in columns.items():
+        for name in SAMPLES:
             values = getattr(clip, name)[:, index]
             padding = [(0, 0)] * values.ndim
             padding[2] = (0, num_arms - len(clip.arms))
-            column.append(np.pad(values, padding))
+            columns[name].append(np.pad(values, padding))
     return TrackBatch(**{name: torch.from_numpy(np.stack(column)) for name, column in columns.items()})
+
+
+def _calibrated(views: Sequence[str], camera_motion: Sequence[str]) -> tuple[str, ...]:
+    return tuple(view for view, motion in zip(views, camera_motion, strict=True) if motion != "absent")
+
+
+def _native(clip: EpisodeTracks, views: Sequence[str], size: int) -> np.ndarray:
+    """Control vectors (n, size), padded with zeros. Raises: DataError when a clip that needs some has none, or longer ones."""
+    if clip.native is None and set(views) <= set(clip.calibrated_views):
+        return np.zeros((clip.num_frames, size), np.float32)
+    if clip.native is None or clip.native.shape[1] > size:
+        raise DataError(
+            "The model is driven by control vectors that these tracks do not have",
+            where=f"episode {clip.episode_id}, embodiment {clip.embodiment}",
+            expected=f"up to {size} numbers a frame",
+            got=None if clip.native is None else clip.native.shape[1],
+            next_step="open the tracks with their episodes, or train with a larger native_size",
+        )
+    return np.pad(clip.native, ((0, 0), (0, size - clip.native.shape[1]))).astype(np.float32)
 
 
 def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> list[dict[str, Any]]:
@@ -187,7 +236,7 @@ class ActionTracks:
     """Read access to a finished ActionTracks artifact; only the episodes asked for are read.
 
     Args:
-        episodes: the recordings, for tracks that carry their native control vectors too.
+        episodes: the recordings, for tracks that carry their native control vectors too. A row without a ``shard`` has nothing else.
     """
 
     def __init__(self, root: Path, rows: Sequence[dict[str, Any]], episodes: EpisodeSet | None = None) -> None:
@@ -195,6 +244,16 @@ class ActionTracks:
         self.episodes = episodes
         self.sigma_px_ref = float(rows[0]["sigma_px_ref"])
         self._rows = {row["episode_id"]: row for row in rows}
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows of the index."""
+        return list(self._rows.values())
+
+    @property
+    def drawn(self) -> bool:
+        """Maps can be drawn of some episodes: there is more than control vectors."""
+        return any(row["shard"] is not None for row in self._rows.values())
 
     @classmethod
     def open(cls, root: Path, episodes: EpisodeSet | None = None) -> ActionTracks:
@@ -222,9 +281,7 @@ class ActionTracks:
     def calibrated_views(self, episode_id: str) -> tuple[str, ...]:
         """Views of an episode whose camera is known."""
         row = self._rows[episode_id]
-        return tuple(
-            view for view, motion in zip(row["views"], row["camera_motion"], strict=True) if motion != "absent"
-        )
+        return _calibrated(row["views"], row["camera_motion"])
 
     def __contains__(self, episode_id: str) -> bool:
         return episode_id in self._rows
@@ -252,6 +309,10 @@ class ActionTracks:
                 next_step="see quarantine.parquet of the same artifact for the reason",
             )
         row = self._rows[episode_id]
+        episode = None if self.episodes is None else self.episodes.episode(self.episodes.position(episode_id))
+        native = None if episode is None else _native_controls(episode, row["controls"])
+        if row["shard"] is None:
+            return _without_cameras(cast("Episode", episode), row["controls"])
         path = self.root / row["shard"]
         try:
             with safe_open(path, framework="numpy") as shard:
@@ -264,94 +325,65 @@ class ActionTracks:
                 "Action tracks are not finite", where=f"{path}, episode {episode_id}", got=", ".join(unusable),
                 next_step=how_to_rebuild(self.root),
             )  # fmt: skip
-        native = None
-        if self.episodes is not None:
-            episode = self.episodes.episode(self.episodes.position(episode_id))
-            native = np.asarray(episode.action if row["controls"] == "action" else episode.state, np.float32)
         labels = {name: tuple(row[name]) if isinstance(row[name], list) else row[name] for name in _LABELS}
         return EpisodeTracks(**labels, **arrays, native=native)
-
-
-class ControlVectors(ActionTracks):
-    """Control vectors of recordings without cameras, for models that take no maps: tracks of no arm in no view.
-
-    Args:
-        controls: ``action`` (the commands; an episode without them is left out) or ``state``.
-    """
-
-    def __init__(self, episodes: EpisodeSet, controls: str) -> None:
-        def known(position: int) -> bool:
-            episode = episodes.episode(position)
-            return episode.commanded if controls == "action" else episode.state_kind != "none"
-
-        self.root, self.episodes, self.sigma_px_ref = episodes.root, episodes, float("nan")
-        self._rows = {
-            row.episode_id: {"controls": controls, "views": VIEWS, "camera_motion": ["absent"] * len(VIEWS)}
-            for position, row in enumerate(episodes.rows)
-            if known(position)
-        }
-        if not self._rows:
-            raise DataError(
-                "No recording has the controls that the model is driven by", where=episodes.root, expected=controls,
-                got=f"none in {len(episodes)} recordings", next_step="declare actions or states in the source",
-            )  # fmt: skip
-
-    def tracks(self, episode_id: str) -> EpisodeTracks:
-        """The vectors of one episode. Raises: DataError: there are none."""
-        if episode_id not in self:
-            raise DataError("No control vectors of this episode", where=self.root, got=episode_id)
-        episodes = cast("EpisodeSet", self.episodes)
-        episode, controls = episodes.episode(episodes.position(episode_id)), self.controls(episode_id)
-        n, v, identity = episode.num_frames, len(VIEWS), np.eye(4, dtype=np.float32)
-        return EpisodeTracks(
-            episode_id=episode_id, embodiment=episode.embodiment, views=VIEWS, arms=(), image_size=(1, 1), controls=controls,
-            camera_motion=("absent",) * v, uv=np.zeros((n, v, 0, 2)), depth=np.zeros((n, v, 0), np.float32),
-            rot6d=np.zeros((n, v, 0, 6), np.float32), gripper=np.zeros((n, v, 0), np.float32),
-            valid=np.zeros((n, v, 0), np.bool_), T_base_tool=np.zeros((n, 0, 4, 4), np.float32),
-            T_base_camera=np.tile(identity, (n, v, 1, 1)), K=np.full((v, 3, 3), np.nan, np.float32),
-            capsules=np.zeros((n, 0, 2, 3), np.float32), capsule_radii=np.zeros(0, np.float32),
-            native=np.asarray(episode.action if controls == "action" else episode.state, np.float32),
-        )  # fmt: skip
 
 
 def open_controls(
     inputs: Mapping[str, Path], episodes: EpisodeSet, *, vectors: bool, controls: str = "action"
 ) -> ActionTracks:
-    """The input ``tracks``; for a model of control vectors, which no camera is needed for, also those of the recordings themselves.
+    """The input ``tracks``; for a model that takes control vectors with these, and also those of recordings without tracks: of no
+    arm, in no view.
 
     Args:
-        vectors: the model takes control vectors.
-        controls: kind of the vectors that are read without ``tracks``.
+        controls: kind of the vectors where there are no tracks: "action" (commands), or what was measured.
 
-    Raises: ConfigError: a model of action maps is given no tracks.
+    Raises:
+        ConfigError: a model of action maps alone is given no tracks.
+        DataError: no recording has such controls.
     """
-    if "tracks" in inputs:
-        return ActionTracks.open(Path(inputs["tracks"]), episodes if vectors else None)
-    if not vectors:
+    if not vectors and "tracks" not in inputs:
         raise ConfigError(
             "Action maps are drawn from action tracks", expected="an input named tracks", got=", ".join(sorted(inputs)),
             next_step="run render_actions and give its folder as --input tracks=FOLDER",
         )  # fmt: skip
-    return ControlVectors(episodes, controls)
+    tracks = ActionTracks.open(Path(inputs["tracks"])) if "tracks" in inputs else None
+    if tracks is not None and not vectors:
+        return tracks
+    rows = [] if tracks is None else tracks.rows
+    kind = rows[0]["controls"] if rows else controls
+    known = {row["episode_id"] for row in rows}
+    if tracks is not None:  # what was refused for another reason than its cameras is no vector either
+        known |= {row.episode_id for row in read_quarantine(tracks.root) if row.reason != NO_CALIBRATION}
+    for position, row in enumerate(episodes.rows):
+        if row.episode_id not in known and _has_controls(episodes.episode(position), kind):
+            absent = {"views": list(VIEWS), "camera_motion": ["absent"] * len(VIEWS), "shard": None, "controls": kind}
+            rows.append({"episode_id": row.episode_id, "sigma_px_ref": SIGMA_PX_REFERENCE, **absent})
+    if not rows:
+        raise DataError(
+            "No recording has the controls that the model is driven by", where=episodes.root, expected=kind,
+            got=f"none in {len(episodes)} recordings", next_step="declare actions or states in the source",
+        )  # fmt: skip
+    return ActionTracks(episodes.root if tracks is None else tracks.root, rows, episodes)
 
 
-def native_vectors(
-    clips: Sequence[EpisodeTracks], views: Sequence[str], size: int
-) -> Float[Tensor, "b v {size} t 1 1"]:
-    """Control vectors of clips of equal length, padded with zeros to ``size`` and repeated for every view: action maps of
-    one cell, for models with FiLM.
+def _has_controls(episode: Episode, kind: str) -> bool:
+    return episode.commanded if kind == "action" else episode.state_kind != "none"
 
-    Raises: DataError when a clip has no control vectors, or longer ones.
-    """
-    rows = []
-    for clip in clips:
-        if clip.native is None or clip.native.shape[1] > size:
-            raise DataError(
-                "The model is driven by control vectors that these tracks do not have",
-                where=f"episode {clip.episode_id}, embodiment {clip.embodiment}",
-                expected=f"up to {size} numbers a frame",
-                got=None if clip.native is None else clip.native.shape[1],
-                next_step="open the tracks with their episodes, or train with a larger native_size",
-            )
-        rows.append(np.pad(clip.native, ((0, 0), (0, size - clip.native.shape[1]))))
-    return repeat(torch.from_numpy(np.stack(rows)), "b t c -> b v c t 1 1", v=len(views))
+
+def _native_controls(episode: Episode, kind: str) -> np.ndarray:
+    return np.asarray(episode.action if kind == "action" else episode.state, np.float32)
+
+
+def _without_cameras(episode: Episode, kind: str) -> EpisodeTracks:
+    """Tracks of no arm in no view, which carry the control vectors alone."""
+    n, v, identity = episode.num_frames, len(VIEWS), np.eye(4, dtype=np.float32)
+    return EpisodeTracks(
+        episode_id=episode.episode_id, embodiment=episode.embodiment, views=VIEWS, arms=(), image_size=(1, 1), controls=kind,
+        camera_motion=("absent",) * v, uv=np.zeros((n, v, 0, 2)), depth=np.zeros((n, v, 0), np.float32),
+        rot6d=np.zeros((n, v, 0, 6), np.float32), gripper=np.zeros((n, v, 0), np.float32),
+        valid=np.zeros((n, v, 0), np.bool_), T_base_tool=np.zeros((n, 0, 4, 4), np.float32),
+        T_base_camera=np.tile(identity, (n, v, 1, 1)), K=np.full((v, 3, 3), np.nan, np.float32),
+        capsules=np.zeros((n, 0, 2, 3), np.float32), capsule_radii=np.zeros(0, np.float32),
+        native=_native_controls(episode, kind),
+    )  # fmt: skip

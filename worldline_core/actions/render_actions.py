@@ -16,6 +16,7 @@ from worldline_core.actions.action_tracks import MissingActionsError, add_counts
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import (
     ARRAYS,
+    NO_CALIBRATION,
     SHARD_FILE,
     ActionTracks,
     EpisodeTracks,
@@ -97,7 +98,7 @@ class RenderWork(ShardFilesWork[ProjectedEpisode]):
                 case MissingActionsError():
                     reason = "missing_actions"
                 case CalibrationError():
-                    reason = "no_calibration"
+                    reason = NO_CALIBRATION
                 case UnavailableError():
                     reason = "kinematics_unavailable"
                 case ConfigError():

@@ -98,12 +98,11 @@ def _splits(found: Discovery) -> list[str]:
 def _stages(found: Discovery) -> list[str]:
     """Sections that depend on views and cameras."""
     if found.state_size is None:
-        return ["", "# Videos alone: Stage I learns from them.", "encode_latents: {primary_alone: true}"]
+        return ["", "# Videos alone: Stage I learns from them."]
     views = f"[{', '.join(found.views)}]"
     lines = [
         "",
-        "# Views that every episode must have, and that models see.",
-        f"filter: {{required_views: {views}}}",
+        "# Views that models see; of each episode those that it has.",
         f"encode_latents: {{views: {views}}}",
     ]
     if found.calibrated and found.source.get("embodiment") != NO_EMBODIMENT:

@@ -23,7 +23,7 @@ from einops import rearrange, reduce
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
+from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks, drawn_size
 from worldline_core.actions.robot_masks import kinematic_robot_masks
 from worldline_core.distillation.distill_config import AuxiliaryWeights
 from worldline_core.geometry.tensor_transforms import is_rigid, valid_intrinsics
@@ -222,7 +222,7 @@ def clip_robot_masks(
     Raises:
         ConfigError: the clips do not fit the tokenizer.
     """
-    parts = max(len(clip.capsule_radii) for clip in clips)
+    parts = max(1, *(len(clip.capsule_radii) for clip in clips))
     order = [[clip.views.index(view) for view in views] for clip in clips]
     capsules = np.stack([_padded(clip.capsules, 1, parts) for clip in clips])
     radii = np.stack([_padded(clip.capsule_radii, 0, parts) for clip in clips])
@@ -235,7 +235,7 @@ def clip_robot_masks(
     K = torch.where(calibrated[..., None, None], K, identity[:3, :3])
     cameras = torch.where(calibrated[:, None, :, None, None], cameras, identity)
     masks = kinematic_robot_masks(
-        torch.from_numpy(capsules), torch.from_numpy(radii), K, cameras, clips[0].image_size, grid_size
+        torch.from_numpy(capsules), torch.from_numpy(radii), K, cameras, drawn_size(clips), grid_size
     )
     return masks * calibrated[:, :, None, None, None].to(masks)
 

@@ -8,7 +8,7 @@ the offline trajectories; a killed run continues there, and on a CPU ends with t
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import partial
 from pathlib import Path
@@ -50,7 +50,7 @@ from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.action_following import ActionFollowing
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_sampler import ClipSampler
+from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 from worldline_core.training.clip_source import open_source, training_rows
 from worldline_core.training.processes import (
     ALONE,
@@ -113,21 +113,23 @@ class DistillationRun:
         self.start = Path(inputs.get("causal", self.stage2))
         if self.start != self.stage2:
             self._check_continued(read_checkpoint_info(self.start))
-        native = info.config.native_size
+        native, self.vector_share = info.config.native_size, 0.0 if info.vectors is None else info.vectors.share
         self.episodes = episodes = EpisodeSet.open(Path(inputs["episodes"]))
         tracks = open_controls(inputs, episodes, vectors=native is not None, controls=info.contract.controls)
         self.source = open_source(config.input, inputs, episodes, device)
         found = {"tokenizer": self.source.description["tokenizer"], "grid_size": self.source.latent_shape[1:]}
         info.contract.require(where=self.source.root, **found)
-        needed = config.clips.needed_views(config.views)
-        self.rows = training_rows(self.source, episodes, stage=2, needed=needed, tracks=tracks)
+        self.rows = training_rows(
+            self.source, episodes, stage=2, views=config.views, tracks=tracks, vectors=native is not None
+        )
+        self.rows = self._known(self.rows)
         info.contract.require_tracks((row.episode_id for row in self.rows), tracks)
         for views in self._sampler(config.teacher_forcing.trainer, config.clips, ALONE).view_sets(info.config.views):
             match_views(info.view_sets, views, f"distill.views, of the Stage II model {self.stage2}")
         self.loader = ClipLoader(
             self.source, views=tuple(config.views), tracks=tracks,
             action_frames=info.config.action_frames, frame_rates={row.episode_id: row.fps for row in episodes.rows},
-            native_size=native, device=device,
+            native_size=native, maps=info.config.takes_maps, device=device,
         )  # fmt: skip
         self.tokenizer = Path(inputs["tokenizer"])
         self.perceptual = _perceptual(config, self.tokenizer, device)
@@ -136,6 +138,20 @@ class DistillationRun:
     def folder(self, step: str) -> Path:
         """Folder of a step's checkpoint; the last step's is the result itself."""
         return self.output if step == STEPS[-1] else self.output / step
+
+    def _known(self, rows: Sequence[ClipRow]) -> list[ClipRow]:
+        """Episodes whose views, and whose robot's control vectors, the Stage II model knows; all where it knows the views of none."""
+        sets = {frozenset(views) for views in self.info.view_sets}
+        robots = None if self.info.vectors is None else self.info.vectors.embodiments
+        known = [row for row in rows if frozenset(row.views) & set(self.config.views) in sets] or rows
+        known = [row for row in known if robots is None or row.embodiment in robots]
+        if len(known) < len(rows):
+            logger.warning(
+                "%d of %d episodes are left out: the Stage II model knows the views %s together%s.",
+                len(rows) - len(known), len(rows), " or ".join(" + ".join(views) for views in self.info.view_sets),
+                "" if robots is None else f", and the control vectors of {', '.join(robots)}",
+            )  # fmt: skip
+        return known
 
     def _check_continued(self, causal: CheckpointInfo) -> None:
         """Raises: CheckpointError: the causal model has another form or contract than the Stage II model."""
@@ -158,9 +174,8 @@ class DistillationRun:
         settings, work = self.config.teacher_forcing, self._work(STEPS[0])
         kind = "stage2" if self.start == self.stage2 else "causal"
         model, info = self._model(self.start, settings.trainer, expect_kind=kind)
-        views = {"view_weights": settings.view_weights, "single_view_factor": settings.single_view_factor}
         plan = batch_plan(settings.trainer, work)
-        sampler = self._sampler(settings.trainer, self.config.clips.model_copy(update=views), plan)
+        sampler = self._sampler(settings.trainer, self.config.first_clips, plan)
         teacher = self._model(self.stage2, settings.trainer)[0] if settings.teacher_share else None
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
         stop = settings.trainer.steps and settings.trainer.steps * plan.accumulation
@@ -201,7 +216,7 @@ class DistillationRun:
         """Clips of the training splits."""
         return ClipSampler(
             self.rows, clips, views=self.config.views, splits=self.config.splits, start_step=self.source.start_step,
-            batch_size=trainer.batch_size, seed=trainer.seed, plan=plan,
+            batch_size=trainer.batch_size, seed=trainer.seed, plan=plan, vector_share=self.vector_share,
         )  # fmt: skip
 
     def _work(self, step: str) -> Path:
@@ -278,7 +293,14 @@ class DistillationRun:
             objective=objective,
             load=load,
             validate=validation_function(
-                self.loader, config.clips, config.validation_splits, trainer, self.rows, objective, config.input
+                self.loader,
+                config.clips,
+                config.validation_splits,
+                trainer,
+                self.rows,
+                objective,
+                config.input,
+                self.vector_share,
             ),
             probe=self._probe(trainer, objective),
             output=work,
@@ -303,6 +325,7 @@ class DistillationRun:
                 action_contract=self.info.contract,
                 causal=config.spec,
                 trained=self._sampler(trainer, config.clips, ALONE).trained(model.config.views),
+                vectors=self.info.vectors,
                 metadata={
                     "distillation": step,
                     "step": result.steps,

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
-from worldline_core.training.clip_config import ClipInput, ClipSampling, LatentInput
+from worldline_core.training.clip_config import JOINT, SUBSET, ClipInput, ClipSampling, LatentInput
 from worldline_core.training.training_config import (
     ActionFollowingConfig,
     LossWeighting,
@@ -65,9 +65,9 @@ class TeacherForcingConfig(StrictModel):
     ``teacher_share``: of what a block should become, the share that the Stage II model predicts of the whole clip in one
     step; the rest is the recording (the paper: all). ``teacher_frames``: longest clip that it is asked about, the longest
     it was trained on; None: all.
-    ``view_weights``: None trains all views jointly; otherwise what a step trains on is drawn by these weights ("joint"
-    or the name of a view), and a step on one view takes ``single_view_factor`` times the clips: cheap where compute is
-    short. The later steps are always joint.
+    ``view_weights``: None: as ``clips`` of the whole distillation; otherwise what a step trains on is drawn by these weights
+    ("joint", "subset" or the name of a view), and a step on one view takes ``single_view_factor`` times the clips: cheap
+    where compute is short.
     """
 
     trainer: TrainerConfig = TrainerConfig(steps=2000, optimizer=OptimizerConfig(learning_rate=3e-4))
@@ -160,13 +160,11 @@ class DistillConfig(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.clips.view_weights is not None:
+        if not {JOINT, SUBSET} >= (self.clips.view_weights or {}).keys():
             raise ValueError(
-                "clips.view_weights: distillation clips hold all views; set teacher_forcing.view_weights for the first "
-                "step alone"
+                "clips.view_weights: distillation clips hold all views (joint) or some (subset); set "
+                "teacher_forcing.view_weights for the first step alone"
             )
-        if not self.clips.needed_views(self.views):
-            raise ValueError("clips.optional_views: one of the `views` must be in every recording")
         span = TEMPORAL_FACTOR * self.block_size
         odd = [length for length in self.clips.lengths if length <= span or (length - 1) % span]
         if odd:
@@ -185,6 +183,14 @@ class DistillConfig(StrictModel):
 
     def weights_read(self) -> Mapping[str, Path | None]:
         return {"lpips": self.lpips_weights}
+
+    @property
+    def first_clips(self) -> ClipSampling:
+        """Clips of the first step."""
+        first = self.teacher_forcing
+        weights = first.view_weights or self.clips.view_weights
+        mixed = {"view_weights": weights, "single_view_factor": first.single_view_factor}
+        return self.clips.model_copy(update=mixed)
 
     @property
     def spec(self) -> CausalSpec:

@@ -7,7 +7,7 @@ sub-steps make the nodes those of the teacher's many-step solution, which the st
 
 Clips and noise of a shard follow from the seed and its number, so a missing shard is remade with the same bytes. Layout:
 `shard-00000.safetensors` ... (`nodes`, half precision, axes n k v c u h w; `mask`, bytes, axes n v t h w; where clips are read
-as frames their `latents`, half precision, axes n v c t h w; the clips in the header) and `trajectories.json` (settings and the
+as frames their `latents`, half precision, axes n v c t h w; the clips and the views that they show in the header) and `trajectories.json` (settings and the
 digest of every shard), written last.
 
 Axes: b clips (n in a shard), k nodes, v views, c latent channels, t latent frames, u = t - 1 without the observed one, h w rows
@@ -125,7 +125,7 @@ def robot_masks(loader: ClipLoader, clips: Sequence[Clip], views: Sequence[str])
 
 def trajectory_shard(
     number: int, config: DistillConfig, teacher: WorldModel, loader: ClipLoader, load: Callable[[int], Batch]
-) -> tuple[Sequence[Clip], dict[str, Tensor]]:
+) -> tuple[ClipBatch, dict[str, Tensor]]:
     """Clips and tensors of one shard of the store: a function of the seed and the shard's number.
 
     Args:
@@ -149,12 +149,12 @@ def trajectory_shard(
     tensors = {"nodes": nodes, "mask": robot_masks(loader, batch.clips, batch.views)}
     if isinstance(config.input, FrameInput):
         tensors["latents"] = batch.latents
-    return batch.clips, tensors
+    return ClipBatch(batch.clips, batch.views), tensors
 
 
 INDEX = "trajectories.json"
 
-MakeShard = Callable[[int], tuple[Sequence[Clip], Mapping[str, Tensor]]]
+MakeShard = Callable[[int], tuple[ClipBatch, Mapping[str, Tensor]]]
 """Clips of a shard by its number, and their ``nodes`` (n k v c u h w), robot ``mask`` (n v t h w) and perhaps ``latents``
 (n v c t h w)."""
 
@@ -189,8 +189,9 @@ def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dic
         for number in mine:
             path = shard_path(folder, number)
             if not path.is_file():
-                clips, tensors = make(number)
-                header = {"clips": json.dumps([asdict(clip) for clip in clips])}
+                drawn, tensors = make(number)
+                clips = json.dumps([asdict(clip) for clip in drawn.clips])
+                header = {"clips": clips, "views": json.dumps(drawn.views)}
                 content = {
                     name: value.to("cpu", torch.uint8 if name == "mask" else torch.float16).contiguous()
                     for name, value in tensors.items()
@@ -205,11 +206,17 @@ def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dic
 
 
 class TrajectoryStore:
-    """Read access to finished trajectories."""
+    """Read access to finished trajectories.
 
-    def __init__(self, folder: Path, clips: Sequence[tuple[int, int, Clip]]) -> None:
+    Attributes:
+        views: shown by the clip of each trajectory.
+    """
+
+    def __init__(self, folder: Path, shards: Sequence[tuple[list[Clip], tuple[str, ...]]]) -> None:
         self.folder = folder
-        self._clips = list(clips)
+        places = [(number, row) for number, (clips, _) in enumerate(shards) for row in range(len(clips))]
+        self._clips = [(number, row, shards[number][0][row]) for number, row in places]
+        self.views = [shards[number][1] for number, _ in places]
 
     @classmethod
     def open(cls, folder: Path) -> TrajectoryStore:
@@ -223,8 +230,7 @@ class TrajectoryStore:
         shards = read_json(folder / INDEX).get("shards")
         if not isinstance(shards, list) or not shards:
             raise ArtifactError("The index lists no shards", where=folder / INDEX, got=type(shards).__name__)
-        found = [(number, _clips(shard_path(folder, number))) for number in range(len(shards))]
-        return cls(folder, [(number, row, clip) for number, clips in found for row, clip in enumerate(clips)])
+        return cls(folder, [_clips(shard_path(folder, number)) for number in range(len(shards))])
 
     def __len__(self) -> int:
         return len(self._clips)
@@ -251,29 +257,33 @@ class TrajectoryStore:
 
 
 _CLIPS = TypeAdapter(list[Clip], config=ConfigDict(strict=True))
+_VIEWS = TypeAdapter(tuple[str, ...], config=ConfigDict(strict=True))
 
 
-def _clips(path: Path) -> list[Clip]:
-    """The clips of a shard whose tensors are one row of half-precision nodes and one of byte masks for each.
+def _clips(path: Path) -> tuple[list[Clip], tuple[str, ...]]:
+    """The clips of a shard whose tensors are one row of half-precision nodes and one of byte masks for each, and their views.
 
     Raises:
         ArtifactError: it is missing, damaged, or of another form.
     """
     try:
         with safe_open(path, framework="pt") as shard:
-            clips = _CLIPS.validate_json((shard.metadata() or {}).get("clips", ""))
+            header = shard.metadata() or {}
+            clips, views = _CLIPS.validate_json(header.get("clips", "")), _VIEWS.validate_json(header.get("views", ""))
             forms = {name: shard.get_slice(name) for name in ("nodes", "mask")}
             found = {name: (form.get_dtype(), form.get_shape()) for name, form in forms.items()}
     except (OSError, SafetensorError, ValueError) as error:  # pydantic's ValidationError is a ValueError
         raise ArtifactError("A shard of trajectories cannot be read", where=path, got=str(error)) from error
     (nodes_type, nodes), (mask_type, mask) = found["nodes"], found["mask"]
-    fits = len(nodes) == 7 and len(mask) == 5 and nodes[0] == mask[0] == len(clips) and nodes[2] == mask[1]
+    fits = (
+        len(nodes) == 7 and len(mask) == 5 and nodes[0] == mask[0] == len(clips) and nodes[2] == mask[1] == len(views)
+    )
     if not fits or (nodes_type, mask_type) != ("F16", "U8"):
-        expected = f"F16 ({len(clips)}, k, v, c, u, h, w) and U8 ({len(clips)}, v, t, h, w)"
+        expected = f"F16 ({len(clips)}, k, {len(views)}, c, u, h, w) and U8 ({len(clips)}, {len(views)}, t, h, w)"
         raise ArtifactError(
             "Tensors of a shard of trajectories do not fit its clips", where=path, expected=expected, got=found
         )
-    return clips
+    return clips, views
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,8 +314,8 @@ class TrajectoryLoader:
         self.kept_latents = kept_latents
         # A batch has one shape, so its clips have one length and the same views: a group of such clips is drawn by its size,
         # then clips within it.
-        recorded = [(clip, loader.source.row(clip.episode_id).views) for clip in store.clips(range(len(store)))]
-        kinds = [(clip.num_frames, tuple(view for view in loader.views if view in views)) for clip, views in recorded]
+        lengths = [clip.num_frames for clip in store.clips(range(len(store)))]
+        kinds = list(zip(lengths, store.views, strict=True))
         self._kinds = sorted(set(kinds))
         self._groups = [[row for row, kind in enumerate(kinds) if kind == wanted] for wanted in self._kinds]
         self._shares = np.array([len(group) for group in self._groups]) / len(store)

@@ -190,7 +190,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         self.views = self.world.chosen_views(views)
         self.starts = RecordedStarts(
             Path(recordings or shipped / "recordings"),
-            view_sets=[self.views], fps=self.world.contract.fps, embodiment=embodiment, splits=splits,
+            view_sets=[self.views], fps=self.world.contract.fps, needs_cameras=self.world.needs_cameras,
+            embodiment=embodiment, splits=splits,
         )  # fmt: skip
         self.kinematics = ArmKinematics(load_embodiment(self.starts.embodiment))
         self.num_envs, self.episode_frames = num_envs, episode_frames

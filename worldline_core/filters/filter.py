@@ -71,15 +71,16 @@ type Detector = Callable[[Signals, FilterConfig, Sequence[Finding]], list[Findin
 
 
 def find_missing_inputs(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
-    """Checks for what Stage II needs besides clean frames: actions, required views with calibration, known tool poses."""
+    """Checks for what Stage II needs besides clean frames: actions, the required views, a camera, known tool poses."""
     if signals.episode.state_kind == "none":
         return [Finding("required_views", None, 2, Verdict("missing_actions", False))]
-    arms = [arm.wrist_view for arm in signals.arms] or ["right_wrist"]
     findings: list[Finding] = []
-    for view in config.required_views or ("head", *arms):
+    for view in config.required_views:
         reason = "missing_calibration" if view in signals.gray else "missing_view"
         passed = view in signals.gray and view in signals.episode.cameras
         findings.append(Finding("required_views", view, 2, Verdict(reason, passed)))
+    calibrated = bool(signals.gray.keys() & signals.episode.cameras.keys())
+    findings.append(Finding("required_views", None, 2, Verdict("missing_calibration", calibrated)))
     if signals.T_base_tool is None:
         findings.append(Finding("required_views", None, 2, Verdict("missing_kinematics", False)))
     return findings

@@ -203,8 +203,8 @@ class FilterConfig(Thresholds):
     `{agibot_world: {static: {min_run_s: 2}}}`. Everything that is not named there stays as it is for all.
     """
 
-    required_views: tuple[str, ...] | None = None
-    """views that Stage II needs; null: head and one wrist view for each arm"""
+    required_views: tuple[str, ...] = ()
+    """views without which an episode is not for Stage II"""
     min_segment_frames: int = Field(default=17, ge=2)
     """shorter stretches are dropped"""
     static: StaticConfig = StaticConfig()

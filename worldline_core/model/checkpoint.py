@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -20,9 +20,15 @@ from torch import Tensor
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
-from worldline_core.model.layers import is_text_parameter
+from worldline_core.model.layers import is_action_parameter, is_text_parameter, new_action_tensors
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import ActionContract, CausalSpec, TrainedClips, WorldModelConfig
+from worldline_core.model.world_model_config import (
+    ActionContract,
+    CausalSpec,
+    NativeVectors,
+    TrainedClips,
+    WorldModelConfig,
+)
 from worldline_core.store.artifact_files import digest_file
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
@@ -159,7 +165,8 @@ CheckpointKind = Literal["base", "stage1", "stage2", "causal"]
 FORMAT = "worldline.checkpoint"
 VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "checkpoint.json"
-MAPS_IN = "action_encoder.proj.weight"
+BY_FRAME = ("action_encoder.proj.weight", "action_film.hidden.weight")
+"""Weights whose columns are of one control frame after the other."""
 CHECKPOINT_DTYPE = torch.float16
 SINGLE_PRECISION = ("time_embedder.",)
 """Parameters that are never rounded to half precision: a noise level of 1000 sigma needs its digits (Cosmos3)."""
@@ -169,7 +176,8 @@ class CheckpointInfo(StrictModel):
     """The content of ``checkpoint.json``.
 
     Attributes:
-        action_contract: meaning of the action maps in training; None for models that have seen none.
+        action_contract: meaning of the controls in training; None for models that have seen none.
+        vectors: of a model that takes control vectors: the robots that it knows by them.
         trained: views and strides of the clips that it was trained on; None: all views together, at stride 1.
         metadata: where it comes from; nothing is computed from it.
     """
@@ -179,6 +187,7 @@ class CheckpointInfo(StrictModel):
     action_contract: ActionContract | None
     causal: CausalSpec | None = None
     trained: TrainedClips | None = None
+    vectors: NativeVectors | None = None
     metadata: dict[str, Any]
     dtype: str
     weights_sha256: str
@@ -187,9 +196,11 @@ class CheckpointInfo(StrictModel):
     def _complete(self) -> Self:
         if self.kind in ("stage2", "causal") and self.action_contract is None:
             raise ValueError(f"action_contract: a checkpoint of kind {self.kind} needs one")
-        drawn, maps = self.action_contract and self.action_contract.sigma_px_ref, self.config.native_size is None
-        if self.action_contract is not None and maps == (drawn is None):
-            raise ValueError(f"action_contract.sigma_px_ref: {drawn}, of a model of {'maps' if maps else 'vectors'}")
+        drawn, takes = self.action_contract and self.action_contract.sigma_px_ref, self.config.action_conditioning
+        if self.action_contract is not None and self.config.takes_maps == (drawn is None):
+            raise ValueError(f"action_contract.sigma_px_ref: {drawn}, of a model that takes {takes}")
+        if self.action_contract is not None and (self.config.native_size is None) != (self.vectors is None):
+            raise ValueError(f"vectors: {self.vectors}, of a model that takes {takes}")
         if (self.kind == "causal") != (self.causal is not None):
             raise ValueError(f"causal: needed by the kind causal and no other, not by {self.kind}")
         shown = {view for views in (self.trained.view_sets if self.trained else ()) for view in views}
@@ -234,6 +245,7 @@ def save_checkpoint(
     action_contract: ActionContract | None,
     causal: CausalSpec | None = None,
     trained: TrainedClips | None = None,
+    vectors: NativeVectors | None = None,
     metadata: Mapping[str, Any] | None = None,
     dtype: torch.dtype = CHECKPOINT_DTYPE,
     state_dict: Mapping[str, Tensor] | None = None,
@@ -257,6 +269,7 @@ def save_checkpoint(
             "action_contract": action_contract,
             "causal": causal,
             "trained": trained,
+            "vectors": vectors,
             "metadata": dict(metadata or {}),
             "dtype": str(dtype).removeprefix("torch."),
             "weights_sha256": "",
@@ -293,7 +306,7 @@ def load_checkpoint(
     *,
     expect_kind: CheckpointKind | tuple[CheckpointKind, ...] | None = None,
     towers: Literal["both", "generation"] | None = None,
-    action_frames: Literal[1, 4] | None = None,
+    adapt: Callable[[WorldModelConfig], WorldModelConfig] = lambda config: config,
     dtype: torch.dtype = torch.float32,
     weights: bool = True,
 ) -> tuple[WorldModel, CheckpointInfo]:
@@ -302,8 +315,8 @@ def load_checkpoint(
     Args:
         expect_kind: kind or kinds the caller can use.
         towers: ``generation`` drops the understanding tower of a checkpoint that has it; None keeps what is stored.
-        action_frames: control frames per latent frame that the model shall take. Those that the checkpoint does not
-            know start with weights of zero, so that the model computes what it computed; None keeps what is stored.
+        adapt: gives the model other action branches, or more control frames per latent frame. What the checkpoint does not know
+            of them starts without effect, so that the model computes what it computed.
         weights: False gives an empty model (on the meta device), for a process that gets its weights from another one.
 
     Raises:
@@ -326,29 +339,37 @@ def load_checkpoint(
         )
     if towers == "generation":
         config = config.model_copy(update={"towers": "generation"})
-    if (action_frames or config.action_frames) < config.action_frames:
+    config = adapt(config)
+    if config.action_frames < info.config.action_frames:
         raise CheckpointError(
             "The checkpoint takes the controls of more frames",
             where=folder,
-            expected=f"action_frames {config.action_frames}",
-            got=action_frames,
-            next_step=f"set action_frames to {config.action_frames}, or start from another checkpoint",
+            expected=f"action_frames {info.config.action_frames}",
+            got=config.action_frames,
+            next_step=f"set action_frames to {info.config.action_frames}, or start from another checkpoint",
         )
-    widened = action_frames is not None and action_frames != config.action_frames
-    if widened and config.action_conditioning == "maps":
-        config = config.model_copy(update={"action_frames": action_frames})
     with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
         model = WorldModel(config)
     if weights:
         path = folder / WEIGHTS
-        tensors = read_weights(path, info.weights_sha256)
-        if widened and MAPS_IN in tensors:
-            added = (config.action_frames - info.config.action_frames) * config.action_channels * config.patch_size**2
-            tensors[MAPS_IN] = torch.nn.functional.pad(tensors[MAPS_IN], (0, added))
+        tensors = _with_branches(config, info.config, read_weights(path, info.weights_sha256))
         if config.towers == "generation":
             tensors = {name: tensor for name, tensor in tensors.items() if not is_text_parameter(name)}
         fill(model, tensors, where=path, dtype=dtype)
     return model, info
+
+
+def _with_branches(config: WorldModelConfig, stored: WorldModelConfig, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors, with those of the action branches as ``config`` has them."""
+    fields = ("action_conditioning", "native_size", "action_frames")
+    if all(getattr(config, name) == getattr(stored, name) for name in fields):
+        return tensors
+    new = new_action_tensors(config)
+    kept = {name: tensor for name, tensor in tensors.items() if name in new or not is_action_parameter(name)}
+    if config.action_frames != stored.action_frames:
+        for name in kept.keys() & set(BY_FRAME):
+            kept[name] = torch.nn.functional.pad(kept[name], (0, new[name].shape[1] - kept[name].shape[1]))
+    return new | kept
 
 
 def read_description(path: Path, form: str, noun: str, version: int) -> dict[str, Any]:

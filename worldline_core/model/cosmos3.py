@@ -12,7 +12,7 @@ from torch import Tensor
 
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import check_fit, read_weights, save_checkpoint
-from worldline_core.model.layers import is_text_parameter, new_action_branch
+from worldline_core.model.layers import is_text_parameter, new_action_tensors
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import (
     Cosmos3Size,
@@ -146,7 +146,7 @@ def read_cosmos3(
         model = WorldModel(config)
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(0)
-        new = {f"action_encoder.{name}": value for name, value in new_action_branch(config).state_dict().items()}
+        new = new_action_tensors(config)
     if model.view_embedding is not None:
         new["view_embedding"] = torch.zeros(model.view_embedding.shape)
     tensors = kept | new

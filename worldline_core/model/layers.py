@@ -330,7 +330,7 @@ class TimeEmbedder(nn.Module):
 
 
 def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str], action_maps: Tensor | None) -> None:
-    """Raises: DataError for latents that are not those of ``views``, or action maps of another grid (vectors: of 1 x 1)."""
+    """Raises: DataError for latents that are not those of ``views``, or controls of another grid (vectors alone: 1 x 1)."""
     if (
         latents.ndim != 6
         or latents.shape[1:3] != (len(views), config.latent_channels)
@@ -340,10 +340,10 @@ def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str]
         expected = f"(b, {len(views)}, {config.latent_channels}, t, h, w), h and w multiples of {config.patch_size}"
         raise DataError("Latents have the wrong shape", expected=expected, got=tuple(latents.shape))
     if action_maps is not None:
-        grid = latents.shape[4:] if config.action_conditioning == "maps" else (1, 1)
-        wanted = (*latents.shape[:2], config.map_channels, latents.shape[3], *grid)
+        grid = latents.shape[4:] if config.takes_maps else (1, 1)
+        wanted = (*latents.shape[:2], config.control_channels, latents.shape[3], *grid)
         if action_maps.shape != wanted:
-            raise DataError("Action maps have the wrong shape", expected=wanted, got=tuple(action_maps.shape))
+            raise DataError("Controls have the wrong shape", expected=wanted, got=tuple(action_maps.shape))
 
 
 def velocity_of(
@@ -385,25 +385,25 @@ class ActionEncoder(nn.Module):
     """``Conv3D(9 -> 9, 1 x 3 x 3)`` added to its input, 2 x 2 patches, and a zero-initialised linear layer.
 
     Because the last layer starts at zero, a model that gains this branch computes what it computed before. Maps of
-    several control frames (``map_channels``) pass the convolution one by one and meet in the linear layer.
+    several control frames pass the convolution one by one and meet in the linear layer.
     """
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
         self.frames, self.patch_size = config.action_frames, config.patch_size
         self.conv = nn.Conv3d(config.action_channels, config.action_channels, (1, 3, 3), padding=(0, 1, 1))
-        self.proj = nn.Linear(config.map_channels * config.patch_size**2, config.hidden_size)
+        self.proj = nn.Linear(config.action_channels * config.action_frames * config.patch_size**2, config.hidden_size)
         nn.init.zeros_(self.proj.weight)
         nn.init.zeros_(self.proj.bias)
 
-    def forward(self, maps: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b n d"]:
-        """Residuals for the video tokens, in order ``(t v h w)``."""
-        flat = rearrange(maps, "b v (k c) t h w -> (b v k) c t h w", k=self.frames)
+    def forward(self, controls: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b n d"]:
+        """Residuals for the video tokens, in order ``(t v h w)``, from the maps: the first channels of every control frame."""
+        flat = rearrange(controls, "b v (k c) t h w -> (b v k) c t h w", k=self.frames)[:, : self.conv.in_channels]
         flat = flat + self.conv(flat)
         patches = rearrange(
             flat,
             "(b v k) c t (h p) (w q) -> b (t v h w) (k p q c)",
-            v=maps.shape[1],
+            v=controls.shape[1],
             k=self.frames,
             p=self.patch_size,
             q=self.patch_size,
@@ -414,28 +414,50 @@ class ActionEncoder(nn.Module):
 class NativeActionFilm(nn.Module):
     """``tokens (1 + scale) + shift`` before every layer, both linear in ``SiLU(linear(vector of the latent frame))``.
 
-    The last linear layers start at zero, so a model that gains this branch computes what it computed before.
+    Tokens of a view without a vector stay as they are. The last linear layers start at zero, so a model that gains this branch
+    computes what it computed before.
     """
 
-    def __init__(self, size: int, hidden_size: int, num_layers: int) -> None:
+    def __init__(self, config: WorldModelConfig, native_size: int) -> None:
         super().__init__()
-        self.hidden = nn.Linear(size, 256)
-        self.proj = nn.ModuleList([nn.Linear(256, 2 * hidden_size) for _ in range(num_layers)])
+        self.frames, self.native_size = config.action_frames, native_size
+        self.hidden = nn.Linear(native_size * config.action_frames, 256)
+        self.proj = nn.ModuleList([nn.Linear(256, 2 * config.hidden_size) for _ in range(config.num_layers)])
         for parameter in self.proj.parameters():
             nn.init.zeros_(parameter)
 
     def forward(
-        self, tokens: Float[Tensor, "b n d"], vectors: Float[Tensor, "b v size t 1 1"], layer: int
+        self, tokens: Float[Tensor, "b n d"], controls: Float[Tensor, "b v c t h w"], layer: int
     ) -> Float[Tensor, "b n d"]:
-        """Tokens in order ``(t v h w)``, modulated for ``layer``; the vectors of all views are the same."""
-        features = F.silu(self.hidden(rearrange(vectors[:, 0], "b c t 1 1 -> b t c").to(self.hidden.weight.dtype)))
-        scale, shift = cast("Tensor", self.proj[layer](features)).to(tokens.dtype).chunk(2, dim=-1)
-        frames = rearrange(tokens, "b (t n) d -> b t n d", t=vectors.shape[3])
-        return rearrange(frames * (1 + scale[:, :, None]) + shift[:, :, None], "b t n d -> b (t n) d")
+        """Tokens in order ``(t v h w)``, modulated for ``layer`` by the last channels of every control frame: the vector, and 1
+        where there is one.
+        """
+        own = rearrange(controls[..., 0, 0], "b v (k c) t -> b t v k c", k=self.frames).to(self.hidden.weight.dtype)
+        given, vectors = own[..., 0, -1:], own[..., -1 - self.native_size : -1]
+        features = F.silu(self.hidden(rearrange(vectors, "b t v k c -> b t v 1 (k c)")))
+        change = cast("Tensor", self.proj[layer](features)) * given[..., None, :]
+        scale, shift = change.to(tokens.dtype).chunk(2, dim=-1)
+        grid = rearrange(tokens, "b (t v n) d -> b t v n d", t=controls.shape[3], v=controls.shape[1])
+        return rearrange(grid * (1 + scale) + shift, "b t v n d -> b (t v n) d")
 
 
-def new_action_branch(config: WorldModelConfig) -> ActionEncoder | NativeActionFilm:
-    """The branch through which controls reach a model of this configuration; it starts without effect."""
-    if config.action_conditioning == "native_film":
-        return NativeActionFilm(config.action_channels, config.hidden_size, config.num_layers)
-    return ActionEncoder(config)
+def is_action_parameter(name: str) -> bool:
+    """Returns whether a parameter belongs to a branch through which controls reach the model."""
+    return name.startswith(("action_encoder.", "action_film."))
+
+
+def action_branches(config: WorldModelConfig) -> tuple[ActionEncoder | None, NativeActionFilm | None]:
+    """The branches of maps and of vectors that a model of this configuration has; they start without effect."""
+    maps = ActionEncoder(config) if config.takes_maps else None
+    return maps, None if config.native_size is None else NativeActionFilm(config, config.native_size)
+
+
+def new_action_tensors(config: WorldModelConfig) -> dict[str, Tensor]:
+    """Weights of the action branches as they start, by their names in the model."""
+    branches = zip(("action_encoder", "action_film"), action_branches(config), strict=True)
+    return {
+        f"{name}.{key}": value
+        for name, branch in branches
+        if branch is not None
+        for key, value in branch.state_dict().items()
+    }

@@ -30,17 +30,16 @@ from worldline_core.model.block_causal_attention import (
     block_bounds,
 )
 from worldline_core.model.layers import (
-    ActionEncoder,
     GenerationAttention,
     MixtureLayer,
-    NativeActionFilm,
     RMSNorm,
     Rotation,
     TextContext,
     TimeEmbedder,
+    action_branches,
     check_shapes,
+    is_action_parameter,
     is_text_parameter,
-    new_action_branch,
     rotation,
     text_positions,
     velocity_of,
@@ -71,7 +70,7 @@ class WorldModel(nn.Module):
         self.proj_in = nn.Linear(config.patch_dim, config.hidden_size)
         self.proj_out = nn.Linear(config.hidden_size, config.patch_dim)
         self.time_embedder = TimeEmbedder(config.hidden_size)
-        self.action_encoder = new_action_branch(config)
+        self.action_encoder, self.action_film = action_branches(config)
         self.view_embedding = (
             nn.Parameter(torch.zeros(len(config.views), config.hidden_size)) if config.view_embedding else None
         )
@@ -91,7 +90,7 @@ class WorldModel(nn.Module):
         """
         residual = (2 * self.config.num_layers) ** -0.5
         for name, parameter in self.named_parameters():
-            if name.startswith(("proj_out.", "action_encoder.proj.", "view_embedding")):
+            if name.startswith(("proj_out.", "action_encoder.proj.", "action_film.proj.", "view_embedding")):
                 nn.init.zeros_(parameter)
             elif parameter.ndim < 2:
                 nn.init.constant_(parameter, 1.0 if "norm" in name else 0.0)
@@ -105,12 +104,12 @@ class WorldModel(nn.Module):
     def generation_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
         """Parameters that Stage II trains besides the action branch (docs/method.md section 4)."""
         for name, parameter in self.named_parameters():
-            if not is_text_parameter(name) and not name.startswith("action_encoder."):
+            if not is_text_parameter(name) and not is_action_parameter(name):
                 yield name, parameter
 
     def action_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
-        """The action branch, trained at its own rate."""
-        return self.action_encoder.named_parameters(prefix="action_encoder")
+        """The branches of the controls, trained at their own rate."""
+        return ((name, parameter) for name, parameter in self.named_parameters() if is_action_parameter(name))
 
     def encode_text(self, text_ids: Tensor, text_mask: Tensor | None = None) -> TextContext:
         """Run the understanding tower over right-padded token ids ``(b m)``.
@@ -152,8 +151,7 @@ class WorldModel(nn.Module):
         Args:
             latents: noisy latents behind a clean first frame.
             sigma: noise level in [0, 1], ``(b)`` or ``(b t)``; not read on the first frame.
-            action_maps: maps at latent resolution, or control vectors ``(b v size t 1 1)`` of a model with
-                ``native_film``; None runs without the action branch.
+            action_maps: controls as `ControlDrawing` gives them, maps or vectors in each view; None runs without controls.
             text: from :meth:`encode_text`.
             views: names of the views in ``latents``.
             fps: frames per second of each clip as it is shown; None: as the config says.
@@ -321,7 +319,7 @@ class WorldModel(nn.Module):
             chosen = repeat(chosen, "v d -> (v n) d", n=tokens.shape[2] // len(views))
             tokens = tokens + chosen.to(tokens.dtype)
         tokens = rearrange(tokens, "b t n d -> b (t n) d")
-        if action_maps is not None and isinstance(self.action_encoder, ActionEncoder):
+        if action_maps is not None and self.action_encoder is not None:
             tokens = tokens + self.action_encoder(action_maps.to(self.proj_in.weight.dtype)).to(tokens.dtype)
         return tokens
 
@@ -338,8 +336,8 @@ class WorldModel(nn.Module):
         features: Tensor | None = None
         for index, layer in enumerate(self._mixture()):
             context = None if text is None else text.layers[index]
-            if action_maps is not None and isinstance(self.action_encoder, NativeActionFilm):
-                tokens = self.action_encoder(tokens, action_maps, index)
+            if action_maps is not None and self.action_film is not None:
+                tokens = self.action_film(tokens, action_maps, index)
             if self.checkpointing == "block" and torch.is_grad_enabled():
                 tokens = cast("Tensor", checkpoint(layer, tokens, attend, index, context, use_reentrant=False))
             else:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 VIEWS = ("head", "left_wrist", "right_wrist")
-ActionConditioning = Literal["maps", "native_film"]
+ActionConditioning = Literal["maps", "vectors", "either"]
 
 
 class WorldModelConfig(StrictModel):
@@ -71,11 +71,14 @@ class WorldModelConfig(StrictModel):
     timestep_scale: float = Field(default=0.1, gt=0)
     """The time embedding sees ``1000 * sigma * timestep_scale`` (Cosmos3: 0.001)."""
     action_channels: int = Field(default=9, ge=1)
-    """Channels of the map of one control frame; with ``native_film`` the size that control vectors are padded to."""
+    """Channels of the map of one control frame."""
+    native_size: int | None = Field(default=None, ge=1)
+    """Size that the control vector of one control frame is padded to; None: the model takes no vectors."""
     action_frames: Literal[1, 4] = 1
-    """Control frames whose maps a latent frame takes: its own (the paper), or all four of its interval."""
+    """Control frames that a latent frame takes: its own (the paper), or all four of its interval."""
     action_conditioning: ActionConditioning = "maps"
-    """``maps``: added to the tokens (the method). ``native_film``: control vectors by FiLM (the paper's ablation)."""
+    """``maps``: added to the tokens (the method). ``vectors``: by FiLM (the paper's ablation). ``either``: each view of a clip
+    takes one of the two."""
     prediction: Literal["velocity", "first_frame_residual"] = "velocity"
     """Output of the head. ``first_frame_residual``: the clean latents less those of the clean first frame, so that still parts are
     free (for tokenizers that code a still group like its first frame)."""
@@ -97,21 +100,22 @@ class WorldModelConfig(StrictModel):
             raise ValueError(f"rope_sections {self.rope_sections}: height and width interleave by three and do not fit")
         if self.num_heads % self.num_kv_heads:
             raise ValueError(f"num_heads {self.num_heads} must be a multiple of num_kv_heads {self.num_kv_heads}")
-        if self.action_conditioning == "native_film" and self.action_frames != 1:
-            raise ValueError("action_frames: control vectors by FiLM are those of one frame, not of a whole interval")
+        if (self.action_conditioning == "maps") != (self.native_size is None):
+            raise ValueError(f"native_size: {self.native_size}, of a model that takes {self.action_conditioning}")
         if len(self.views) != len(self.view_offsets) or len(set(self.views)) != len(self.views):
             raise ValueError(f"views {self.views} and view_offsets {self.view_offsets} must pair up, without repeats")
         return self
 
     @property
-    def map_channels(self) -> int:
-        """Channels of the action maps (or vectors) of one latent frame."""
-        return self.action_channels * self.action_frames
+    def takes_maps(self) -> bool:
+        """The model has the branch of action maps."""
+        return self.action_conditioning != "vectors"
 
     @property
-    def native_size(self) -> int | None:
-        """Size of the control vectors that a model with FiLM takes; None for a model of action maps."""
-        return self.action_channels if self.action_conditioning == "native_film" else None
+    def control_channels(self) -> int:
+        """Channels of the controls of one latent frame: those of `ControlDrawing`."""
+        maps, vectors = self.takes_maps * self.action_channels, 0 if self.native_size is None else self.native_size + 1
+        return (maps + vectors) * self.action_frames
 
     @property
     def patch_dim(self) -> int:
@@ -201,7 +205,7 @@ class ActionContract(StrictModel):
 
     Attributes:
         controls: what is projected: commands, measured joints, or recorded tool poses.
-        sigma_px_ref: width of the Gaussian, pixels on the reference canvas (H, W); None for control vectors, which are not drawn.
+        sigma_px_ref: width of the Gaussian, pixels on the reference canvas (H, W); None: the model takes no maps.
         fps: control frames per second of the recordings.
         grid_size: (rows, columns) of the latents and of the maps.
         tokenizer: fingerprint of the encoder that the latents come from.
@@ -240,11 +244,23 @@ class ActionContract(StrictModel):
         Raises:
             CheckpointError: naming the first episode that differs, and the field.
         """
-        if self.sigma_px_ref is not None:
+        if self.sigma_px_ref is not None and tracks.drawn:
             self.require(where=tracks.root, sigma_px_ref=tracks.sigma_px_ref)
         for episode_id in episode_ids:
             if episode_id in tracks:
                 self.require(where=f"{tracks.root}, episode {episode_id}", controls=tracks.controls(episode_id))
+
+
+class NativeVectors(StrictModel):
+    """Control vectors that a model was trained on.
+
+    Attributes:
+        embodiments: robots whose vectors it knows; the columns of another one mean nothing to it.
+        share: how often a view with a camera took the vector instead of the map.
+    """
+
+    embodiments: tuple[str, ...] = Field(min_length=1)
+    share: float = Field(gt=0, le=1)
 
 
 class TrainedClips(StrictModel):
@@ -274,7 +290,7 @@ def match_views(view_sets: Sequence[tuple[str, ...]], views: Iterable[str], wher
         where=where,
         expected=" or ".join(" + ".join(trained) for trained in view_sets),
         got=" + ".join(names) or "no view",
-        next_step="give the views of one of these sets, or train on yours (clips.view_weights, clips.optional_views)",
+        next_step='give the views of one of these sets, or train on yours (docs/training_input.md, "Sets of views")',
     )
 
 

@@ -15,6 +15,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun
 from worldline_core.report.ablation_table import VARIANTS_FILE, Variant, load_variants
 from worldline_core.rollout.rollout_config import RolloutConfig
+from worldline_core.training.clip_config import view_subsets
 from worldline_core.training.training_config import StageConfig
 
 FULL, METHOD = "full", "stage2"
@@ -87,7 +88,9 @@ def tokens_a_step(stage: StageConfig, views: int) -> float:
     clips = stage.clips
     latent_frames = sum(1 + (length - 1) // 4 for length in clips.lengths) / len(clips.lengths)
     drawn = clips.view_weights or {"joint": 1.0}
-    shown = {name: views if name == "joint" else clips.single_view_factor for name in drawn}
+    subsets = view_subsets(["view"] * views)
+    shown = {"joint": views, "subset": sum(map(len, subsets)) / len(subsets)}
+    shown = {name: shown.get(name, clips.single_view_factor) for name in drawn}
     mean_views = sum(weight * shown[name] for name, weight in drawn.items()) / sum(drawn.values())
     return stage.trainer.batch_size * stage.trainer.accumulation * latent_frames * mean_views
 

@@ -35,7 +35,7 @@ from worldline_core.model.lpips import LPIPS
 from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.training.clip_config import JOINT, ClipSampling, FrameInput
+from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_sampler import Clip, latent_frame_count
 from worldline_core.training.clip_source import LatentStore
@@ -163,12 +163,12 @@ class Sources:
     def batch(self, model: WorldModelConfig, clips: int, views: Sequence[str], frames: int, text: int = 0) -> Batch:
         """An uninitialised batch of clips of so many recorded frames, with maps, or with ``text`` tokens for each clip."""
         size, count = (clips, len(views)), latent_frame_count(frames)
-        drawn = self.grid if model.native_size is None else (1, 1)
+        drawn = self.grid if model.takes_maps else (1, 1)
         return Batch(
             (Clip("", 0, frames, 1),) * clips,
             tuple(views),
             torch.empty(*size, model.latent_channels, count, *self.grid),
-            None if text else torch.empty(*size, model.map_channels, count, *drawn),
+            None if text else torch.empty(*size, model.control_channels, count, *drawn),
             torch.zeros(clips, text, dtype=torch.long) if text else None,
             torch.ones(clips, text, dtype=torch.bool) if text else None,
         )
@@ -177,7 +177,7 @@ class Sources:
         self, model: WorldModelConfig, trainer: TrainerConfig, clips: ClipSampling, views: Sequence[str], text: int = 0
     ) -> Batch:
         """The largest micro-batch: the longest clips, in all views where steps are joint, else in one."""
-        joint = clips.view_weights is None or JOINT in clips.view_weights
+        joint = clips.view_weights is None or {JOINT, SUBSET} & clips.view_weights.keys()
         count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
         return self.batch(model, count * trainer.batch_size, views, max(clips.lengths), text)
 
@@ -370,8 +370,7 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
 def _distillation(part: str, config: DistillConfig, source: Sources, network: WorldModel) -> Work:
     """A step of one of the three trainings of Stage III."""
     first, model = config.teacher_forcing, network.config
-    mixed = {"view_weights": first.view_weights, "single_view_factor": first.single_view_factor}
-    clips = config.clips.model_copy(update=mixed if part == "teacher_forcing" else {})
+    clips = config.first_clips if part == "teacher_forcing" else config.clips
     batch = source.largest(model, getattr(config, part).trainer, clips, config.views)
     tokenizer, whole = tokenizer_outline(source.tokenizer), dict[str, nn.Module]()
     if isinstance(config.input, FrameInput):

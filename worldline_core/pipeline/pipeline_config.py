@@ -27,7 +27,7 @@ from worldline_core.rollout.rollout_config import ImportRolloutsConfig, RolloutC
 from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote
-from worldline_core.training.clip_config import EncodeLatentsConfig, FrameInput
+from worldline_core.training.clip_config import SUBSET, EncodeLatentsConfig, FrameInput
 from worldline_core.training.training_config import Stage1Config, Stage2Config, StageConfig, TokenizerConfig
 
 
@@ -77,7 +77,7 @@ class PipelineConfig(StrictModel):
     filter: FilterConfig
     render_actions: RenderActionsConfig | None = Field(
         default=None,
-        description="null: recordings without cameras; models take control vectors (train_stage2.native_size)",
+        description="null: no recording has a camera; models take control vectors (train_stage2.native_size)",
     )
     encode_latents: EncodeLatentsConfig
     train_tokenizer: TokenizerConfig | None = Field(default=None, description="null: models.tokenizer is used")
@@ -231,6 +231,12 @@ class PipelineConfig(StrictModel):
         """Refuse what distillation would refuse after Stage II, and what latents lack; without `distill.views` take those they have."""
         wanted = self.distill.views
         known = {"train_stage2.clips.view_weights": self.train_stage2.clips.shown_views(wanted)}
+        names = {*(self.distill.clips.view_weights or ()), *(self.distill.teacher_forcing.view_weights or ())}
+        trained = (self.train_stage2.clips.view_weights or {}).get(SUBSET, 0) > 0
+        if SUBSET in names and not trained and len(self.train_stage2.clips.shown_views(wanted)) > 1:
+            raise ValueError(
+                "distill shows subsets of the views: set train_stage2.clips.view_weights to learn them first"
+            )
         if not isinstance(self.distill.input, FrameInput):
             known["encode_latents.views"] = self.encode_latents.views
         if "views" not in self.distill.model_fields_set:

@@ -35,7 +35,7 @@ from worldline_core.evaluation.paired import (
     sign_of,
     write_series,
 )
-from worldline_core.evaluation.recordings import HEAD
+from worldline_core.evaluation.recordings import HEAD, ROLLOUT_PREFIX
 from worldline_core.evaluation.scores import SCORES_FILE, Interval
 from worldline_core.pages import charts
 from worldline_core.pages.page import render, words
@@ -94,10 +94,19 @@ def read_run(place: str) -> Series:
     if folder and not Path(place).exists():
         _require_night(read_history(Path(folder)), night)
         return read_series(scores_file(Path(folder), night))
+    found = evaluations_of(place)
+    return {name: values for path in found for name, values in read_scores(path, subgroups=True).items()}
+
+
+def evaluations_of(place: str) -> list[Path]:
+    """Verified folders of an evaluation, or of those that a report shows.
+
+    Raises: ArtifactError for a place without scores, or one that is damaged.
+    """
     path = Path(place)
     verify_artifact(path)
     if (path / SCORES_FILE).is_file():
-        return read_scores(path, subgroups=True)
+        return [path]
     names = [n for n in read_json(path / MANIFEST_NAME).get("inputs") or () if n.partition(".")[0] in EVALUATIONS]
     folders = [folder for name in names if (folder := linked_folder(path, name)) is not None]
     if not folders or len(folders) < len(names):
@@ -108,7 +117,7 @@ def read_run(place: str) -> Series:
         )  # fmt: skip
     for folder in folders:
         verify_artifact(folder)
-    return {name: values for folder in folders for name, values in read_scores(folder, subgroups=True).items()}
+    return folders
 
 
 def compare_runs(
@@ -149,6 +158,32 @@ def compare_runs(
         values = means[0], means[1], means[0] - means[1], low, high
         rows.append(Difference(what, group.replace("|", "/"), label, metric, *values, test.count, better))
     return rows
+
+
+def drawn_and_not(place: str) -> list[tuple[str, str]]:
+    """Methods of a run that are rollouts of one checkpoint with the same settings, through the cameras and by control vectors alone.
+
+    Raises: ArtifactError for a place without scores, or without such a pair.
+    """
+    found: dict[str, dict[bool, str]] = {}
+    for folder in evaluations_of(place):
+        for name in read_json(folder / MANIFEST_NAME).get("inputs") or ():
+            rollouts = linked_folder(folder, name) if name.startswith(ROLLOUT_PREFIX) else None
+            manifest = {} if rollouts is None else read_json(rollouts / MANIFEST_NAME)
+            checkpoint = manifest.get("inputs", {}).get("checkpoint", {}).get("digest")
+            if checkpoint is not None:
+                config = dict(manifest["config"])
+                cameras = config.pop("cameras", True)
+                config.pop("method")
+                found.setdefault(digest_value([checkpoint, config]), {})[cameras] = name.removeprefix(ROLLOUT_PREFIX)
+    pairs = sorted({(both[True], both[False]) for both in found.values() if len(both) == 2})
+    if not pairs:
+        raise ArtifactError(
+            "No checkpoint was rolled out both with cameras and without", where=place,
+            expected="two rollouts that differ in `cameras` alone, of a model that also takes control vectors",
+            next_step="add a rollout with `cameras: false` (docs/rollout.md), or name a second run to compare with",
+        )  # fmt: skip
+    return pairs
 
 
 def as_table(rows: Sequence[Difference]) -> str:

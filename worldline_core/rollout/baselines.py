@@ -45,7 +45,8 @@ class FirstFrameCopy:
     views: tuple[str, ...] = VIEWS
     view_sets = None
     frames_per_unit = TEMPORAL_FACTOR
-    needs_cameras = False
+    takes_maps = False
+    vector_robots: tuple[str, ...] | None = None
 
     def __init__(self, episodes: EpisodeSet) -> None:
         self.image_size = recorded_size(episodes)
@@ -71,7 +72,8 @@ class TextToVideo:
         ConfigError: nothing states how text is read, or the recordings' pictures do not divide into patches.
     """
 
-    needs_cameras = False
+    takes_maps = False
+    vector_robots: tuple[str, ...] | None = None
     view_sets = None
 
     def __init__(

@@ -72,7 +72,8 @@ class GeSim:
     views: tuple[str, ...] = VIEWS
     view_sets: tuple[tuple[str, ...], ...] = (VIEWS,)
     frames_per_unit = 4
-    needs_cameras = True
+    takes_maps = True
+    vector_robots: tuple[str, ...] | None = ()
 
     def __init__(self, config: GeSimConfig, episodes: EpisodeSet, tracks: ActionTracks, stride: int) -> None:
         self.image_size = recorded_size(episodes)

@@ -16,6 +16,7 @@ from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.tensor_transforms import is_rigid, valid_intrinsics
+from worldline_core.model.checkpoint import CheckpointInfo
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def real_numbers(values: Any, what: str) -> np.ndarray:
     if found.dtype.kind not in "fiu" or np.ma.is_masked(found):
         got = "masked values" if np.ma.is_masked(found) else found.dtype
         raise DataError("Not an array of numbers", where=what, expected="real numbers", got=got)
-    return np.asarray(found, np.float64)
+    return np.asarray(found, np.float64, order="C")
 
 
 def checked_seeds(seeds: object, count: int) -> list[int]:
@@ -99,13 +100,13 @@ def check_controls(
 
 
 def image_size(images: Mapping[str, np.ndarray], cameras: Mapping[str, Camera]) -> tuple[int, int]:
-    """(H, W) of first images that have a usable camera each.
+    """(H, W) of first images; those that have a camera have a usable one.
 
     Raises:
-        DataError: a camera is missing, the images differ in size, or a pose has a wrong shape.
+        DataError: a camera has no image, the images differ in size, or a pose has a wrong shape.
         CalibrationError: nothing can be drawn into a camera, so that a prediction would be one without controls.
     """
-    if set(cameras) != set(images):
+    if not set(cameras) <= set(images):
         raise DataError("The cameras are not those of the images", expected=list(images), got=list(cameras))
     for view, image in images.items():
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or np.ma.is_masked(image):
@@ -148,6 +149,30 @@ def image_size(images: Mapping[str, np.ndarray], cameras: Mapping[str, Camera]) 
     return height, width
 
 
+def require_drivable(
+    info: CheckpointInfo, views: Sequence[str], cameras: Mapping[str, Camera], embodiment: str
+) -> None:
+    """Refuse what a model cannot be driven by: views without a camera, for a model of action maps alone, or the control vectors
+    of a robot that it has not seen.
+
+    Raises: DataError: naming the views, or the robot.
+    """
+    missing = [view for view in views if view not in cameras or not info.config.takes_maps]
+    if missing and info.vectors is None:
+        raise DataError(
+            f"No camera of the view {', '.join(missing)}: the model takes action maps alone, which are drawn through cameras",
+            expected=f"cameras of {', '.join(views)}", got=", ".join(cameras) or "none",
+            next_step="give K and T_base_camera of the view, or use a model that also takes control vectors "
+            "(train_stage2.native_size)",
+        )  # fmt: skip
+    if missing and info.vectors is not None and embodiment not in info.vectors.embodiments:
+        raise DataError(
+            f"No camera of the view {', '.join(missing)}, and the model does not know this robot's control vectors",
+            expected=f"a robot that it was trained on: {', '.join(info.vectors.embodiments)}", got=embodiment,
+            next_step="give cameras to a model that takes action maps, or train on this robot",
+        )  # fmt: skip
+
+
 def project_controls(
     cameras: Mapping[str, Camera],
     size: tuple[int, int],
@@ -159,7 +184,8 @@ def project_controls(
     """Action tracks of controls ``(frames, state size)``; the first row belongs to the moment of the cameras' poses.
 
     Args:
-        size: (H, W) of the images that the cameras took.
+        cameras: of some or all views; nothing is drawn into others.
+        size: (H, W) of the images.
 
     Raises:
         DataError: a camera has neither a pose nor a known mount, or the controls do not fit the embodiment.
@@ -194,4 +220,4 @@ def project_controls(
         timestamps=np.arange(frames) / fps,
         cameras=tracks,
     )
-    return compute_tracks(episode, kinematics, without_mount="first_frame_mount")[0]
+    return compute_tracks(episode, kinematics, without_mount="first_frame_mount", image_size=size)[0]

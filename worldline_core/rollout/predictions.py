@@ -21,11 +21,14 @@ class Predictor(Protocol):
     """A model, server or baseline; the first of its views is in every prediction, which has 1 + k ``frames_per_unit`` frames.
 
     ``view_sets``: views that it predicts together, the largest set first; None: any of ``views``, each by itself.
+    ``takes_maps``: drawn through the cameras of the views; ``vector_robots``: robots of which it takes control vectors in views
+    without a camera, None: it needs no cameras at all.
     """
 
     views: tuple[str, ...]
     frames_per_unit: int
-    needs_cameras: bool
+    takes_maps: bool
+    vector_robots: tuple[str, ...] | None
 
     @property
     def view_sets(self) -> tuple[tuple[str, ...], ...] | None: ...
@@ -142,14 +145,19 @@ def _views(
     if tracks is not None and row.episode_id not in tracks:
         return (), ("missing_actions", "no action tracks of this episode")
     recorded = tuple(view for view in predictor.views if view in row.views)
-    known = tracks.calibrated_views(row.episode_id) if tracks and predictor.needs_cameras else recorded
-    views = tuple(view for view in recorded if view in known)
+    robots = predictor.vector_robots
+    drawn = tracks.calibrated_views(row.episode_id) if tracks and predictor.takes_maps and config.cameras else ()
+    free = tracks is None or robots is None or row.embodiment in robots
+    views = tuple(view for view in recorded if free or view in drawn)
     sets = predictor.view_sets or (views, predictor.views[:1])
     if config.views != "all_present":
         sets = (tuple(view for view in predictor.views if view in config.views),)
     fitting = [wanted for wanted in sets if predictor.views[0] in wanted and set(wanted) <= set(views)]
     if fitting:
         return fitting[0], None
+    if robots and not free and set(sets[-1]) <= set(recorded):
+        known = ", ".join(robots)
+        return (), ("unknown_embodiment", f"without cameras the model knows {known}, and not {row.embodiment}")
     reason, present, what = "missing_view", recorded, "no video of"
     if set(sets[-1]) <= set(recorded):
         reason, present, what = "missing_calibration", views, "no camera of"

@@ -31,7 +31,7 @@ class RecordedStart:
 
     Attributes:
         images: ``uint8 (H, W, 3)`` by view.
-        cameras: of each view, at the first frame of the recording.
+        cameras: of the views that have one, at the first frame of the recording.
         state: ``(state size)``, the first command.
         earlier: ``(frame, state size)``, the commands from there to the frame of the images.
     """
@@ -59,6 +59,7 @@ class RecordedStarts:
     Args:
         view_sets: of the model; a start shows the first one whose views are all recorded and calibrated.
         fps: of the model's controls.
+        needs_cameras: of every view; False: of a model that knows control vectors.
         embodiment, splits: of the recordings; None: all.
     """
 
@@ -68,6 +69,7 @@ class RecordedStarts:
         *,
         view_sets: Sequence[Sequence[str]],
         fps: float,
+        needs_cameras: bool = True,
         embodiment: str | None = None,
         splits: Sequence[str] | None = None,
     ) -> None:
@@ -75,6 +77,8 @@ class RecordedStarts:
         self._rows = {row.episode_id: row for row in self._episodes.rows}
         self._left_out: dict[str, str] = {}
         self.rows: list[EpisodeRow] = []
+        self._needs_cameras = needs_cameras
+        fit = {None, "missing_view", *(() if needs_cameras else ("missing_calibration",))}
         banks: set[str] = set()
         for row in self._episodes.rows:
             reasons = {
@@ -82,7 +86,7 @@ class RecordedStarts:
                 "of another split": splits is not None and row.split not in splits,
                 "without all views": not any(set(views) <= set(row.views) for views in view_sets),
                 "of another rate": row.fps != fps,
-                "without calibration or commands": row.stage2_reason not in (None, "missing_view"),
+                "without calibration or commands": row.stage2_reason not in fit,
                 _SAME_START: row.bank in banks,
             }
             reason = next((reason for reason, holds in reasons.items() if holds), None)
@@ -168,7 +172,8 @@ class RecordedStarts:
 
     def _read(self, episode_id: str, frame: int) -> RecordedStart:
         position, episode = self._episodes.position(episode_id), self._episode(episode_id)
-        usable = set(episode.cameras) & set(self._rows[episode_id].views)
+        recorded = set(self._rows[episode_id].views)
+        usable = recorded & set(episode.cameras) if self._needs_cameras else recorded
         views = next((views for views in self._view_sets if set(views) <= usable), None)
         if views is None:
             raise DataError(
@@ -176,7 +181,8 @@ class RecordedStarts:
                 expected=" or ".join(" + ".join(views) for views in self._view_sets), got=" + ".join(sorted(usable)),
                 next_step="add its calibration, or start from another recording",
             )  # fmt: skip
-        cameras = {view: Camera(episode.cameras[view].K, episode.cameras[view].T_base_camera[0]) for view in views}
+        known = {view: episode.cameras[view] for view in views if view in episode.cameras}
+        cameras = {view: Camera(camera.K, camera.T_base_camera[0]) for view, camera in known.items()}
         images = {view: self._episodes.frames(position, view, [frame])[0] for view in views}
         commands = np.asarray(episode.action[: frame + 1], np.float64)
         return RecordedStart(episode_id, episode.instruction, images, cameras, commands[0], commands[1:])
@@ -190,14 +196,20 @@ class RecordedStarts:
         return video
 
 
-def read_start(folder: Path, embodiment: Embodiment, views: Sequence[str]) -> RecordedStart:
+def read_start(
+    folder: Path, embodiment: Embodiment, views: Sequence[str], *, needs_cameras: bool = True
+) -> RecordedStart:
     """An observation as files: ``<view>.png`` of each view, ``calibration.yaml`` (docs/sources.md), and ``state.yaml``, the
     command that belongs to the pictures: a number for each name of the embodiment's state, in its units.
+
+    Args:
+        needs_cameras: False: the calibration may lack views, or be missing.
 
     Raises:
         DataError: a file, view or number is missing, or cannot be used.
     """
-    calibration, cameras = read_calibration(folder / "calibration.yaml").views, RecordedCameras()
+    path, cameras = folder / "calibration.yaml", RecordedCameras()
+    calibration = read_calibration(path).views if needs_cameras or path.is_file() else {}
     images: dict[str, np.ndarray] = {}
     for view in views:
         try:
@@ -205,9 +217,11 @@ def read_start(folder: Path, embodiment: Embodiment, views: Sequence[str]) -> Re
         except (OSError, ValueError) as error:
             raise DataError("Not a picture to start from", where=folder / f"{view}.png", got=str(error)) from error
         entry = calibration.get(view)
+        if entry is None and not needs_cameras:
+            continue
         if entry is None or entry.T is None or entry.distortion is not None:
             raise DataError(
-                "A start needs the pinhole camera of each view", where=f"{folder / 'calibration.yaml'}, view {view}",
+                "A start needs the pinhole camera of each view", where=f"{path}, view {view}",
                 expected="K, T and no distortion", got="nothing" if entry is None else "T_feature or distortion",
                 next_step="write K and T; undistort the picture",
             )  # fmt: skip

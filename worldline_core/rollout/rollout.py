@@ -87,6 +87,16 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         world = TextToVideo(config, sampler, Path(inputs["checkpoint"]), Path(inputs["tokenizer"]), episodes)
     else:
         world = _load(config, sampler, inputs, rates)
+        if not config.cameras and world.needs_cameras:
+            raise ConfigError(
+                "The model takes action maps alone, which are drawn through cameras", where="rollout.cameras",
+                expected="true", got=False, next_step="train with train_stage2.native_size, or leave it out",
+            )  # fmt: skip
+        if config.actions == "mirrored" and not (config.cameras and world.takes_maps):
+            raise ConfigError(
+                "Controls are mirrored as poses, of which there are no control vectors", where="rollout.actions",
+                expected="a model of action maps, with cameras", got=world.info.config.action_conditioning,
+            )  # fmt: skip
         tracks = open_controls(
             inputs, episodes, vectors=not world.needs_cameras, controls=world.contract.controls
         )  # fmt: skip
@@ -201,6 +211,7 @@ def _predicted(
         views=batch[0].views,
         stride=config.stride,
         without_actions=config.actions == "zero",
+        by_vector=not config.cameras,
     )
 
 
@@ -232,7 +243,7 @@ def _timed_blocks(
         return None
     first = encode_images(world.tokenizer, _observed(world, episodes, [item]).to(config.device))
     index = range(0, world.frames_per_unit + 1, TEMPORAL_FACTOR)
-    maps = world.action_maps([tracks.tracks(item.controls_of)], index, views=item.views)
+    maps = world.action_maps([tracks.tracks(item.controls_of)], index, views=item.views, by_vector=not config.cameras)
     return long_rollout(partial(world.simulator, [item.seed], item.views), first, maps, sampler.timed_blocks)
 
 

@@ -122,8 +122,9 @@ class RolloutConfig(StrictModel):
         method: name of the predictions in scores and reports.
         actions: controls that drive the predictions.
         banks, embodiments: only episodes of these candidate banks, of these robots; None: all.
-        views: ``all_present``: the views of each episode that have a camera and that the model was trained on; the model's
+        views: ``all_present``: the largest set of views that each episode has and that the model was trained on; the model's
             first one is always among them. Or names of views: episodes that lack one of them are left out.
+        cameras: false: as if no camera were known, so that a model that also takes control vectors is driven by these alone.
         num_frames: longest prediction; shorter episodes are predicted as far as whole blocks (or latent frames) go.
             ``whole``: every recording to its end; the last block (or clip) keeps the last controls, and its frames after the
             end are cut off.
@@ -142,6 +143,7 @@ class RolloutConfig(StrictModel):
     embodiments: tuple[str, ...] | None = None
     max_episodes_per_embodiment: int | None = Field(default=None, ge=1)
     views: Literal["all_present"] | tuple[str, ...] = "all_present"
+    cameras: bool = True
     num_frames: Annotated[int, Field(ge=5)] | Literal["whole"] = 33
     stride: int = Field(default=1, ge=1)
     batch_size: int = Field(default=8, ge=1)

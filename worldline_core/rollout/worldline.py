@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.actions.action_maps import render_action_maps, stack_controls
-from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, native_vectors
+from worldline_core.actions.action_maps import ControlDrawing
+from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, drawn_size
 from worldline_core.errors import CheckpointError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -30,6 +30,7 @@ from worldline_core.rollout.observation import (
     image_size,
     project_controls,
     real_numbers,
+    require_drivable,
 )
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts
@@ -50,7 +51,8 @@ class WorldLine:
             chained. None: all at once.
         frames_per_unit: a prediction has 1 + k times this many frames (k blocks, or k latent frames).
         image_size: (H, W) of the predicted frames.
-        needs_cameras: controls are drawn into the views; a model of control vectors needs no cameras.
+        needs_cameras: controls are drawn into every view; a model that also takes control vectors does without some or all cameras.
+        vector_robots: robots whose control vectors it knows.
     """
 
     def __init__(
@@ -71,7 +73,8 @@ class WorldLine:
         self.device = device
         self.bfloat16 = bfloat16
         self.views, self.view_sets = info.views, info.view_sets
-        self.needs_cameras = info.config.native_size is None
+        self.needs_cameras, self.takes_maps = info.vectors is None, info.config.takes_maps
+        self.vector_robots = () if info.vectors is None else info.vectors.embodiments
         self.contract = info.contract
         self.causal = info.causal
         if self.causal is not None:
@@ -146,15 +149,15 @@ class WorldLine:
             images: what each view sees now, ``uint8 (H, W, 3)`` RGB, all of one size: of the views of one of ``view_sets``.
             controls: ``(frames, state size)`` in the embodiment's layout (for each arm joints [rad], then the gripper's
                 opening, 0 closed .. 1 open), at ``contract.fps`` frames per second. Row 0 belongs to the images.
-            cameras: of the same views.
+            cameras: of the same views. A model that knows the robot's control vectors takes these in views without a camera.
             embodiment: name or YAML file of the robot.
 
         Returns:
             ``uint8 (frames, H, W, 3)`` per view, the observed frame first, at ``image_size``.
 
         Raises:
-            DataError: the model was not trained on these views together, a shape does not fit, the number of frames is not
-                1 + k whole units, or controls are in another unit.
+            DataError: the model was not trained on these views together, or needs the camera of one, a shape does not fit, the
+                number of frames is not 1 + k whole units, or controls are in another unit.
             CalibrationError: a camera cannot be used.
             ConfigError: there is no such embodiment.
         """
@@ -166,6 +169,7 @@ class WorldLine:
                 got=len(rows), next_step=f"give {1 + max(1, (len(rows) - 1) // unit) * unit} rows",
             )  # fmt: skip
         kinematics = ArmKinematics(load_embodiment(embodiment))
+        require_drivable(self.info, views, cameras, kinematics.embodiment.name)
         check_controls(kinematics, rows, "controls")
         seeds = checked_seeds(seed, 1)
         tracks = project_controls(
@@ -203,6 +207,8 @@ class WorldLine:
         """
         starts = Starts(images, cameras, embodiment, state, seed, earlier)
         views = self.chosen_views(starts.images[0])
+        for given in starts.cameras:
+            require_drivable(self.info, views, given, starts.kinematics.embodiment.name)
         frames = self.unit(USUAL_CLIP_FRAMES)
         # Rows of the tracks of a step: the start, the last known frame, the new ones.
         index = range(1, frames + 2, self.tokenizer.temporal_compression)
@@ -226,6 +232,7 @@ class WorldLine:
         views: Sequence[str] | None = None,
         stride: int = 1,
         without_actions: bool = False,
+        by_vector: bool = False,
     ) -> Iterator[Frames]:
         """Videos of a batch of any length, piece by piece: the observed frame, then what each step predicts.
 
@@ -236,7 +243,8 @@ class WorldLine:
             seeds: of each clip's noise, which does not depend on who shares the batch.
             views: names of the views in ``images``, one of ``view_sets`` in any order; by default the largest.
             stride: predicted frames are those of every ``stride``-th control.
-            without_actions: with maps of zeros.
+            without_actions: with controls of zeros, which are none.
+            by_vector: every view takes control vectors, as if no camera were known.
 
         Yields:
             Of every clip, ``uint8 (n, H, W, 3)`` by view.
@@ -257,7 +265,7 @@ class WorldLine:
 
         def controls(begin: int) -> Tensor:
             index = [stride * frame for frame in range(begin, begin + unit + 1, self.tokenizer.temporal_compression)]
-            maps = self.action_maps(tracks, index, views=chosen, stride=stride)
+            maps = self.action_maps(tracks, index, views=chosen, stride=stride, by_vector=by_vector)
             return torch.zeros_like(maps) if without_actions else maps
 
         for begin, clips in zip(begins, session.steps(map(controls, begins)), strict=True):
@@ -296,9 +304,10 @@ class WorldLine:
         *,
         views: Sequence[str],
         stride: int = 1,
+        by_vector: bool = False,
     ) -> Float[Tensor, "b v a t h w"]:
-        """Maps (or vectors, of a model with FiLM) of the latent frames at these recorded frames, drawn as of a clip that begins at the
-        first of them; past the end of a track its last controls stay.
+        """Controls of the latent frames at these recorded frames, drawn as of a clip that begins at the first of them; past the end
+        of a track its last controls stay. Views without a camera take vectors; with ``by_vector`` all do.
         """
         cut = []
         count, native = self.info.config.action_frames, self.info.config.native_size
@@ -306,13 +315,9 @@ class WorldLine:
             # Of every latent frame, and of those between it and the one before: `control_frames`.
             drawn = [max(frames[0], frame - stride * back) for frame in frames for back in range(count)]
             cut.append(track.clip([min(frame, track.num_frames - 1) for frame in drawn]))
-        if native is not None:
-            maps = native_vectors(cut, views, native)
-        else:
-            collated, size = collate_tracks(cut, views=views), cut[0].image_size
-            sigma = cast("float", self.contract.sigma_px_ref)
-            maps = render_action_maps(collated, size, grid_size=self.contract.grid_size, sigma_px_ref=sigma)
-        return stack_controls(maps.to(self.device), count)
+        drawing = ControlDrawing(self.contract.grid_size, self.contract.sigma_px_ref, native, count)
+        chosen = torch.full((len(cut), len(views)), by_vector)
+        return drawing.draw(collate_tracks(cut, views, native), drawn_size(cut), chosen).to(self.device)
 
     def simulator(
         self, seeds: Sequence[int], views: Sequence[str] | None = None, stride: int = 1

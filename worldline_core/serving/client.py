@@ -105,7 +105,8 @@ class SimulatorClient(MessageSocket):
         """Begin a session at a recording of the server, or at an observation as of ``WorldLine.start``.
 
         Args:
-            cameras: by view, ``Camera`` objects.
+            cameras: by view, ``Camera`` objects; a model that knows the robot's control vectors (``needs_cameras`` of the metadata is
+                false) does without.
             seeds: a clip for each.
 
         Raises:

@@ -420,7 +420,7 @@ def save_played(
     tracks = project_controls(start.cameras, given, kinematics, controls=commands, fps=fps)
     height, width = next(iter(frames.values())).shape[1:3]
     cameras = {}
-    for view in frames:
+    for view in start.cameras:
         v = tracks.views.index(view)
         poses = tracks.T_base_camera[:, v].astype(np.float64)
         poses[:, :3, :3] = nearest_rotation(poses[:, :3, :3])

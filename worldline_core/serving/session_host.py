@@ -58,7 +58,9 @@ class _CameraMessage(_Request):
 
 
 class StartRequest(_Request):
-    """Begin a session at a recording of the server, or at images, cameras, state and embodiment; a clip for each seed."""
+    """Begin a session at a recording of the server, or at images, state, embodiment and cameras (of the views that the model needs
+    them of); a clip for each seed.
+    """
 
     op: Literal["start"]
     episode: str | None = None
@@ -114,7 +116,9 @@ class SessionHost:
     def __init__(self, world: WorldLine, config: ServeConfig) -> None:
         self.world = world
         self.config = config
-        self.starts = RecordedStarts(config.episodes, view_sets=world.view_sets, fps=world.contract.fps)
+        self.starts = RecordedStarts(
+            config.episodes, view_sets=world.view_sets, fps=world.contract.fps, needs_cameras=world.needs_cameras
+        )
         self.kinematics = KinematicsByName({})
         self._running: dict[str, _Running] = {}
         self._players: set[object] = set()
@@ -143,6 +147,7 @@ class SessionHost:
         return {
             "protocol": PROTOCOL,
             "views": list(world.views),
+            "needs_cameras": world.needs_cameras,
             "view_sets": [list(views) for views in world.view_sets],
             "fps": world.contract.fps,
             "frames_per_step": world.frames_per_unit if world.causal is not None else None,
@@ -203,7 +208,8 @@ class SessionHost:
             "state": request.state,
         }
         present = [name for name, value in given.items() if value is not None]
-        if (request.episode is not None) == bool(present) or (present and len(present) < len(given)):
+        whole = {*present, "cameras"} == given.keys()  # what lacks a camera, the model says
+        if (request.episode is not None) == bool(present) or (present and not whole):
             raise DataError(
                 "A session starts at a recording, or at an observation", expected=f"episode, or {', '.join(given)}",
                 got=", ".join([*present, *(["episode"] if request.episode is not None else [])]) or "neither",

@@ -1,6 +1,6 @@
 """From what a person does with keys, a gamepad or a mouse to commands of all joints, and to marks over the pictures.
 
-Wishes are in the head camera's terms, level with the ground: to its right, away from it, up. They move a wanted pose of each tool,
+Wishes are in the head camera's terms (the base's, where no camera is known), level with the ground: to its right, away from it, up. They move a wanted pose of each tool,
 which inverse kinematics follows within the joint limits; a pose that cannot be reached is drawn back to what was reached.
 """
 
@@ -66,8 +66,12 @@ class Teleoperation:
         self.take_over(start.state)
 
     def _level_axes(self) -> np.ndarray:
-        """(3, 3) columns: right, away and up of the first camera in the base frame."""
-        view = next(iter(self._start.cameras))
+        """(3, 3) columns: right, away and up of the first camera in the base frame, or of someone who stands behind the base and looks
+        along its x axis.
+        """
+        view = next(iter(self._start.cameras), None)
+        if view is None:
+            return np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         tracks = self._tracks(self._start.state[None])
         pose = tracks.T_base_camera[0, tracks.views.index(view)]
         away = pose[:3, 2] + 1e-3 * -pose[:3, 1]  # of a camera that looks straight down: where its picture's top is
@@ -125,6 +129,12 @@ class Teleoperation:
         seen = self._seen
         if goal.view not in self._start.images:
             raise DataError("No such view", expected=list(self._start.images), got=goal.view)
+        if goal.view not in self._start.cameras:
+            raise DataError(
+                "Nothing can be dragged in a view without a camera",
+                where=goal.view,
+                next_step="use keys, or another view",
+            )
         v = seen.views.index(goal.view)
         height, width = seen.image_size
         ray = np.linalg.solve(seen.K[v], np.array([goal.u * width - 0.5, goal.v * height - 0.5, 1.0]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -12,8 +13,17 @@ from worldline_core.config import ImageSize, StrictModel
 
 JOINT = "joint"
 """In place of a view's name: all views of the model together."""
+SUBSET = "subset"
+"""In place of a view's name: some of an episode's views, the first one among them (view dropout)."""
 PRIMARY = "primary"
 """In place of a view's name: the task-facing view of each episode (Stage I)."""
+
+
+def view_subsets(views: Sequence[str]) -> list[tuple[str, ...]]:
+    """Proper subsets of some views that hold the first of them; of a single view itself."""
+    first, *others = views
+    chosen = (rest for count in range(max(len(others), 1)) for rest in combinations(others, count))
+    return [(first, *rest) for rest in chosen]
 
 
 def _expand_range(value: Any) -> Any:
@@ -30,12 +40,14 @@ class ClipSampling(StrictModel):
     ``lengths``: clip lengths in video frames (4 k + 1), equally likely; a list, or ``{from: 33, to: 129}`` for every
     such length between. ``strides``: temporal strides.
     ``source_weights``: weight of an episode by its source (default 1).
-    ``view_weights``: None trains all views jointly (Stage II); otherwise what a step trains on is drawn by these
-    weights: the name of a view, "primary" (each episode's own task-facing view; Stage I), or "joint" (all views).
+    ``view_weights``: None trains all views of an episode jointly (Stage II); otherwise what a step trains on is drawn by these
+    weights: "joint" (all views), "subset" (some of them, the first among them: such sets can then be predicted, too), the
+    name of a view, or "primary" (each episode's own task-facing view; Stage I).
     Steps on one view cost a fraction of joint ones and teach most of what controls look like: where compute is short,
     a mixture learns faster. ``single_view_factor`` multiplies the batch of such steps.
-    ``optional_views``: views that an episode may lack. A batch holds clips that have the same of them, so that nothing
-    is padded and a clip is trained as it would be alone.
+
+    A batch holds clips of episodes that have the same views, so that nothing is padded and a clip is trained as it would be
+    alone.
     """
 
     lengths: Annotated[tuple[int, ...], BeforeValidator(_expand_range)] = Field(default=(33,), min_length=1)
@@ -43,7 +55,6 @@ class ClipSampling(StrictModel):
     source_weights: dict[str, float] = Field(default_factory=dict)
     view_weights: dict[str, float] | None = None
     single_view_factor: int = Field(default=1, ge=1)
-    optional_views: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _lengths_the_tokenizer_codes(self) -> Self:
@@ -52,14 +63,10 @@ class ClipSampling(StrictModel):
             raise ValueError(f"lengths {odd}: a causal tokenizer codes clips of 4 k + 1 frames")
         return self
 
-    def needed_views(self, views: Sequence[str]) -> tuple[str, ...]:
-        """Those of a model's views that every episode must have."""
-        return tuple(view for view in self.shown_views(views) if view not in self.optional_views)
-
     def shown_views(self, views: Sequence[str]) -> tuple[str, ...]:
-        """Those of a model's views that clips may have."""
-        weights = self.view_weights
-        return tuple(view for view in views if weights is None or weights.get(JOINT, 0) > 0 or weights.get(view, 0) > 0)
+        """Those of some views that clips may show."""
+        drawn = {name for name, weight in (self.view_weights or {JOINT: 1.0}).items() if weight > 0}
+        return tuple(view for view in views if drawn & {JOINT, SUBSET, view})
 
 
 class ReadingConfig(StrictModel):
@@ -109,15 +116,11 @@ class EncodeLatentsConfig(StrictModel):
     """Settings of cached latents.
 
     ``start_step``: clips may start at multiples of it. ``strides``: temporal strides that training may ask for.
-    ``primary_alone``: also encode, by their task-facing view alone, episodes that lack some of ``views``: Stage I takes
-    them (plain videos have one view), Stage II does not.
-    ``optional_views``: those of ``views`` that an episode may lack; its other views are encoded.
+    ``views``: those that are encoded of an episode that has them, beside its task-facing one.
     """
 
     splits: tuple[str, ...] | None = None
     views: tuple[str, ...] = ("head", "left_wrist", "right_wrist")
-    primary_alone: bool = False
-    optional_views: tuple[str, ...] = ()
     image_size: ImageSize = (64, 96)
     start_step: int = Field(default=4, ge=1)
     strides: tuple[int, ...] = Field(default=(1,), min_length=1)

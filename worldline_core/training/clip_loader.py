@@ -20,8 +20,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from worldline_core.actions.action_maps import control_frames, render_action_maps, stack_controls
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, native_vectors
+from worldline_core.actions.action_maps import ControlDrawing, control_frames
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, drawn_size
 from worldline_core.errors import ConfigError, DataError, TrainingError, WorldLineError
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.store.artifact_files import read_json_lines
@@ -204,8 +204,9 @@ class ClipLoader:
         text: turns instructions into ids; its prompts may name a clip's duration and size.
         frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
             rate.
-        native_size: of the control vectors that are given instead of maps, where the model takes these.
-        action_frames: control frames whose maps a latent frame takes.
+        action_frames: control frames that a latent frame takes.
+        native_size: of the control vectors of a model that takes these.
+        maps: the model takes maps.
         object_weights: loss weights of clips; None: all places count alike.
     """
 
@@ -215,17 +216,18 @@ class ClipLoader:
     tracks: ActionTracks | None = None
     text: TextEncoder | None = None
     frame_rates: Mapping[str, float] = field(default_factory=dict)
-    native_size: int | None = None
     action_frames: int = 1
+    native_size: int | None = None
+    maps: bool = True
     object_weights: ObjectWeights | None = None
     device: str = "cpu"
 
     def __post_init__(self) -> None:
         self._tracks: dict[str, EpisodeTracks] = {}
         self._resident: ResidentTracks | None = None
-        if isinstance(self.source, ResidentLatents) and self.tracks and not self.native_size:
+        if isinstance(self.source, ResidentLatents) and self.tracks:
             names = [row.episode_id for row in self.source.rows if row.episode_id in self.tracks]
-            self._resident = ResidentTracks(self.tracks, names, self.views, self.device)
+            self._resident = ResidentTracks(self.tracks, names, self.views, self.device, self.native_size)
 
     def batches(
         self, sampler: ClipSampler, reading: ReadingConfig, run: Path | None = None, stop: int | None = None
@@ -306,19 +308,18 @@ class ClipLoader:
         return self.frame_rates[clip.episode_id] / clip.stride
 
     def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v a t h w"]:
-        """Maps at latent resolution (or vectors) of the controls that each latent frame takes (docs/method.md section 2)."""
+        """Controls that each latent frame takes (docs/method.md section 2): in each view the map at latent resolution, or the vector."""
         if self.tracks is None:
             raise ConfigError("Action maps need action tracks", where="ClipLoader")
         if self._resident is not None:
             samples, image_size = self._resident.batch(clips, self.action_frames, views), self._resident.image_size
         else:
             cut = [self._clip_tracks(self.tracks, clip) for clip in clips]
-            if self.native_size is not None:
-                return native_vectors(cut, views, self.native_size).to(self.device)
-            samples, image_size = collate_tracks(cut, views=views).to(self.device), cut[0].image_size
-        grid_size = self.source.latent_shape[1:]
-        maps = render_action_maps(samples, image_size, grid_size, sigma_px_ref=self.tracks.sigma_px_ref)
-        return stack_controls(maps, self.action_frames)
+            samples, image_size = collate_tracks(cut, views, self.native_size).to(self.device), drawn_size(cut)
+        sigma = self.tracks.sigma_px_ref if self.maps else None
+        drawing = ControlDrawing(self.source.latent_shape[1:], sigma, self.native_size, self.action_frames)
+        by_vector = torch.tensor([[view in clip.vectors for view in views] for clip in clips], device=self.device)
+        return drawing.draw(samples, image_size, by_vector)
 
     def _clip_tracks(self, tracks: ActionTracks, clip: Clip) -> EpisodeTracks:
         if clip.episode_id not in self._tracks:

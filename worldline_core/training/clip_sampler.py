@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -12,18 +13,25 @@ from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.errors import DataError
 from worldline_core.model.world_model_config import TrainedClips
-from worldline_core.training.clip_config import JOINT, PRIMARY, ClipSampling
+from worldline_core.training.clip_config import JOINT, PRIMARY, SUBSET, ClipSampling, view_subsets
 from worldline_core.training.processes import ALONE, BatchPlan
+
+LEAST_SHARE = 0.01
+"""Of the steps; a set of views that fewer of them show is not known."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """``num_frames`` frames at ``start``, ``start + stride``, ... of an episode."""
+    """``num_frames`` frames at ``start``, ``start + stride``, ... of an episode.
+
+    ``vectors``: views that take control vectors though their cameras may be known.
+    """
 
     episode_id: str
     start: int
     num_frames: int
     stride: int
+    vectors: tuple[str, ...] = ()
 
     @property
     def frames(self) -> range:
@@ -112,6 +120,7 @@ class ClipSampler:
         start_step: clips start at multiples of it.
         batch_size: clips of a micro-batch.
         plan: which micro-batches are this process's, and how many are drawn as one.
+        vector_share: how often a view of a clip takes the control vector, whether its camera is known or not.
 
     Raises:
         DataError: no episode is long enough for any clip.
@@ -128,7 +137,9 @@ class ClipSampler:
         batch_size: int,
         seed: int,
         plan: BatchPlan = ALONE,
+        vector_share: float = 0.0,
     ) -> None:
+        self.vector_share = vector_share
         self.views, self.start_step, self.batch_size, self.seed, self.plan = views, start_step, batch_size, seed, plan
         self.single_view_factor = config.single_view_factor
         self._view_weights = dict(sorted((config.view_weights or {JOINT: 1.0}).items()))
@@ -166,15 +177,24 @@ class ClipSampler:
         kind = self._kinds[int(random.choice(len(self._kinds), p=self._kind_weights))]
         name = JOINT
         if set(self._view_weights) != {JOINT}:
-            here = (JOINT, PRIMARY, *kind.views)
-            present = [weight * (name in here) for name, weight in self._view_weights.items()]
-            name = list(self._view_weights)[int(random.choice(len(present), p=_normalised(present)))]
-        size = self.batch_size * (1 if name == JOINT else self.single_view_factor)
+            drawn = self._drawn(kind)
+            name = list(drawn)[int(random.choice(len(drawn), p=_normalised(list(drawn.values()))))]
+        size = self.batch_size * (1 if name in (JOINT, SUBSET) else self.single_view_factor)
+        sets = self._sets(name, kind)
+        views = sets[0] if len(sets) == 1 else sets[int(random.integers(len(sets)))]
         clips = self._draw(random, kind, size, part)
-        return ClipBatch(clips, self._slots(name, kind), primary=name == PRIMARY), kind
+        return ClipBatch(clips, views, primary=name == PRIMARY), kind
 
-    def _slots(self, name: str, kind: _Kind) -> tuple[str, ...]:
-        return kind.views if name == JOINT else (self.views[0],) if name == PRIMARY else (name,)
+    def _drawn(self, kind: _Kind) -> dict[str, float]:
+        """What steps on clips of a kind may train on, with its weight."""
+        here = (PRIMARY, *((JOINT, SUBSET, *kind.views) if kind.views else ()))
+        return {name: weight * (name in here) for name, weight in self._view_weights.items()}
+
+    def _sets(self, name: str, kind: _Kind) -> list[tuple[str, ...]]:
+        """Sets of views that a step on ``name`` may show, equally likely."""
+        if name == SUBSET:
+            return view_subsets(kind.views)
+        return [kind.views if name == JOINT else (self.views[0],) if name == PRIMARY else (name,)]
 
     def replacement(self, index: int, place: int, attempt: int) -> Clip:
         """Another clip of the length, stride and views of micro-step ``index``, for its unreadable clip at ``place``."""
@@ -185,15 +205,14 @@ class ClipSampler:
         return self._draw(random, kind, 1, part)[0]
 
     def view_sets(self, slots: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
-        """Sets of the model's ``slots`` that clips fill together."""
-        drawn = [name for name, weight in self._view_weights.items() if weight > 0]
-        shown = {
-            tuple(view for view in slots if view in self._slots(name, kind))
-            for kind in self._kinds
-            for name in drawn
-            if name in (JOINT, PRIMARY, *kind.views)
-        }
-        return tuple(sorted(shown))
+        """Sets of the model's ``slots`` that `LEAST_SHARE` of the steps or more fill together."""
+        shares: Counter[tuple[str, ...]] = Counter()
+        for kind, share in zip(self._kinds, self._kind_weights, strict=True):
+            names = self._drawn(kind)
+            for name, weight in zip(names, _normalised(list(names.values())), strict=True):
+                for views in (sets := self._sets(name, kind)):
+                    shares[tuple(view for view in slots if view in views)] += share * weight / len(sets)
+        return tuple(sorted(views for views, share in shares.items() if share >= LEAST_SHARE))
 
     def trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
         """View sets and strides of the clips; None: all ``slots`` together, at stride 1."""
@@ -209,6 +228,11 @@ class ClipSampler:
             row = kind.rows[number]
             starts = (row.num_frames - 1 - (kind.length - 1) * kind.stride) // self.start_step + 1
             clips.append(Clip(row.episode_id, int(where * starts) * self.start_step, kind.length, kind.stride))
+        if self.vector_share:
+            chosen = random.random((size * self.plan.together, len(self.views)))[part * size : (part + 1) * size]
+            for number, row in enumerate(chosen < self.vector_share):
+                vectors = tuple(view for view, vector in zip(self.views, row, strict=True) if vector)
+                clips[number] = replace(clips[number], vectors=vectors)
         return tuple(clips)
 
 

@@ -9,7 +9,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -275,24 +275,35 @@ class ResidentTracks:
         DataError: the episodes' frames have several sizes.
     """
 
-    def __init__(self, tracks: ActionTracks, episode_ids: Sequence[str], views: tuple[str, ...], device: str) -> None:
+    def __init__(
+        self,
+        tracks: ActionTracks,
+        episode_ids: Sequence[str],
+        views: tuple[str, ...],
+        device: str,
+        native_size: int | None = None,
+    ) -> None:
         samples: list[TrackBatch] = []
         self._first: dict[str, int] = {}
         sizes: set[tuple[int, int]] = set()
         count = 0
         for episode_id in episode_ids:
             episode = tracks.tracks(episode_id)
-            samples.append(collate_tracks([episode], views))
+            samples.append(collate_tracks([episode], views, native_size))
             self._first[episode_id] = count
             count += episode.num_frames
-            sizes.add(episode.image_size)
+            sizes |= {episode.image_size} if episode.calibrated_views else set()
         if len(sizes) > 1:
             raise DataError("Resident action tracks have frames of one size", where=tracks.root, got=sorted(sizes))
-        (self.image_size,) = sizes
+        self.image_size = sizes.pop() if sizes else (1, 1)
         arms = max(sample.valid.shape[3] for sample in samples)
         self._samples = {
             name: torch.cat([_padded(getattr(sample, name)[0], arms) for sample in samples]).to(device)
             for name in SAMPLES
+        }
+        self._vectors = {
+            name: torch.cat([getattr(sample, name)[0] for sample in samples]).to(device)
+            for name in (() if native_size is None else ("native", "camera"))
         }
         self._views = views
 
@@ -303,7 +314,10 @@ class ResidentTracks:
         strides = np.array([clip.stride for clip in clips])
         numbers = torch.from_numpy(firsts[:, None] + strides[:, None] * within).to(self._samples["uv"].device)
         chosen = [self._views.index(view) for view in views]
-        return TrackBatch(**{name: values[numbers][:, :, chosen] for name, values in self._samples.items()})
+        vectors = {name: values[numbers] for name, values in self._vectors.items()}
+        if vectors:
+            vectors["camera"] = vectors["camera"][:, :, chosen]
+        return TrackBatch(**{name: values[numbers][:, :, chosen] for name, values in self._samples.items()}, **vectors)
 
 
 def _padded(values: Tensor, arms: int) -> Tensor:
@@ -427,36 +441,48 @@ def training_rows(
     episodes: EpisodeSet,
     *,
     stage: Literal[1, 2],
-    needed: Sequence[str] = (),
+    views: Sequence[str] = (),
     tracks: ActionTracks | None = None,
+    vectors: bool = False,
     outcomes: Sequence[str] | None = None,
 ) -> list[ClipRow]:
-    """Rows of the source whose episode is fit for the stage, ended in one of ``outcomes`` and has the views ``needed``.
+    """Rows of the source whose episode is fit for the stage and ended in one of ``outcomes``.
 
-    Stage I needs the task-facing view, Stage II action tracks.
+    Stage I needs the task-facing view. Stage II needs controls and one of ``views``; without ``vectors`` (the model knows control
+    vectors) one with a camera, and its clips show no others.
 
     Raises:
         DataError: if none is left.
     """
 
     def fit(row: EpisodeRow) -> bool:
-        stage2_ok = row.stage2_ok or row.stage2_reason == "missing_view"  # which may be one that is not needed
+        stage2_ok = row.stage2_ok or (vectors and row.stage2_reason == "missing_calibration")
         return (row.stage1_ok if stage == 1 else stage2_ok) and (outcomes is None or row.outcome in outcomes)
 
-    def shown(row: ClipRow) -> bool:
-        return {*needed, *((row.primary_view,) if stage == 1 else ())} <= {*row.views}
-
     allowed = {row.episode_id for row in episodes.rows if fit(row)}
-    in_view = [row for row in source.rows if row.episode_id in allowed and shown(row)]
-    rows = [row for row in in_view if tracks is None or row.episode_id in tracks]
-    if len(rows) < len(in_view):
-        logger.warning(
-            "%d of %d episodes have no action tracks and are left out.", len(in_view) - len(rows), len(in_view)
-        )
+    usable = [row for row in source.rows if row.episode_id in allowed]
+    if stage == 1:
+        rows = [row for row in usable if row.primary_view in row.views]
+    else:
+        known = usable if tracks is None else [row for row in usable if row.episode_id in tracks]
+        if len(known) < len(usable):
+            logger.warning(
+                "%d of %d episodes have no controls and are left out.", len(usable) - len(known), len(usable)
+            )
+        if tracks is not None and not vectors:
+            drawn = {row.episode_id: tracks.calibrated_views(row.episode_id) for row in known}
+            cut = [replace(row, views=tuple(v for v in row.views if v in drawn[row.episode_id])) for row in known]
+            if fewer := sum(now.views != row.views for now, row in zip(cut, known, strict=True)):
+                logger.warning(
+                    "Of %d episodes the views without a camera are left out: the model takes action maps alone "
+                    "(train_stage2.native_size).", fewer,
+                )  # fmt: skip
+            known = cut
+        rows = [row for row in known if set(views) & set(row.views)]
     if not rows:
         raise DataError(
             "No episode is left to train on.",
-            where=f"stage {stage}, views {', '.join(needed) or 'the task-facing one'}",
+            where=f"stage {stage}, one of the views {', '.join(views) or 'that are task-facing'}",
             expected="episodes that are in the EpisodeSet, the source of clips and (Stage II) the action tracks",
             got=f"{len(allowed)} fit episodes in the set, {len(source.rows)} in the source",
             next_step="see the quarantine tables of curate, filter and render_actions",

@@ -271,10 +271,8 @@ def read_videos(
 
 
 def _views(row: EpisodeRow, config: EncodeLatentsConfig) -> tuple[str, ...]:
-    """Views of an episode to encode: all configured ones that it has, the task-facing one alone, or none."""
-    if all(view in row.views for view in config.views if view not in config.optional_views):
-        return tuple(view for view in config.views if view in row.views)
-    return (row.primary_view,) if config.primary_alone and row.stage1_ok and row.primary_view in row.views else ()
+    """Views of an episode to encode: the configured ones that it has, and the task-facing one."""
+    return tuple(view for view in dict.fromkeys((*config.views, row.primary_view)) if view in row.views)
 
 
 def _select(episodes: EpisodeSet, config: EncodeLatentsConfig) -> list[int]:

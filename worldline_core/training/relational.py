@@ -173,7 +173,7 @@ class TeacherSimilarities(ClipSimilarities):
         grid: tuple[int, int, int],
         frames: UInt8[Tensor, "v n height width 3"] | None,
     ) -> SimilarityMatrices:
-        key = (clip, views)
+        key = (replace(clip, vectors=()), views)
         if key in self._cache:
             self._cache.move_to_end(key)
             return self._cache[key]

@@ -16,7 +16,7 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.model.checkpoint import CHECKPOINT_DTYPE, CheckpointInfo, save_checkpoint
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import ActionContract
+from worldline_core.model.world_model_config import ActionContract, NativeVectors
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput, ReadingConfig
 from worldline_core.training.clip_loader import Batch, ClipLoader
@@ -26,7 +26,7 @@ from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.processes import BatchPlan, gathered, join_processes, place_model, processes
 from worldline_core.training.trainer import ParameterGroup, Probe, TrainingResult, batch_plan, held_out_losses, train
-from worldline_core.training.training_config import LossWeighting, StageConfig, TrainerConfig
+from worldline_core.training.training_config import LossWeighting, Stage2Config, StageConfig, TrainerConfig
 
 logger = logging.getLogger(__name__)
 VALIDATION_SEED = 20_000
@@ -78,10 +78,17 @@ class Stage:
         place_model(model, config.trainer.sharding, precision=config.trainer.precision, device=device).train()
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
         source = open_source(config.input, inputs, episodes, device)
-        needed = config.clips.needed_views(model.config.views)
-        rows = training_rows(source, episodes, stage=number, needed=needed, tracks=tracks, outcomes=config.outcomes)
+        rows = training_rows(
+            source, episodes, stage=number, views=config.clips.shown_views(model.config.views), tracks=tracks,
+            vectors=model.config.native_size is not None, outcomes=config.outcomes,
+        )  # fmt: skip
         start, kind = ("scratch", None) if parent is None else (parent.weights_sha256, parent.kind)
         return cls(config, title, output, model, start, kind, episodes, source, rows)
+
+    @property
+    def vector_share(self) -> float:
+        """How often a view of a clip takes the control vector instead of the map."""
+        return self.config.vector_share if isinstance(self.config, Stage2Config) else 0.0
 
     @property
     def training_rows(self) -> list[ClipRow]:
@@ -101,6 +108,7 @@ class Stage:
             batch_size=trainer.batch_size,
             seed=trainer.seed,
             plan=self.plan,
+            vector_share=self.vector_share,
         )
 
     @cached_property
@@ -116,6 +124,7 @@ class Stage:
             action_frames=self.model.config.action_frames,
             frame_rates={row.episode_id: row.fps for row in self.episodes.rows},
             native_size=self.model.config.native_size,
+            maps=self.model.config.takes_maps,
             object_weights=weights_of(self.config.weighting, self.episodes, self.source),
             device=self.config.trainer.device,
             **conditions,
@@ -142,7 +151,14 @@ class Stage:
             objective=objective,
             load=loader.batches(self.sampler, config.input, self.output / "run", stop),
             validate=validation_function(
-                loader, config.clips, config.validation_splits, trainer, self.rows, objective, config.input
+                loader,
+                config.clips,
+                config.validation_splits,
+                trainer,
+                self.rows,
+                objective,
+                config.input,
+                self.vector_share,
             ),
             probe=probe,
             output=self.output,
@@ -155,6 +171,13 @@ class Stage:
             title=self.title,
             models=(self.model,),
         )
+
+    def _vectors(self) -> NativeVectors | None:
+        """The control vectors that the run trains on."""
+        if self.model.config.native_size is None:
+            return None
+        known = tuple(sorted({row.embodiment for row in self.training_rows}))
+        return NativeVectors(embodiments=known, share=self.vector_share if self.model.config.takes_maps else 1.0)
 
     def save(
         self,
@@ -174,6 +197,7 @@ class Stage:
                 kind=kind,
                 action_contract=action_contract,
                 trained=self.sampler.trained(self.model.config.views) if kind == "stage2" else None,
+                vectors=self._vectors() if kind == "stage2" else None,
                 metadata={
                     "step": result.steps,
                     "seed": trainer.seed,
@@ -226,6 +250,7 @@ def validation_function(
     rows: Sequence[ClipRow],
     objective: ValidatedObjective,
     reading: ReadingConfig,
+    vector_share: float = 0.0,
 ) -> Callable[[], dict[str, float]] | None:
     """A function that measures the losses on held-out clips: always the same clips, noise and noise levels.
 
@@ -254,7 +279,7 @@ def validation_function(
         clips = clips.model_copy(update={"view_weights": None})
     sampler = ClipSampler(
         held_out, clips, views=loader.views, splits=splits, start_step=loader.source.start_step, batch_size=size,
-        seed=VALIDATION_SEED,
+        seed=VALIDATION_SEED, vector_share=vector_share,
     )  # fmt: skip
     load = loader.batches(sampler, reading.model_copy(update={"workers": 0}), stop=trainer.validation_batches)
     return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)

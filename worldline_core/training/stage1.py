@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
-from worldline_core.model.layers import is_text_parameter
+from worldline_core.model.layers import is_action_parameter, is_text_parameter
 from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
@@ -21,7 +21,7 @@ from worldline_core.training.training_config import Stage1Config
 
 def is_trained(name: str) -> bool:
     """Returns whether Stage I trains a parameter: all of both towers, not the action branch."""
-    return not name.startswith("action_encoder.")
+    return not is_action_parameter(name)
 
 
 def stage1_groups(model: WorldModel) -> list[ParameterGroup]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ from worldline_core.actions.episode_tracks import open_controls
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
-from worldline_core.model.layers import new_action_branch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, WorldModelConfig
 from worldline_core.training.action_following import ActionFollowing
@@ -39,16 +39,14 @@ def stage2_groups(model: WorldModel, action_multiplier: float) -> list[Parameter
     ]
 
 
-def _film(config: Stage2Config) -> dict[str, Any]:
-    """Changes of the model config where control vectors replace maps."""
-    if config.native_size is None:
-        return {}
-    return {"action_conditioning": "native_film", "action_channels": config.native_size}
+def stage2_model_config(config: Stage2Config, start: WorldModelConfig, *, drawn: bool = True) -> WorldModelConfig:
+    """The model that Stage II trains from a checkpoint: its video tower, with the configured action branches.
 
-
-def stage2_model_config(config: Stage2Config, start: WorldModelConfig) -> WorldModelConfig:
-    """The model that Stage II trains from a checkpoint: its video tower, with the configured action branch."""
-    controls = {"action_frames": config.action_frames or start.action_frames, **_film(config)}
+    Args:
+        drawn: there are action tracks to draw maps from.
+    """
+    takes = "maps" if config.native_size is None else "either" if drawn and config.vector_share < 1 else "vectors"
+    controls = {"action_frames": config.action_frames, "native_size": config.native_size, "action_conditioning": takes}
     return start.model_copy(update={"towers": "generation", **controls})
 
 
@@ -64,21 +62,13 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         DataError: if no clip fits, or one cannot be read.
     """
     parent = Path(inputs["stage1"])
-    native = config.native_size is not None
-    tracks = open_controls(inputs, EpisodeSet.open(Path(inputs["episodes"])), vectors=native)
+    episodes = EpisodeSet.open(Path(inputs["episodes"]))
+    tracks = open_controls(inputs, episodes, vectors=config.native_size is not None)
 
     def load_model() -> tuple[WorldModel, CheckpointInfo]:
-        model, info = load_checkpoint(
-            parent,
-            expect_kind=("base", "stage1", "stage2"),
-            towers="generation",
-            action_frames=config.action_frames,
-            weights=processes()[0] == 0,
-        )
-        if config.native_size is not None and model.config.native_size != config.native_size:
-            model.config = model.config.model_copy(update=_film(config))
-            model.action_encoder = new_action_branch(model.config)
-        return model, info
+        adapt = partial(stage2_model_config, config, drawn="tracks" in inputs)
+        kinds = ("base", "stage1", "stage2")
+        return load_checkpoint(parent, expect_kind=kinds, towers="generation", adapt=adapt, weights=processes()[0] == 0)
 
     stage = Stage.open(config, inputs, output, number=2, title="stage II", load_model=load_model, tracks=tracks)
     model = stage.model
@@ -86,7 +76,7 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         {
             "controls": tracks.tracks(stage.training_rows[0].episode_id).controls,
             "fps": stage.episodes.rows[0].fps,
-            "sigma_px_ref": None if native else tracks.sigma_px_ref,
+            "sigma_px_ref": tracks.sigma_px_ref if model.config.takes_maps else None,
             "grid_size": stage.source.latent_shape[1:],
             "tokenizer": stage.source.description["tokenizer"],
         }
@@ -94,10 +84,12 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     before = read_checkpoint_info(parent)
     learnt = before.action_contract
     if learnt is not None:
-        if before.config.native_size != config.native_size:
+        was, now = before.config, model.config
+        if was.native_size not in (None, now.native_size) or was.takes_maps > now.takes_maps:
             raise CheckpointError(
-                "The Stage II model is driven otherwise", where=f"{parent}: native_size", expected=before.config.native_size,
-                got=config.native_size,
+                "The Stage II model is driven otherwise", where=f"{parent}: native_size, vector_share",
+                expected=f"{was.action_conditioning}, native_size {was.native_size}",
+                got=f"{now.action_conditioning}, native_size {now.native_size}",
             )  # fmt: skip
         kept = {"sigma_px_ref", "tokenizer", "fps"}
         learnt.require_tracks((row.episode_id for row in stage.rows), tracks)

@@ -209,7 +209,9 @@ class Stage2Config(StageConfig):
     ``action_frames``: control frames whose maps a latent frame takes: its own (1, the paper's), or all 4 of its interval,
     for grippers that close faster than a latent frame. Those that the start does not know begin with weights of zero.
     ``relational``: null trains without these terms. How wide the maps' Gaussian is, the action tracks say.
-    ``native_size``: the paper's ablation: control vectors, padded to this size, by FiLM in every layer instead of maps.
+    ``native_size``: the model also takes control vectors, padded to this size, by FiLM in every layer, for views whose camera is
+    not known. ``vector_share``: how often a view with a camera takes the vector instead of the map; 1: always, and the model has no
+    maps (the paper's ablation).
     ``action_following``: needs the input tokenizer; null measures nothing.
     """
 
@@ -218,13 +220,8 @@ class Stage2Config(StageConfig):
     action_frames: Literal[1, 4] = 1
     relational: RelationalConfig | None = RelationalConfig()
     native_size: int | None = Field(default=None, ge=1)
+    vector_share: float = Field(default=0.3, gt=0, le=1)
     action_following: ActionFollowingConfig | None = None
-
-    @model_validator(mode="after")
-    def _one_frame_of_vectors(self) -> Self:
-        if self.native_size is not None and self.action_frames != 1:
-            raise ValueError("native_size: control vectors are those of one frame; leave action_frames out")
-        return self
 
 
 BLOCKS = 4

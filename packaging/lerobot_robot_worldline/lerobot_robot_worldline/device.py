@@ -55,6 +55,7 @@ class Recordings:
         return RecordedStarts(
             Path(self.recordings or shipped_folder() / "recordings"),
             embodiment=self.embodiment, splits=self.splits, view_sets=[self.shown_views(info)], fps=info.contract.fps,
+            needs_cameras=info.vectors is None,
         )  # fmt: skip
 
 

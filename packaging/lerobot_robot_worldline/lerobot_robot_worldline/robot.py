@@ -103,7 +103,14 @@ class WorldLineRobot(Robot):
         self._starts: Sequence[RecordedStart] | RecordedStarts = (
             config.starts(self._info)
             if config.observation is None
-            else [read_start(Path(config.observation), self._kinematics.embodiment, list(self.cameras))]
+            else [
+                read_start(
+                    Path(config.observation),
+                    self._kinematics.embodiment,
+                    list(self.cameras),
+                    needs_cameras=self._info.vectors is None,
+                )
+            ]
         )
         self._running = self._begun(0)
         self._sent: list[float] = []

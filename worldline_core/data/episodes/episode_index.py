@@ -32,7 +32,7 @@ class EpisodeRow(EpisodeLabels):
         start, stop: frames of the stored episode that this row covers, stop exclusive.
         num_frames: stop - start. video_frames: how many of them, from the first on, have images.
         stage2_reason: why not stage2_ok.
-        stage1_ok, stage2_ok: whether the row may enter action-free, respectively three-view action-conditioned, training.
+        stage1_ok, stage2_ok: whether the row may enter action-free, respectively action-conditioned, training.
         conventions: JSON of what the source declared.
     """
 

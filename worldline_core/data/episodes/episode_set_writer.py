@@ -351,7 +351,7 @@ def _check_images(images: np.ndarray, episode: Episode, where: str) -> None:
 
 def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:
     episode, views = part.episode, tuple(part.videos)
-    reason = "missing_view" if len(views) < 2 else "missing_calibration" if set(views) - set(episode.cameras) else None
+    reason = None if set(views) & set(episode.cameras) else "missing_calibration"
     if reason is None and episode.embodiment == NO_EMBODIMENT and episode.T_base_ee is None:
         reason = "missing_kinematics"
     if episode.state_kind == "none":
