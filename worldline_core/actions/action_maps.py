@@ -159,7 +159,7 @@ class ControlDrawing:
             rows, columns = (1, 1) if self.sigma_px_ref is None else self.grid_size
             shown = repeat(numbers, "b t c -> b v c t h w", v=given.shape[2], h=rows, w=columns)
             parts.append(shown * rearrange(given, "b t v -> b v 1 t 1 1"))
-        return stack_controls(torch.cat(parts, dim=2), self.frames)
+        return stack_controls(parts[0] if len(parts) == 1 else torch.cat(parts, dim=2), self.frames)
 
 
 def _profile(centre: Float[Tensor, "*b"], size: int, sigma: float) -> Float[Tensor, "*b size"]:
