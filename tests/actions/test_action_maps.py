@@ -81,8 +81,8 @@ def test_a_gripper_that_closes_and_opens_between_latent_frames_is_seen_in_the_wh
 def test_every_view_takes_its_map_or_the_vector(per_latent_frame):
     """Maps alone are the rendered ones bit by bit; the vector is in every cell, with 1 behind it, and zeros are no controls."""
     tracks, size, grid = batch(t=3 * per_latent_frame), (480, 640), (30, 40)
-    maps = stack_controls(render_action_maps(tracks, size, grid), per_latent_frame)
-    assert torch.equal(ControlDrawing(grid, 10.0, frames=per_latent_frame).draw(tracks, size), maps)
+    maps, everywhere = stack_controls(render_action_maps(tracks, size, grid), per_latent_frame), torch.ones(2, 3) > 0
+    assert torch.equal(ControlDrawing(grid, 10.0, frames=per_latent_frame).draw(tracks, size, everywhere), maps)
     native = torch.randn(2, 3 * per_latent_frame, 5, generator=torch.Generator().manual_seed(1))
     camera = torch.tensor([[True, False, True], [True, True, True]])[:, None].expand(2, 3 * per_latent_frame, 3)
     given = replace(tracks, native=native, camera=camera)

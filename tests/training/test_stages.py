@@ -194,7 +194,9 @@ def test_a_model_of_maps_also_learns_vectors_and_says_whose(
     assert 0.25 < float(given.float().mean()) < 0.55
     train_stage2(config, inputs | {"stage1": tmp_path / "both"}, tmp_path / "on")
     gained = stage2(2, native_size=3, action_frames=action_frames)
-    train_stage2(stage2(2, action_frames=action_frames), inputs, tmp_path / "maps")
+    seen.clear()
+    train_stage2(stage2(6, action_frames=action_frames), inputs, tmp_path / "maps")
+    assert bool((torch.cat(seen).amax(dim=2) > 0).all())  # a model of maps alone is never given nothing
     train_stage2(gained, inputs | {"stage1": tmp_path / "maps"}, tmp_path / "gained")
     assert load_checkpoint(tmp_path / "gained")[1].config.action_conditioning == "either"
 

@@ -144,11 +144,11 @@ class ControlDrawing:
         """Controls of the latent frames whose `control_frames` the tracks hold.
 
         Args:
-            by_vector: views that take the vector though their camera is known.
+            by_vector: views that take the vector though their camera is known, of a model that takes vectors.
         """
         parts: list[Tensor] = []
         vector = torch.zeros_like(tracks.valid.any(dim=-1)) if tracks.camera is None else ~tracks.camera
-        if by_vector is not None:
+        if by_vector is not None and self.native_size is not None:
             vector = vector | by_vector[:, None]
         if self.sigma_px_ref is not None:
             drawn = replace(tracks, valid=tracks.valid & ~vector[..., None])

@@ -87,8 +87,9 @@ class Stage:
 
     @property
     def vector_share(self) -> float:
-        """How often a view of a clip takes the control vector instead of the map."""
-        return self.config.vector_share if isinstance(self.config, Stage2Config) else 0.0
+        """How often a view of a clip takes the control vector instead of the map: never, of a model of maps alone."""
+        takes = isinstance(self.config, Stage2Config) and self.config.native_size is not None
+        return self.config.vector_share if takes else 0.0
 
     @property
     def training_rows(self) -> list[ClipRow]:
