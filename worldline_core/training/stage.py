@@ -88,8 +88,8 @@ class Stage:
     @property
     def vector_share(self) -> float:
         """How often a view of a clip takes the control vector instead of the map: never, of a model of maps alone."""
-        takes = isinstance(self.config, Stage2Config) and self.config.native_size is not None
-        return self.config.vector_share if takes else 0.0
+        config = self.config
+        return config.vector_share if isinstance(config, Stage2Config) and config.native_size is not None else 0.0
 
     @property
     def training_rows(self) -> list[ClipRow]:
