@@ -95,12 +95,47 @@ def test_videos_of_a_camera_and_rows_of_the_table_are_missing(tmp_path: Path) ->
     assert "the first, raw-000000 (missing_file)" in said
     of_second = said[said.index("the first, raw-000001 (length_mismatch): 2 things are wrong") :]
     assert f"expected: {FRAMES} rows" in of_second
+    assert "next step: copy the recording again, or drop it; videos one frame longer" in of_second
     assert "missing_file: " in of_second
     assert "observation.images.exterior_2_left" in of_second
     counts, curated = run(tmp_path / "available", source, views="available")
     assert counts["reasons"] == {"length_mismatch": 1}
     assert curated.rows[0].views == ("head", "right_wrist")
     assert "exterior_2_left" in curated.quarantine()[0].detail  # it lacks that as well
+
+
+@pytest.mark.parametrize("kind", ["robomind", "robotwin", "unitree transitions", "unitree hdf5"])
+def test_a_camera_that_a_file_lacks_costs_its_view_alone(tmp_path: Path, kind: str) -> None:
+    pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
+    import published_robomind as robomind
+    import test_source_robotwin as robotwin
+    import test_source_unitree_h5 as unitree
+
+    root = tmp_path / "raw"
+    match kind:
+        case "robomind":
+            robomind.write_franka(root)
+            source = {
+                "kind": kind,
+                "path": str(root),
+                "layout": "h5_franka_3rgb",
+                "fps": 10,
+                "gripper_state": robomind.GRIPPER,
+            }
+            source["views"] = {"head": "camera_top"}
+        case "robotwin":
+            robotwin.write_episode(root)
+            source = robotwin.settings(root, views={"head": "head_camera"})
+        case _:
+            (unitree.write_transitions if kind.endswith("transitions") else unitree.write_hdf5)(root)
+            source = unitree.settings(root, views={"head": "cam_left_high"})
+    source["views"] |= {"left_wrist": "gone", "right_wrist": "gone_too"}
+    with pytest.raises(DataError, match=r"(?s)2 things are wrong.*gone.*gone_too"):
+        run(tmp_path, source)
+    _, curated = run(tmp_path / "available", source, views="available")
+    assert curated.rows[0].views == ("head",)
+    with pytest.raises(DataError, match="gone"):  # no view is left
+        run(tmp_path / "none", source | {"views": {"head": "gone"}}, views="available")
 
 
 def test_unknown_fields_of_both_templates_are_said_at_once(tmp_path: Path) -> None:

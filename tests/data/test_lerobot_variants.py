@@ -194,6 +194,22 @@ def test_a_camera_that_a_dataset_lacks_is_absent(tmp_path: Path) -> None:
     assert curated.rows[0].views == ("head",)
 
 
+def test_all_that_a_configuration_asks_for_in_vain_is_one_message(tmp_path: Path) -> None:
+    write_robocoin(tmp_path / "raw")
+    wrong = {"views": {"none": "head"}, "grippers": {"finger": {"closed": 0, "open": 1}}, "success_column": "won"}
+    with pytest.raises(ConfigError, match=r"(?s)no camera and no state column and no feature .*got: none; finger; won"):
+        run(tmp_path, source(tmp_path / "raw", **(V21 | wrong)))
+
+
+def test_pictures_of_an_unknown_robot_need_no_arms(tmp_path: Path) -> None:
+    write_robocoin(tmp_path / "raw")
+    counts, curated = run(
+        tmp_path, source(tmp_path / "raw", **(V21 | {"embodiment": "none", "angle_unit": "range_m100_100"}))
+    )
+    assert counts["kept"] == 1
+    assert (curated.episode(0).state_kind, curated.episode(0).state.shape) == ("none", (FRAMES, 0))
+
+
 def cached(raw: Path, root: Path) -> Path:
     """A dataset as the Hub's cache keeps it: links of a snapshot to blobs; returns the snapshot."""
     snapshot, blobs = root / "datasets--a--b/snapshots/0123", root / "datasets--a--b/blobs"

@@ -171,14 +171,33 @@ def test_other_bags_are_named_with_their_next_step(
     assert (error.reason, next_step in str(error.next_step)) == ("unreadable", True)
 
 
-def test_missing_topics_are_named_beside_those_there_are(tmp_path: Path, toy: Any) -> None:
+def test_missing_topics_are_named_beside_those_there_are_and_those_of_images_cost_their_view(
+    tmp_path: Path, toy: Any
+) -> None:
+    toy.robot().write(tmp_path / "a.mcap")
+    declared = toy.declared(tmp_path, primary_view="head")
+    declared["views"]["head"]["image"] = "/top/image"
+    loaded = load(declared)
+    assert loaded.views == ("right_wrist",)
+    error = loaded.absent["head"]
+    assert (error.reason, error.expected) == ("missing_topic", "/top/image")
+    assert "/head/image/compressed (sensor_msgs/msg/CompressedImage)" in str(error.got)
+    declared["arms"][0]["state"]["gripper"]["topic"] = "/finger"
+    assert rejection(declared).expected == "/finger, /top/image"  # all that is missing
+    declared = toy.declared(tmp_path)
+    for view in declared["views"].values():
+        view["image"] = "/none"
+    assert rejection(declared).expected == "/none"
+
+
+def test_pictures_alone_need_no_arms(tmp_path: Path, toy: Any) -> None:
     toy.robot().write(tmp_path / "a.mcap")
     declared = toy.declared(tmp_path)
-    declared["views"]["head"]["image"] = "/top/image"
-    error = rejection(declared)
-    assert error.reason == "missing_topic"
-    assert error.expected == "/top/image"
-    assert "/head/image/compressed (sensor_msgs/msg/CompressedImage)" in str(error.got)
+    with_arms = load(declared)
+    del declared["arms"]
+    episode = load(declared).episode
+    assert (episode.state_kind, episode.state.shape[1], episode.commanded) == ("none", 0, False)
+    assert set(episode.cameras) == set(with_arms.episode.cameras)
 
 
 def test_schemas_that_are_not_understood_or_do_not_fit(tmp_path: Path, toy: Any) -> None:
@@ -311,7 +330,7 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path: Path, toy: Any) -> None:
     ("changes", "message"),
     [
         ({"fps": 0}, r"fps\n  Input should be greater"),
-        ({"arms": []}, "at least 1 item"),
+        ({"arms": [], "embodiment": "so101"}, "the arms of so101 are not declared"),
         ({"primary_view": "top"}, "primary_view top is none of head, right_wrist"),
         ({"rate": 30}, "Extra inputs are not permitted"),
         ({"transforms": ["/joint_states"]}, "declared both as readings and as transforms"),

@@ -162,17 +162,15 @@ class McapFile:
             raise RejectedInputError("missing_topic", "MCAP file holds no messages", where=self.path)
         return first
 
-    def check_topics(self, wanted: Collection[str]) -> None:
-        missing = sorted(set(wanted) - set(self.topics))
-        if missing:
-            raise RejectedInputError(
-                "missing_topic",
-                "MCAP file lacks a topic",
-                where=self.path,
-                expected=", ".join(missing),
-                got=", ".join(f"{topic} ({schema})" for topic, schema in self.topics.items()) or "no topics",
-                next_step="correct the topics in curate.sources[]",
-            )
+    def lacks_topics(self, missing: Collection[str]) -> RejectedInputError:
+        return RejectedInputError(
+            "missing_topic",
+            "MCAP file lacks a topic",
+            where=self.path,
+            expected=", ".join(sorted(missing)),
+            got=", ".join(f"{topic} ({schema})" for topic, schema in self.topics.items()) or "no topics",
+            next_step="correct the topics in curate.sources[]",
+        )
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,7 +86,9 @@ class _Recording:
             None if stop is None else stop + _READING_MARGIN_NS,
         )
         self.measured = [arm.state for arm in config.arms]
+        self.absent: dict[str, RejectedInputError] = {}
         self.streams = self._read_streams()
+        config = self.config
         self.clocks = clocks = Clocks(config, self.streams, file.path)
         self.start_ns, self.stop_ns = (None if t is None else t - clocks.header_to_log_ns for t in (start, stop))
         self.signals = {readings: self._signal(readings) for readings in config.readings}
@@ -119,18 +121,33 @@ class _Recording:
     def _read_streams(self) -> dict[str, Stream]:
         """Every topic that the episode needs; a missing transform is reported where a pose needs it."""
         topics = self.config.topics
+        wanted = {topic for role in _KINDS if role != "transforms" for topic in topics[role]}
+        self._leave_out_views(wanted - set(self.file.topics), self.file.lacks_topics)
+        topics = self.config.topics
         roles: dict[str, tuple[Kind, ...]] = {
             topic: kinds for role, kinds in _KINDS.items() if role != "transforms" for topic in sorted(topics[role])
         }
-        self.file.check_topics(roles)
         needed = set(roles) - topics["calibrations"]
         roles |= {topic: _KINDS["transforms"] for topic in self.config.transforms if topic in self.file.topics}
         streams = self.file.streams(roles, *self.around_ns)
-        silent = sorted(needed - set(streams))
-        if silent:
-            what = "A topic has no messages during the episode"
-            raise RejectedInputError("missing_topic", what, where=self.file.path, expected=", ".join(silent))
+        self._leave_out_views(needed - set(streams), self._is_silent)
         return streams
+
+    def _is_silent(self, topics: Collection[str]) -> RejectedInputError:
+        what = "A topic has no messages during the episode"
+        return RejectedInputError("missing_topic", what, where=self.file.path, expected=", ".join(sorted(topics)))
+
+    def _leave_out_views(self, missing: set[str], fault: Callable[[Collection[str]], RejectedInputError]) -> None:
+        """Go on without the views whose images are missing. Raises: the fault of all, where anything else is missing."""
+        views = self.config.views
+        gone = {view: each for view, each in views.items() if each.image in missing}
+        kept = {view: each for view, each in views.items() if view not in gone}
+        primary = self.config.primary_view
+        config = self.config.model_copy(update={"views": kept, "primary_view": primary if primary in kept else None})
+        if missing and (not kept or any(missing & topics for topics in config.topics.values())):
+            raise fault(missing)
+        self.absent |= {view: fault([each.image]) for view, each in gone.items()}
+        self.config = config
 
     def _signal(self, readings: TopicReadings) -> _Signal:
         """The declared numbers of a topic; messages with other joints (several drivers may share it) are left out."""
@@ -329,7 +346,8 @@ class _Recording:
 
     def arm_vectors(self, arms: Iterable[ArmReadings], grid: np.ndarray) -> tuple[np.ndarray, int]:
         """(t, J) joints [rad] and opening of each arm, and how many openings lay outside of 0..1."""
-        columns, outside = [], 0
+        columns: list[np.ndarray] = [np.zeros((len(grid), 0))]
+        outside = 0
         for arm in arms:
             self._check_values(arm, grid)
             joints, fingers = self._resampled(arm.joints, grid), self._resampled(arm.gripper, grid)
@@ -356,6 +374,7 @@ def read_topics_episode(
 ) -> LoadedEpisode:
     """The episode; its images stay in the file until they are asked for. Raises: RejectedInputError."""
     recording = _Recording(config, file, segment)
+    config = recording.config
     grid = recording.grid()
     chosen = {view: recording.chosen_images(view, grid) for view in config.views}
     cameras = RecordedCameras()
@@ -398,6 +417,7 @@ def read_topics_episode(
         gripper=None if tools is None else state[:, [name.endswith("/gripper") for name in state_names]],
         primary_view=config.timing_view,
         state_names=tuple(state_names),
+        state_kind="joints" if config.arms else "none",
         conventions={
             "layout": LAYOUT,
             "time": config.time,
@@ -409,4 +429,10 @@ def read_topics_episode(
         },
     )
     tracks = {view: recording.track(view, chosen[view], cameras.tracks.get(view)) for view in config.views}
-    return LoadedEpisode(episode, tuple(config.views), lambda view: tracks[view].frames(), distortions=cameras.lenses)
+    return LoadedEpisode(
+        episode,
+        tuple(config.views),
+        lambda view: tracks[view].frames(),
+        distortions=cameras.lenses,
+        absent=recording.absent,
+    )

@@ -76,8 +76,9 @@ class Clocks:
                 next_step="declare time_offsets_ms, or set time: log",
                 evidence={"skew_ms": skew_ms, "least_delay_ms": least_ms},
             )
-        joints = config.arms[0].state.joints.topic
-        self.header_to_log_ns = round(least_ms.get(joints, min(least_ms.values())) * 1e6)
+        joints = [arm.state.joints.topic for arm in config.arms[:1]]
+        delays = [least_ms[topic] for topic in joints if topic in least_ms]
+        self.header_to_log_ns = round((delays[0] if delays else min(least_ms.values())) * 1e6)
 
     def times_ns(self, stream: Stream) -> np.ndarray:
         """(n,) times of a topic's messages [ns] on the configured clock."""

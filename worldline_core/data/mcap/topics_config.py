@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from worldline_core.config import FrameRate, StrictModel
+from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.source import EmbodimentName, ForeignSourceConfig, GripperRange
 
 
@@ -135,7 +136,9 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
     embodiment: EmbodimentName
     fps: FrameRate = Field(description="rate to which everything is brought")
     views: dict[str, ViewTopics] = Field(min_length=1)
-    arms: tuple[ArmTopics, ...] = Field(min_length=1, max_length=2, description="left before right")
+    arms: tuple[ArmTopics, ...] = Field(
+        default=(), max_length=2, description="left before right; none, with embodiment none: the pictures alone"
+    )
     without_commands: Literal["refuse", "repeat_state"] = Field(
         default="refuse", description="repeat_state: recordings without command topics get the measured state as action"
     )
@@ -164,12 +167,16 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
     @model_validator(mode="after")
     def _complete(self) -> McapTopicsSourceConfig:
         names = [arm.name for arm in self.arms]
-        if names not in (["left"], ["right"], ["left", "right"]):
+        if not names and self.embodiment != NO_EMBODIMENT:
+            raise ValueError(
+                f"the arms of {self.embodiment} are not declared; embodiment: none reads the pictures alone"
+            )
+        if names and names not in (["left"], ["right"], ["left", "right"]):
             raise ValueError(f"arms are {names}; expected left before right, each once")
         commanded = [arm.command is not None for arm in self.arms]
         if len(set(commanded)) > 1:
             raise ValueError("either all arms have commands or none")
-        if not commanded[0] and self.without_commands == "refuse":
+        if commanded and not commanded[0] and self.without_commands == "refuse":
             raise ValueError("no arm has commands: give their topics, or say without_commands: repeat_state")
         if len({arm.tool_frame is None and arm.tool_pose is None for arm in self.arms}) > 1:
             raise ValueError("either all arms have tool poses or none")

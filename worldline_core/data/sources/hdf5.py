@@ -99,13 +99,15 @@ class Hdf5File:
             node = self._node(group)
             return sorted(node) if isinstance(node, self._h5py.Group) else []
 
-    def require_cameras(self, group: str, cameras: Mapping[str, str]) -> None:
-        """Raises: RejectedInputError (missing_view) where a group lacks the camera of a view."""
-        found = self.names(group)
-        missing = [camera for camera in cameras.values() if camera not in found]
-        if missing:
-            expected, got = ", ".join(missing), ", ".join(found) or "none"
-            raise self._rejected("missing_view", "File lacks a camera", group, expected, got)
+    def cameras(self, group: str, views: Mapping[str, str]) -> tuple[dict[str, str], dict[str, RejectedInputError]]:
+        """The views whose camera a group holds, and the rejection (missing_view) of each of the others."""
+        names = self.names(group)
+        absent = {
+            view: self._rejected("missing_view", "File lacks a camera", group, camera, ", ".join(names) or "none")
+            for view, camera in views.items()
+            if camera not in names
+        }
+        return {view: camera for view, camera in views.items() if view not in absent}, absent
 
     def has(self, key: str) -> bool:
         """True if `key` is a dataset that holds something: recorders write unused fields as empty ones."""

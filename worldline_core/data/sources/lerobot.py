@@ -128,7 +128,8 @@ class LeRobotSourceConfig(ForeignSourceConfig):
     kind: Literal["lerobot_v21", "lerobot_v3"]
     embodiment: EmbodimentName = Field(description="a robot of `worldline embodiment list`, or none: Stage I")
     angle_unit: AngleUnit = Field(
-        description="unit of the joint columns; range_m100_100: LeRobot's -100..100 of a calibrated range, with `arms`"
+        description="unit of the joint columns; range_m100_100: LeRobot's -100..100 of a calibrated range, with `arms`;"
+        " without them, and with embodiment none, the pictures alone are read"
     )
     views: dict[str, str] = Field(description="camera of the dataset -> view, for example {...cam_high: head}")
     grippers: dict[str, GripperRange] = Field(
@@ -162,8 +163,10 @@ class LeRobotSourceConfig(ForeignSourceConfig):
             raise ValueError("give arms (which name their grippers) or grippers, not both")
         tracks = [track for arm in self.arms or () for track in (arm.state, arm.action) if track is not None]
         if self.angle_unit == "range_m100_100":
-            if self.arms is None:
-                raise ValueError("range_m100_100 says where in its range a joint is: declare arms")
+            if self.arms is None and self.embodiment != NO_EMBODIMENT:
+                raise ValueError(
+                    "range_m100_100 says where in its range a joint is: declare arms, or embodiment: none for the pictures alone"
+                )
             if self.embodiment == NO_EMBODIMENT and any(track.joints.ranges is None for track in tracks):
                 raise ValueError("range_m100_100 of a robot without a description: declare ranges of the joints")
             if any(track.joints.zeros is not None for track in tracks):
@@ -266,7 +269,7 @@ class StateColumns:
                 values = read_feature(block.feature).astype(np.float64)
                 values = values[:, None] if values.ndim == 1 else values
                 if block.indices is not None:
-                    if values.shape[1] <= max(block.indices):
+                    if values.shape[1] <= max(block.indices, default=-1):
                         raise RejectedInputError(
                             "length_mismatch",
                             "Feature has fewer columns than the dataset says",
@@ -325,6 +328,8 @@ def state_columns(config: LeRobotSourceConfig, features: Features, where: str) -
     Raises: ConfigError for columns that the dataset does not have, an arm that is declared twice, or a gripper of more
         than one column.
     """
+    if config.arms is None and config.angle_unit == "range_m100_100":  # of no known robot: pictures alone
+        return StateColumns((), [_Block("timestamp", [])], [])
     if config.arms is None:
         names = flat_names(features.get("observation.state", {}))
         if config.angle_unit == "deg" and (
@@ -408,6 +413,7 @@ class LeRobotSource:
         # A dataset may lack some views (`views: available`); one that has none is of another configuration.
         views = {} if set(config.views) & set(cameras) else config.views
         names = flat_names(features.get("observation.state", {}))
+        missing: dict[str, tuple[str, str]] = {}
         for what, wanted, known in (
             ("camera", views, cameras),
             ("state column", config.grippers, names),
@@ -415,8 +421,14 @@ class LeRobotSource:
         ):
             unknown = sorted(set(wanted) - set(known) - {"task_index"})
             if unknown:
-                expected, got = ", ".join(known) or f"a dataset with a {what}", ", ".join(unknown)
-                raise ConfigError(f"The dataset has no {what} of this name", where=root, expected=expected, got=got)
+                missing[what] = ", ".join(known) or f"a dataset with a {what}", ", ".join(unknown)
+        if missing:
+            raise ConfigError(
+                f"The dataset has no {' and no '.join(missing)} of this name",
+                where=root,
+                expected="; ".join(expected for expected, _ in missing.values()),
+                got="; ".join(got for _, got in missing.values()),
+            )
         if depth := [key for key in config.views if is_depth(features.get(key, {}))]:
             raise depth_picture(root, f"is_depth_map of {', '.join(depth)} in meta/info.json")
         self._columns = state_columns(config, features, str(root))
@@ -484,6 +496,7 @@ class LeRobotSource:
             cameras=cameras.tracks,
             primary_view=config.primary_view or "head",
             state_names=self._columns.names,
+            state_kind="none" if self._columns.names == () else "joints",
             conventions={
                 "layout": f"lerobot {dataset.info.codebase_version}",
                 "declared_angle_unit": config.angle_unit,

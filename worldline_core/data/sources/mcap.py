@@ -194,7 +194,8 @@ def _segments(rule: WholeFiles | TimeRanges | Markers, recording: _Recording, ro
 
 def _between_markers(rule: Markers, file: McapFile) -> Iterator[Segment]:
     """Start to stop; a start without a stop, or the reverse, is an episode that cannot be read."""
-    file.check_topics([rule.topic])
+    if rule.topic not in file.topics:
+        raise file.lacks_topics([rule.topic])
     markers = [(log_ns, str(text)) for _, kind, log_ns, _, text in file.messages([rule.topic]) if kind == "marker"]
     begun: tuple[int, re.Match[str]] | None = None
     count = 0

@@ -194,7 +194,6 @@ class RobomindSource(EpisodeFiles[RobomindSourceConfig]):
     def load(self, episode_id: str) -> LoadedEpisode:
         config, layout = self.config, self._layout
         relative, path = self.files[episode_id], self.path(episode_id)
-        views = dict(config.views or layout.views)
         with open_hdf5(path) as file:
             state = file.arms(layout.arms, config.gripper_state, track="puppet")
             length = len(state.values)
@@ -203,7 +202,7 @@ class RobomindSource(EpisodeFiles[RobomindSourceConfig]):
                 if layout.commanded
                 else None
             )
-            file.require_cameras(layout.images, views)
+            views, absent = file.cameras(layout.images, config.views or layout.views)
             # Who collected it: some stations recorded the arms exchanged.
             collector = file.attribute("metadata", "collector") if layout.version == 2 else None
             text = self._text(file, relative, path)
@@ -217,7 +216,7 @@ class RobomindSource(EpisodeFiles[RobomindSourceConfig]):
             embodiment=config.embodiment or layout.embodiment,
             instruction=text,
             outcome=_outcome(relative, config.outcome),
-            primary_view=next(iter(views)),
+            primary_view=next(iter(config.views or layout.views)),
             state_names=state.names,
             conventions={} if collector is None else {"collector": collector},
         )
@@ -226,7 +225,7 @@ class RobomindSource(EpisodeFiles[RobomindSourceConfig]):
         def images(view: str) -> Iterator[np.ndarray]:
             return hdf5_images(path, f"{layout.images}/{views[view]}", length, channels, raw_sizes=_RAW_SIZES)
 
-        return LoadedEpisode(episode, tuple(views), images)
+        return LoadedEpisode(episode, tuple(views), images, absent=absent)
 
     def _text(self, file: Hdf5File, relative: PurePosixPath, path: AnyPath) -> str:
         if self._instructions is None:

@@ -80,8 +80,8 @@ class RobotwinSource(EpisodeFiles[RobotwinSourceConfig]):
             readings = [file.array(f"endpose/{arm.name}_gripper", (length,)) for arm in _ARMS]
             opening, overshoot = _GRIPPER.opening(np.stack(readings, axis=1))
             state = file.arms(_ARMS, _GRIPPER, length=length)
-            file.require_cameras("observation", config.views)
-            for view, camera in config.views.items():
+            views, absent = file.cameras("observation", config.views)
+            for view, camera in views.items():
                 _add_camera(cameras, file, path, view, f"observation/{camera}", length)
         setting = "-".join(relative_name(path, self.root).parts[:-2])
         episode = self.episode(
@@ -104,10 +104,9 @@ class RobotwinSource(EpisodeFiles[RobotwinSourceConfig]):
         )
         return LoadedEpisode(
             episode,
-            tuple(config.views),
-            lambda view: hdf5_images(
-                path, f"observation/{config.views[view]}/rgb", length, "as_written", calibrated=True
-            ),
+            tuple(views),
+            lambda view: hdf5_images(path, f"observation/{views[view]}/rgb", length, "as_written", calibrated=True),
+            absent=absent,
         )
 
     def _instruction(self, path: AnyPath) -> str:

@@ -24,8 +24,14 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.config import FrameRate
-from worldline_core.data.episodes.source import EmbodimentName, ForeignSourceConfig, GripperRange, LoadedEpisode
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.episodes.source import (
+    EmbodimentName,
+    ForeignSourceConfig,
+    GripperRange,
+    LoadedEpisode,
+    sorted_views,
+)
+from worldline_core.data.guards.rejection import RejectedInputError, all_of
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.sources.episode_files import EpisodeFiles, timed_video_size
 from worldline_core.data.sources.hdf5 import ArmPlace, Channels, Columns, hdf5_images, open_hdf5, require_h5py
@@ -141,9 +147,10 @@ class UnitreeH5Source(EpisodeFiles[UnitreeH5SourceConfig]):
                     )
             if trained:
                 text = self._instruction(relative, path)
+                views, absent = dict(config.views), dict[str, RejectedInputError]()
             else:
-                file.require_cameras(_IMAGES, config.views)
-                for camera in config.views.values():
+                views, absent = file.cameras(_IMAGES, config.views)
+                for camera in views.values():
                     if config.channels is None and not file.holds_pixels(f"{_IMAGES}/{camera}"):
                         raise RejectedInputError(
                             "unreadable",
@@ -155,10 +162,16 @@ class UnitreeH5Source(EpisodeFiles[UnitreeH5SourceConfig]):
                 text = (file.text("language_raw") or "").strip()
         clips: dict[str, VideoClip] = {}
         if trained:
-            for view, camera in config.views.items():
-                video = inside(self.root, f"videos/{relative.parent.name}/{camera}/{relative.stem}.mp4")
+
+            def clip(view: str) -> VideoClip:
+                video = inside(self.root, f"videos/{relative.parent.name}/{views[view]}/{relative.stem}.mp4")
                 timed_video_size(video, config.fps)
-                clips[view] = VideoClip.whole_file(video, length, config.fps)
+                return VideoClip.whole_file(video, length, config.fps)
+
+            faults: list[RejectedInputError] = []
+            clips, absent = sorted_views(views, clip, faults)
+            if faults:
+                raise all_of([*faults, *absent.values()], f"episode {episode_id}")
         episode = self.episode(
             episode_id,
             "-".join([config.label, *_episode_parts(relative)[:-1]]),
@@ -172,9 +185,10 @@ class UnitreeH5Source(EpisodeFiles[UnitreeH5SourceConfig]):
         )
         return LoadedEpisode(
             episode,
-            tuple(config.views),
-            lambda view: hdf5_images(path, f"{_IMAGES}/{config.views[view]}", length, config.channels or "standard"),
+            tuple(clips if trained else views),
+            lambda view: hdf5_images(path, f"{_IMAGES}/{views[view]}", length, config.channels or "standard"),
             clips=clips,
+            absent=absent,
         )
 
     def _instruction(self, relative: PurePosixPath, path: AnyPath) -> str:
