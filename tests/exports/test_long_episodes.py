@@ -106,8 +106,9 @@ def read_mcap(recorded: Recorded, output: Path) -> None:
         assert np.array_equal(one, other)
 
 
-WITH_THUMBNAILS = ("episode as mcap", "episode as lerobot", "curate")
-"""Thumbnails of each view grow, and messages are collected in chunks: together little more than the frames of one view."""
+WITH_THUMBNAILS = "episode as lerobot"
+"""Keeps grey thumbnails of 72 x 96 until the episode is whole, 0.19 of a view's frames each: those of three views, one of them
+twice while it is stacked, and what they are packed into: 0.97 when measured."""
 SLOW = ("episode as mcap", "episode as rrd", "rollout as mcap and rrd", "inspect", "overlay", "curate", "exact masks")
 OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
     "side by side": lambda recorded, output: write_side_by_side(
@@ -159,7 +160,7 @@ def test_memory_does_not_grow_with_the_frames(
         finally:
             tracemalloc.stop()
     one_view = (LONG - SHORT) * FRAME_BYTES
-    assert peaks[LONG] - peaks[SHORT] < (1.2 * one_view if name in WITH_THUMBNAILS else one_view / 2)
+    assert peaks[LONG] - peaks[SHORT] < (1.1 * one_view if name == WITH_THUMBNAILS else one_view / 4)
 
 
 def test_packed_masks_are_those_of_one_piece_and_read_in_pieces() -> None:

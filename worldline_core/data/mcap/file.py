@@ -224,14 +224,18 @@ class McapFile:
     def _records(
         self, topics: Collection[str] | None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[Schema | None, Channel, Record]]:
+        chosen = None if topics is None else list(topics)
         with self._reader() as reader:
-            # Not in order of log time: the reader would hold all chunks that overlap in time.
-            yield from reader.iter_messages(
-                None if topics is None else list(topics),
-                log_time_order=False,
-                starting_at=start_ns,
-                ending_before=stop_ns,
-            )
+            summary = reader.get_summary() if isinstance(reader, SeekingReader) else None
+            chunks = [] if summary is None else summary.chunk_indexes
+            for chunk in chunks or [None]:
+                if summary is not None and chunk is not None:
+                    # One at a time: in the order of the file the reader unpacks all chunks before it gives the first
+                    # message, in the order of log times all that overlap.
+                    summary.chunk_indexes = [chunk]
+                yield from reader.iter_messages(
+                    chosen, log_time_order=False, starting_at=start_ns, ending_before=stop_ns
+                )
 
     @contextmanager
     def _reader(self, *, indexed: bool | None = None) -> Iterator[McapReader]:
