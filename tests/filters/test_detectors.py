@@ -24,6 +24,7 @@ from worldline_core.filters.detectors import (
     detect_dark,
     detect_joint_jump,
     detect_joint_speed,
+    detect_joint_stuck,
     detect_overexposed,
     detect_reset,
     detect_static,
@@ -152,6 +153,29 @@ def test_a_broken_reading_that_goes_home_alone_is_no_reset() -> None:
     assert cut(detect_joint_jump(broken, JointMotionConfig())) == [20]
     one_joint = np.concatenate([joints[:, :1], joints[:, :1]])  # nothing else could come home with it
     assert cut(detect_reset(one_joint, FPS, ResetConfig()))[0] == 33
+
+
+@pytest.mark.parametrize("frames", [slice(20, 23), slice(20, 30)])
+def test_readings_of_some_joints_that_break_together_are_no_reset(frames: slice) -> None:
+    joints = np.concatenate([swing(), 0.7 * swing()], axis=1)  # two arms
+    dropped, some = joints.copy(), joints.copy()
+    dropped[20:23] = joints[0]  # every reading, for a moment
+    some[frames, :2] += 2.0
+    for broken in (dropped, some):
+        assert cut(detect_reset(broken, FPS, ResetConfig())) == []
+    assert set(range(20, 24)) >= set(cut(detect_joint_jump(dropped, JointMotionConfig()))) > set()
+    assert cut(detect_joint_jump(some, JointMotionConfig()))[0] == 20
+
+
+def test_a_joint_whose_reading_ignores_its_command_is_stuck() -> None:
+    joints = 1.5 * swing()
+    stuck, idle = joints.copy(), joints.copy()
+    stuck[15:, 0] = joints[15, 0]
+    idle[:, 1] = 0.4
+    still = joints.copy()
+    still[:, 1] = 0.4
+    for values, commands, bad in ((stuck, joints, list(range(16, 33))), (joints, joints, []), (idle, still, [])):
+        assert cut(detect_joint_stuck(values, commands, FPS, JointMotionConfig())) == bad
 
 
 def test_joint_readings_that_jump_or_run_away() -> None:

@@ -208,7 +208,7 @@ PICTURE_FAULTS = ("too_dark", "overexposed", "blur", "corrupted")
 def find_picture_faults(signals: Signals, config: FilterConfig, found: Sequence[Finding]) -> list[Finding]:
     """Checks every view, the primary one first, which alone decides for Stage I. A frame counts for its first fault."""
     primary, fps = signals.primary_view, signals.episode.fps
-    unreliable = bad_frames(found, len(signals.gray[primary]), "joint_jump", "joint_speed")
+    unreliable = bad_frames(found, len(signals.gray[primary]), "joint_jump", "joint_speed", "joint_stuck")
     findings: list[Finding] = []
     for view in [primary, *(view for view in signals.gray if view != primary)]:
         stage = 1 if view == primary else 2
@@ -271,7 +271,7 @@ def return_home(joints: np.ndarray, fps: float, config: ResetConfig) -> tuple[in
     for i, j in _candidates(from_home, steps, longest, config):
         usual = _usual(np.concatenate([steps[:i], steps[j:]]))
         quick = (from_home[i] - from_home[j]) / (j - i) > _least(j - i, config) * usual
-        if quick and not _one_reading_alone(joints[[0, i, j]]):
+        if quick and not _broken_readings(joints, i, j, usual):
             # The return may have begun before the part of it that leads straight home.
             begin = i
             while begin > max(j - longest, 0) and steps[begin - 1] > usual:
@@ -294,21 +294,27 @@ def _candidates(from_home: np.ndarray, steps: np.ndarray, longest: int, config: 
     return sorted(pairs, key=lambda pair: (pair[1], -pair[0]))
 
 
+_WINDOW = 4
+"""Frames after which a reading that jumped does not count as having come back."""
 _STILL_RAD = 0.03
 """Joints that are no further from their first positions have not moved: encoder noise is smaller."""
 
 
-def _one_reading_alone(joints: np.ndarray) -> bool:
-    """True when no other joint goes home with the one that was furthest away: a broken reading, not the robot.
+def _broken_readings(joints: np.ndarray, i: int, j: int, usual: float) -> bool:
+    """True when the robot does not go home with its readings: only one of them, or few of those that are away, go home
+    between the frames i and j, or they jump back soon.
 
     Args:
-        joints: (3, j) [rad] at the first frame, before the return and after it.
+        joints: (n, j) [rad].
+        usual: step of the episode [rad].
     """
-    before, after = np.abs(joints[1:] - joints[0])
-    others = np.arange(len(before)) != before.argmax()
-    away = before[others].max(initial=0.0)
-    came_home = away > _STILL_RAD and after[others].max(initial=0.0) <= 0.5 * away
-    return bool(others.any() and not came_home)
+    before, after = np.abs(joints[[i, j]] - joints[0])
+    away = before > _STILL_RAD
+    if len(before) > 1 and ((away & (after <= 0.5 * before)).sum() <= max(1, away.sum() / 2)):
+        return True
+    furthest = before.argmax()
+    steps = np.abs(np.diff(joints[j : j + 1 + _WINDOW, furthest]))
+    return bool((steps > max(0.5 * before[furthest], 2 * usual)).any())
 
 
 def _usual(steps: np.ndarray) -> float:
@@ -333,7 +339,6 @@ def detect_reset(joints: np.ndarray, fps: float, config: ResetConfig) -> Verdict
     return frame_verdict("reset", True, bad, {"distance_from_home_rad": from_home})
 
 
-_WINDOW = 4
 _LARGE_STEPS = 2
 """A reading that jumps away and back makes two large steps; with a third it is motion."""
 
@@ -390,6 +395,27 @@ def detect_joint_speed(joints: np.ndarray, fps: float, config: JointMotionConfig
     return frame_verdict("joint_speed", True, bad, {"joint_speed_rad_s": curve})
 
 
+_STUCK_S = 1.0
+
+
+def detect_joint_stuck(joints: np.ndarray, commands: np.ndarray, fps: float, config: JointMotionConfig) -> Verdict:
+    """Stretches in which a reading stays the same to the bit while its command moves further than a jump.
+
+    Args:
+        joints, commands: (n, j) [rad], without grippers.
+    """
+    bad = np.zeros(len(joints), dtype=bool)
+    commanded = np.zeros(len(joints))
+    same = np.concatenate([np.zeros((1, joints.shape[1]), dtype=bool), np.diff(joints, axis=0) == 0])
+    for joint in range(joints.shape[1]):
+        for start, stop in runs(same[:, joint]):
+            moved = float(np.ptp(commands[start - 1 : stop, joint]))
+            if stop - start >= _STUCK_S * fps:
+                commanded[start:stop] = np.maximum(commanded[start:stop], moved)
+                bad[start:stop] |= moved > config.min_jump_rad
+    return frame_verdict("joint_stuck", True, bad, {"commanded_rad": Curve(commanded, config.min_jump_rad)})
+
+
 def find_joint_faults(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
     """Resets first: what follows one is dropped, so that jumps and speeds after it do not count."""
     joints, fps = signals.joints, signals.episode.fps
@@ -398,7 +424,9 @@ def find_joint_faults(signals: Signals, config: FilterConfig, _: Sequence[Findin
     reset = Finding("reset", None, 1, detect_reset(joints, fps, config.reset))
     last = np.flatnonzero(~bad_frames([reset], len(joints)))[-1]
     held = joints[np.minimum(np.arange(len(joints)), last)]
-    verdicts = detect_joint_jump(held, config.joint_motion), detect_joint_speed(held, fps, config.joint_motion)
+    verdicts = [detect_joint_jump(held, config.joint_motion), detect_joint_speed(held, fps, config.joint_motion)]
+    if signals.commands is not None:
+        verdicts.append(detect_joint_stuck(joints, signals.commands, fps, config.joint_motion))
     return [reset, *(Finding(verdict.reason, None, 1, verdict) for verdict in verdicts)]
 
 

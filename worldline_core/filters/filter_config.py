@@ -54,7 +54,7 @@ class JointMotionConfig(Thresholds):
     """Joint positions in radians. Arms of this size reach 2 to 4 rad/s (Panda 2.6, UR5e and xArm 3.1, ViperX 3.1)."""
 
     min_jump_rad: Positive = 0.3
-    """smaller steps from frame to frame are not jumps"""
+    """smaller steps from frame to frame are not jumps, smaller commands not obeyed do not show that a joint is stuck"""
     min_relative_step: float = Field(default=3.0, gt=1)
     """ratio of a jump to the largest other step of the joint within four frames"""
     max_speed_rad_s: Positive = 7.0

@@ -124,7 +124,8 @@ class Signals:
         gray: by view, uint8 (n, h, 96). sharpness: by view, (n,) variance of the Laplacian at the images' own size.
         pictures: by view, numbers about gray.
         joint_speed, gripper_speed: (n,) fastest joint [rad/s] and gripper [1/s], by their range within half a second.
-        joints: (n, j) joint positions [rad], without grippers; None for pose recordings.
+        joints: (n, j) joint positions [rad], without grippers; None for pose recordings. commands: the same of the commands,
+            None where none are recorded.
         T_base_tool: (n, a, 4, 4), or None where neither poses nor kinematics are known. arms: its a arms.
     """
 
@@ -135,6 +136,7 @@ class Signals:
     joint_speed: np.ndarray
     gripper_speed: np.ndarray
     joints: np.ndarray | None
+    commands: np.ndarray | None
     T_base_tool: np.ndarray | None
     arms: tuple[Arm, ...]
 
@@ -189,6 +191,9 @@ def measure(episode: Episode, thumbnails: Mapping[str, ViewThumbnails]) -> Signa
         range_speed(state[:, joint_columns], episode.fps),
         range_speed(state[:, gripper_columns], episode.fps),
         state[:, joint_columns] if episode.state_kind == "joints" else None,
+        episode.action[:num_frames, joint_columns].astype(np.float64)
+        if episode.state_kind == "joints" and episode.commanded
+        else None,
         None if tools is None else tools[:num_frames],
         arms,
     )

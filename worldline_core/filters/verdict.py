@@ -102,6 +102,7 @@ REASONS: dict[str, str] = {
     "base_motion": "Nearly the whole picture changes: the chassis drives.",
     "joint_jump": "A joint reading jumps from one frame to the next.",
     "joint_speed": "A joint is faster than its motor can be.",
+    "joint_stuck": "A joint reading stays the same while the joint is commanded to move.",
     "too_short": "Fewer usable frames than the shortest clip.",
     "unreadable": "The stored images or values cannot be read.",
     "missing_view": "A required view is not there.",
