@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import ViewThumbnails
+from worldline_core.errors import CalibrationError
 from worldline_core.filters import filter as filter_module
 from worldline_core.filters.calibration import detect_mistake, kinematics_of
 from worldline_core.filters.filter import inspect
@@ -77,16 +79,27 @@ def test_kinematics_that_do_not_fit_are_not_used(recording: tuple[Episode, dict[
     assert kinematics_of(replace(episode, T_base_ee=three)) is None
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("cannot reshape array of size 0"), np.linalg.LinAlgError("cannot reshape a singular matrix"),
+        CalibrationError("cannot reshape"), cv2.error("cannot reshape"), TypeError("a mistake in the code"),
+    ],
+)  # fmt: skip
 def test_a_judgement_that_fails_does_not_cost_the_episode(
-    recording: tuple[Episode, dict[str, ViewThumbnails], Signals], monkeypatch: pytest.MonkeyPatch
+    recording: tuple[Episode, dict[str, ViewThumbnails], Signals], error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> list[Finding]:
-        raise ValueError("cannot reshape array of size 0")
+        raise error
 
     fails.__name__ = "find_mistake"
     judged = inspect(FilterConfig(), recording[2])
     monkeypatch.setattr(filter_module, "JUDGEMENTS", (*filter_module.JUDGEMENTS[:-1], fails))
     monkeypatch.setattr(filter_module, "DETECTORS", (*filter_module.DETECTORS[:-1], fails))
+    if isinstance(error, TypeError):
+        with pytest.raises(TypeError, match="a mistake in the code"):
+            inspect(FilterConfig(), recording[2])
+        return
     *others, failed = inspect(FilterConfig(), recording[2])
     assert [f.detector for f in others] == [f.detector for f in judged[:-1]]
     assert (failed.stage, failed.verdict.passed, failed.verdict.numbers["verdict"]) == (2, True, "not_judged")

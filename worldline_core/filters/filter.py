@@ -21,6 +21,7 @@ from itertools import batched
 from pathlib import Path
 from typing import Any, ClassVar
 
+import cv2
 import numpy as np
 import pyarrow as pa
 from pydantic import Field
@@ -35,6 +36,7 @@ from worldline_core.data.episodes.episode_index import (
 )
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWork
 from worldline_core.data.episodes.episode_set_writer import EMBODIMENTS_FOLDER, copy_embodiments, part_name
+from worldline_core.errors import DataError
 from worldline_core.filters.calibration import find_calibration_faults, find_lags, find_mistake, find_projection
 from worldline_core.filters.detectors import find_base_motion, find_joint_faults, find_picture_faults, find_static
 from worldline_core.filters.filter_config import FilterConfig
@@ -94,7 +96,7 @@ JUDGEMENTS: tuple[Detector, ...] = (
 )
 """For Stage II, by estimates from poses and pictures: one that fails is recorded, and costs the episode nothing."""
 DETECTORS: tuple[Detector, ...] = (
-    find_joint_faults,  # reset, joint_jump, joint_speed
+    find_joint_faults,  # reset, joint_jump, joint_speed, joint_stuck
     find_picture_faults,  # too_dark, overexposed, blur, corrupted, in each view
     find_static,
     find_base_motion,
@@ -104,13 +106,17 @@ DETECTORS: tuple[Detector, ...] = (
 """In this order: Stage I first. Of several findings that drop an episode the first one is its reason."""
 
 
+_NUMBERS = (DataError, ValueError, ArithmeticError, cv2.error)
+"""What a judgement of unusual numbers ends with (numpy's LinAlgError is a ValueError); another error is a mistake in the code."""
+
+
 def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:
     """All findings about an episode. A mistake that the calibration doctor explains comes before what it explains."""
     findings: list[Finding] = []
     for detect in DETECTORS:
         try:
             findings += detect(signals, config, findings)
-        except Exception as error:
+        except _NUMBERS as error:
             if detect not in JUDGEMENTS or ends_the_run(error):
                 raise
             evidence = {name: str(value) for name, value in crash_evidence(error).items()}
