@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +16,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, TypeAliasType, Union, cast, get_args, get_origin
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from yaml.constructor import ConstructorError
 
 from worldline_core.errors import ConfigError
@@ -229,15 +230,22 @@ def validate[Model: BaseModel](model: type[Model], values: Mapping[str, Any], *,
         return model.model_validate(dict(values))
     except ValidationError as error:
         lines = []
-        for problem in error.errors():
+        problems = error.errors()
+        for problem in problems:
+            place = problem["loc"]
+            if problem["type"] == "too_short" and any(p["loc"][: len(place)] == place != p["loc"] for p in problems):
+                continue  # pydantic counts the valid ones alone
             dotted = ".".join(str(part) for part in problem["loc"])
             if problem["type"] == "extra_forbidden":
                 known = _known_keys(model, problem["loc"][:-1])
                 close = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
                 hint = f"; did you mean {close[0]!r}?" if close else f"; known keys: {', '.join(known)}"
-                lines.append(f"{dotted}: unknown key{hint}")
+                lines.append(f"{dotted}: unknown key{_place_above(model, place, problem['input']) or hint}")
             else:
-                lines.append(f"{dotted}: {problem['msg']} (got {cut(repr(problem.get('input')), _LONGEST_INPUT)})")
+                hint = _place_above(model, place, problem.get("input"))
+                lines.append(
+                    f"{dotted}: {problem['msg']} (got {cut(repr(problem.get('input')), _LONGEST_INPUT)}){hint}"
+                )
         if len(lines) > _MOST_MISTAKES:
             lines[_MOST_MISTAKES:] = [f"and {len(lines) - _MOST_MISTAKES} more"]
         raise ConfigError("The configuration is not valid", where=where, got="\n    " + "\n    ".join(lines)) from error
@@ -257,6 +265,22 @@ def _take_away(values: dict[str, Any], given: Mapping[str, Any], keys: Sequence[
 def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
     """The keys that a place in the configuration takes."""
     return sorted({key for current in _types_at(model, location) for key in getattr(current, "model_fields", {})})
+
+
+def _place_above(model: type[BaseModel], location: Sequence[int | str], value: object) -> str:
+    """Says where a key belongs that a model further up has, and for which this value is right; else nothing."""
+    place, key = list(location[:-1]), location[-1] if location else ""
+    while place:
+        place.pop()
+        if place and isinstance(place[-1], int):  # another kind of the same list
+            continue
+        for current in _types_at(model, place):
+            field = getattr(current, "model_fields", {}).get(key)
+            with suppress(ValidationError):
+                if field is not None:
+                    TypeAdapter(field.annotation).validate_python(value)
+                    return f"; {key} belongs further up, beside {'.'.join(map(str, location[: len(place) + 1]))}"
+    return ""
 
 
 def _types_at(model: type[BaseModel], location: Sequence[int | str]) -> list[Any]:
@@ -301,6 +325,7 @@ def load_config[Model: BaseModel](
     path: Path | None = None,
     overrides: Sequence[str] = (),
     section: str | None = None,
+    prune: Callable[[dict[str, Any], Mapping[str, Any]], None] | None = None,
 ) -> Model:
     """Load a preset or a file, apply overrides, and validate.
 
@@ -310,6 +335,10 @@ def load_config[Model: BaseModel](
     still written from the top (``train_stage2.steps=10``). An override with null takes away what the file has (one of its
     rollouts), as in a file that extends it, where null is no value of its own. A value that begins with TODO is refused,
     whichever section is asked for.
+
+    Args:
+        prune: changes the values before they are validated, given what the user wrote: the file and the overrides without
+            the preset.
 
     Raises:
         ConfigError: anything that is not right with it.
@@ -322,6 +351,8 @@ def load_config[Model: BaseModel](
         within = keys if section is None else keys[1:]
         if section in (None, keys[0]) and within and type(None) not in _types_at(model, within):
             _take_away(values, given, keys)
+    if prune is not None:
+        prune(values, apply_overrides({} if path is None else read_yaml(path), overrides))
     if section is not None:
         values = values.get(section) or {}
         if not isinstance(values, Mapping):

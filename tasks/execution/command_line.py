@@ -83,7 +83,20 @@ def run_task(task: ArtifactTask, arguments: argparse.Namespace) -> Artifact:
     store, mapper = ArtifactStore(arguments.artifacts, runner.verify), shard_mapper(runner)
     given = dict(_parse_input(text) for text in arguments.inputs)
     calls: dict[str, TaskCall] = {}
-    if (task.name != "curate" and not PipelineConfig.lacking(preset, arguments.config)) or arguments.name is not None:
+    lacking = PipelineConfig.lacking(preset, arguments.config)
+    missing = task.lacks(given)
+    if lacking and (arguments.name is not None or missing):
+        steps = (
+            [f"give {' '.join(f'--input {name.replace("*", "NAME")}=FOLDER' for name in missing)}"] if missing else []
+        )
+        steps += ["leave --name out"] if arguments.name is not None else []
+        raise ConfigError(
+            f"The file describes no whole run in which {arguments.name or f'inputs of {task.name}'} could be looked up",
+            where=arguments.config,
+            got=f"no sections {', '.join(lacking)}",
+            next_step=f"{' and '.join(steps)}, or begin the file with `extends: tiny`",
+        )
+    if (task.name != "curate" and not lacking) or arguments.name is not None:
         calls = outline(load_chain(), PipelineConfig.load(preset, arguments.config, overrides))
     if not calls or (arguments.name is None and task.name not in calls and not task.lacks(given)):
         config = load_config(

@@ -71,7 +71,10 @@ for mistake in {list(mistakes.values())}:
         # An input that is given looks up the others all the same, and a file of one section none.
         ("train_stage1 --preset tiny --input episodes={tmp}", ["encode_latents", "an empty FOLDER"]),
         ("train_stage2 --preset tiny --input episodes={tmp} --input stage1={tmp}", ["render_actions, encode_latents"]),
-        ("filter --config {tmp}/own.yaml", ["missing ['episodes']", "--input NAME=FOLDER"]),
+        ("filter --config {tmp}/own.yaml", ["no sections models, curate", "give --input episodes=FOLDER, or begin"]),
+        ("evaluate_video --config {tmp}/own.yaml", ["--input episodes=FOLDER --input rollouts.NAME=FOLDER"]),
+        ("filter --name filter --config {tmp}/own.yaml", ["--input episodes=FOLDER and leave --name out"]),
+        ("report --name report --config {tmp}/own.yaml", ["next step: leave --name out, or begin"]),
         ("curate", ["--config FILE", "--preset demo"]),
     ],
 )

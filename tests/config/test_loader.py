@@ -218,3 +218,19 @@ def test_rates_that_give_no_usable_times_are_refused_before_anything_is_read(fps
     ):
         with pytest.raises(ValidationError, match=rf"{name}\n"):
             CurateConfig.model_validate({"sources": sources, **changes})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("trim", "common", r"trim: unknown key; trim belongs further up, beside sources"),
+        ("views", "available", r"views: Input should .*; views belongs further up, beside sources"),
+        ("video_crf", 4, r"video_crf: unknown key; video_crf belongs further up, beside sources"),
+        ("trim", "no", r"trim: unknown key; did you mean 'stride'\?$"),
+        ("views", 3, r"views: Input should .* \(got 3\)$"),
+    ],
+)
+def test_a_key_of_a_section_above_is_sent_there(key: str, value: object, said: str) -> None:
+    source = {"kind": "lerobot_v3", "path": "x", "embodiment": "none", "angle_unit": "rad", "views": {}, key: value}
+    with pytest.raises(ConfigError, match=f"(?m){said}"):
+        validate(CurateConfig, {"sources": [source]}, where="a.yaml")

@@ -112,7 +112,9 @@ def test_protobuf_decoders_read_the_export(tmp_path: Path, sample: Make) -> None
     assert found["/head/image"][2].timestamp.ToNanoseconds() == round(episode.timestamps[2] * 1e9)
     decoded = cv2.imdecode(np.frombuffer(found["/head/image"][2].data, np.uint8), cv2.IMREAD_COLOR)
     assert np.array_equal(decoded[..., ::-1], frames["head"][2])  # pyright: ignore[reportOptionalSubscript]
-    (tool,) = [each for each in found["/tf"] if each.child_frame_id == "tool_1" and each.timestamp.ToNanoseconds() == 0]
+    (tool,) = [
+        each for each in found["/tf"] if each.child_frame_id == "right_tool" and each.timestamp.ToNanoseconds() == 0
+    ]
     assert np.allclose([tool.translation.x, tool.translation.y, tool.translation.z], tools()[0, 1, :3, 3])
 
 

@@ -40,7 +40,7 @@ Encoding = Literal["protobuf", "ros2"]
 Message = Mapping[str, Any]
 _Schema = Literal["CompressedImage", "CameraCalibration", "FrameTransform", "JointStates"]
 EPISODE_METADATA = "worldline.episode"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 STATIC_TRANSFORMS = "/tf_static"
 _JPEG_QUALITY = 95
 
@@ -163,8 +163,9 @@ class _Messages:
                 pose = camera.T_base_camera[index if camera.moving else 0]
                 topic = "/tf" if camera.moving else self._static_transforms
                 self.add(topic, "FrameTransform", _transform(f"{view}_camera", pose))
-        for arm, pose in enumerate(T_base_ee[index] if T_base_ee is not None else ()):
-            self.add("/tf", "FrameTransform", _transform(f"tool_{arm}", pose))
+        poses = () if T_base_ee is None else T_base_ee[index]
+        for frame, pose in zip(_tool_frames(len(poses)), poses, strict=True):
+            self.add("/tf", "FrameTransform", _transform(frame, pose))
 
     def add_images(self, images: Mapping[tuple[str, str], np.ndarray], image_format: Literal["png", "jpeg"]) -> None:
         """By kind (image, robot_mask) and view."""
@@ -346,7 +347,7 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         (calibration,) = _all_of(streams, topic, 1, file).values
         camera_poses = _poses(poses, f"{view}_camera", num_frames if moving[view] else 1, file)
         add_camera(cameras, view, calibration, camera_poses, where=f"{file.path}, topic {topic}")
-    tools = [_poses(poses, f"tool_{arm}", num_frames, file) for arm in range(int(about["num_arms"]))]
+    tools = [_poses(poses, frame, num_frames, file) for frame in _tool_frames(int(about["num_arms"]))]
     state, action = (
         np.array([value.position for value in joints[name].values], dtype=ARRAYS["state"].dtype)
         for name in ("state", "command")
@@ -371,6 +372,11 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         return MadeFrames(lambda: (image[..., 0] > 127 for image in masks[view].frames()), (count, *size), bool)
 
     return LoadedEpisode(episode, views, lambda view: tracks[view].frames(), robot_masks, cameras.lenses)
+
+
+def _tool_frames(num_arms: int) -> tuple[str, ...]:
+    """Names of the tools' frames in the order of the arms; a single arm is the right one."""
+    return ("left_tool", "right_tool")[-num_arms:] if num_arms else ()
 
 
 def _all_of(streams: Mapping[str, Stream], topic: str, count: int, file: McapFile) -> Stream:
