@@ -167,14 +167,14 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
 def _checked_preset(arguments: argparse.Namespace, *, weights: bool = False) -> str | None:
     """The preset of a run whose configuration is sound, and whose recordings and ``weights`` are there: mistakes are
     reported before Prefect and its server start."""
-    from worldline_core.config import load_config, preset_path
+    from worldline_core.config import preset_path
 
     preset = arguments.preset or (None if arguments.config else "demo")
     if preset is not None:
         preset_path(preset)  # answers before torch is imported
     from worldline_core.pipeline.pipeline_config import PipelineConfig, check_recordings, check_weights
 
-    config = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=arguments.overrides)
+    config = PipelineConfig.load(preset, arguments.config, arguments.overrides)
     check_recordings(config, Path.cwd())
     if weights:
         check_weights(config, Path.cwd())

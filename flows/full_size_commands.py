@@ -26,7 +26,7 @@ def add_plan_command(commands: argparse._SubParsersAction[argparse.ArgumentParse
 
 
 def _plan(arguments: argparse.Namespace) -> None:
-    from worldline_core.config import load_config, preset_path, validate
+    from worldline_core.config import preset_path, validate
 
     preset = arguments.preset or (None if arguments.config else "demo")
     if preset is not None:
@@ -34,7 +34,7 @@ def _plan(arguments: argparse.Namespace) -> None:
     from worldline_core.pipeline.pipeline_config import PipelineConfig
     from worldline_core.pipeline.size_sheet import SizeSheet
 
-    config = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=arguments.overrides)
+    config = PipelineConfig.load(preset, arguments.config, arguments.overrides)
     machine = {"devices": arguments.gpus, "memory": arguments.memory}
     sheet = validate(SizeSheet, {"config": config, "project": Path.cwd(), **machine}, where="worldline plan")
     rows = list(sheet.rows())

@@ -104,6 +104,27 @@ def test_shipped_rollout_needs_a_shipped_model() -> None:
         load_config(PipelineConfig, preset="tiny", overrides=["models.stage2=null"])
 
 
+def test_rollouts_of_a_preset_go_with_their_models_and_banks(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    own = """extends: tiny
+models: {stage2: null, causal: null}
+curate: {sources: [{kind: video_folder, path: mine}]}
+curate_banks: null
+evaluate_planning: null
+filter: {required_views: [head]}
+encode_latents: {views: [head]}
+"""
+    path.write_text(own)
+    config = PipelineConfig.load(None, path)
+    assert list(config.rollouts) == ["copy_first_frame", "stage2", "stage2_shuffled", "causal"]
+    assert "rollout.stage2" in outline(chain, config)
+    path.write_text(
+        own + "rollouts: {mine: {checkpoint: shipped_stage2, config: {method: mine, sampler: {kind: full_clip}}}}"
+    )
+    with pytest.raises(ConfigError, match=r"rollouts\.mine needs models\.stage2"):  # what the user wrote is not dropped
+        PipelineConfig.load(None, path)
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [

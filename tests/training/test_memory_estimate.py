@@ -237,3 +237,14 @@ def test_the_full_size_fits_cards_of_80_gb() -> None:
         need = rows[title]
         assert need.parameters == pytest.approx(counted, rel=0.01)
         assert need.fits(80e9), need.describe_parts()
+
+
+def test_an_inherited_import_counts_only_for_the_base_that_it_makes() -> None:
+    inherited, own = (
+        SizeSheet(config=PipelineConfig.load("cosmos3-nano", overrides=changes), project=Path("none"), memory="80GB")  # type: ignore[arg-type]
+        for changes in ([], ["models.base=null"])
+    )
+    assert own.config.import_backbone is not None
+    assert own.config.train_stage1 is not None
+    assert own.model == own.config.train_stage1.model
+    assert inherited.model.hidden_size > own.model.hidden_size

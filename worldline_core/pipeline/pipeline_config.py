@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, Self, cast
+from typing import Any, Literal, Self, cast
 
 from pydantic import Field, model_validator
 
@@ -29,6 +30,8 @@ from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote
 from worldline_core.training.clip_config import SUBSET, EncodeLatentsConfig, FrameInput
 from worldline_core.training.training_config import Stage1Config, Stage2Config, StageConfig, TokenizerConfig
+
+logger = logging.getLogger(__name__)
 
 
 class ModelPaths(StrictModel):
@@ -61,6 +64,33 @@ class RolloutRun(StrictModel):
         if (self.config is None) == (self.imported is None) or (self.videos is None) != (self.imported is None):
             raise ValueError("give either config, or videos and imported")
         return self
+
+
+def _drop_unusable_rollouts(values: dict[str, Any], written: Mapping[str, Any]) -> None:
+    """Take away the rollouts whose models or banks are not there, and that the user has not written."""
+    rollouts, own, models = (
+        found.get(name) or {} for found, name in ((values, "rollouts"), (written, "rollouts"), (values, "models"))
+    )
+    if not all(isinstance(part, Mapping) for part in (rollouts, own, models)):
+        return  # validation names it
+    draws = values.get("render_actions") is not None
+    there = {
+        "base": models.get("base"),
+        "stage1": values.get("train_stage1"),
+        "shipped_stage2": models.get("stage2") if draws else None,
+        "shipped_causal": models.get("causal") if draws else None,
+    }
+
+    def usable(run: object) -> bool:
+        if not isinstance(run, Mapping):
+            return True
+        banks = run.get("episodes") != "banks" or values.get("curate_banks") is not None
+        return banks and there.get(str(run.get("checkpoint")), True) is not None
+
+    left_out = [name for name, run in rollouts.items() if name not in own and not usable(run)]
+    if left_out:
+        logger.info("rollouts left out, whose models or banks are not there: %s", ", ".join(left_out))
+        values["rollouts"] = {name: run for name, run in rollouts.items() if name not in left_out}
 
 
 class PipelineConfig(StrictModel):
@@ -98,8 +128,12 @@ class PipelineConfig(StrictModel):
 
     @classmethod
     def load(cls, preset: str | None, path: Path | None = None, overrides: Sequence[str] = ()) -> Self:
-        """Read a preset, or a file of the same form instead, and apply ``a.b=value`` overrides."""
-        return load_config(cls, preset=None if path else preset, path=path, overrides=overrides)
+        """Read a preset, or a file of the same form instead, and apply ``a.b=value`` overrides.
+
+        Rollouts of the preset go with the models and banks that the file or an override takes away.
+        """
+        preset = None if path else preset
+        return load_config(cls, preset=preset, path=path, overrides=overrides, prune=_drop_unusable_rollouts)
 
     @classmethod
     def lacking(cls, preset: str | None, path: Path | None) -> list[str]:

@@ -95,7 +95,7 @@ def changes_of(
     """
 
     def values(more: Sequence[str] = ()) -> dict[str, Any]:
-        config = load_config(PipelineConfig, preset=preset, path=path, overrides=[*overrides, *more])
+        config = PipelineConfig.load(preset, path, [*overrides, *more])
         return dict(_leaves(config.model_dump(mode="json")))
 
     small: list[Change] = []
