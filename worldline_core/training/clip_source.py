@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -480,12 +481,25 @@ def training_rows(
             known = cut
         rows = [row for row in known if set(views) & set(row.views)]
     if not rows:
+        clips = {row.episode_id for row in source.rows}
+
+        def left_out(row: EpisodeRow) -> str:
+            if outcomes is not None and row.outcome not in outcomes:
+                return f"outcome {row.outcome}"
+            if not fit(row):
+                return (stage == 2 and row.stage2_reason) or f"not fit for Stage {stage}"
+            if row.episode_id not in clips:
+                return f"split {row.split}: not among the clips"
+            return "no controls" if tracks is not None and row.episode_id not in tracks else "none of the views"
+
+        counts = Counter(map(left_out, episodes.rows))
         raise DataError(
             "No episode is left to train on.",
             where=f"stage {stage}, one of the views {', '.join(views) or 'that are task-facing'}",
             expected="episodes that are in the EpisodeSet, the source of clips and (Stage II) the action tracks",
-            got=f"{len(allowed)} fit episodes in the set, {len(source.rows)} in the source",
-            next_step="see the quarantine tables of curate, filter and render_actions",
+            got=", ".join(f"{reason} {count}" for reason, count in counts.most_common()) or "an empty EpisodeSet",
+            next_step="docs/filters.md says what each reason asks for; other episodes are in the quarantine tables of curate,"
+            " filter and render_actions",
         )
     return rows
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import platform
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -286,6 +287,11 @@ def _select(episodes: EpisodeSet, config: EncodeLatentsConfig) -> list[int]:
             "No episode is left to encode.",
             where="encode_latents",
             expected=f"episodes with the views {config.views} in the splits {config.splits or 'all'}",
-            got=f"{len(episodes)} episodes, none of them fitting",
+            got=", ".join(
+                f"{count} of split {split} with {' '.join(views)}"
+                for (split, views), count in Counter((row.split, row.views) for row in episodes.rows).most_common(5)
+            )
+            or "an empty EpisodeSet",
+            next_step="encode_latents.splits, views and primary_alone say which are encoded",
         )
     return selected
