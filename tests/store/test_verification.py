@@ -17,6 +17,8 @@ from tasks.execution.chain import outline, ready_inputs
 from worldline_core.config import StrictModel, load_config
 from worldline_core.errors import ArtifactError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.rollout.recorded_starts import RecordedStarts
+from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store import artifact_files
 from worldline_core.store.artifact_files import VerifyMode, check_artifacts, find_damage, folder_files, write_manifest
 from worldline_core.store.store import Artifact, ArtifactStore
@@ -103,14 +105,25 @@ def test_no_command_reads_a_flipped_byte(
     assert not (tmp_path / "out").exists() or [p.name for p in (tmp_path / "out").rglob("*")] == ["run", ".lock"]
 
 
+@pytest.mark.parametrize("kind", ["curate", "filter"])
+def test_no_simulation_starts_from_a_flipped_byte(run: dict[str, Path], kind: str) -> None:
+    video = next(run["curate"].rglob("*.mp4"))
+    artifact_files._digests.clear()
+    with flipped(video, video.stat().st_size // 2, 3), pytest.raises(ArtifactError, match=rf"{video.name}: sha256"):
+        RecordedStarts(run[kind], view_sets=[("head",)], fps=8)
+
+
 @pytest.mark.parametrize("command", ["card {set}", "export {set} --format model --output {out}", "inspect {set}"])
 def test_no_command_reads_a_damaged_model(
     project_root: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     copy = shutil.copytree(project_root / "artifacts/shipped/models/causal", tmp_path / "model")
     weights = next(copy.glob("*.safetensors"))
-    with flipped(weights, weights.stat().st_size - 1, 3), pytest.raises(SystemExit, match="1"):
-        main(command.format(set=copy, out=tmp_path / "out").split())
+    with flipped(weights, weights.stat().st_size - 1, 3):
+        with pytest.raises(SystemExit, match="1"):
+            main(command.format(set=copy, out=tmp_path / "out").split())
+        with pytest.raises(ArtifactError, match=f"{weights.name}: sha256"):
+            WorldLine.from_pretrained(copy)
     assert f"{weights.name}: sha256" in capsys.readouterr().err
 
 

@@ -23,6 +23,7 @@ from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import Embodiment
 from worldline_core.model.tokenizers import resized_frames
 from worldline_core.rollout.observation import Camera
+from worldline_core.store.artifact_files import verify_artifact
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class RecordedStarts:
         embodiment: str | None = None,
         splits: Sequence[str] | None = None,
     ) -> None:
+        verify_artifact(recordings, what="Set of recordings")
         self._episodes, self._view_sets = EpisodeSet.open(recordings), view_sets
         self._rows = {row.episode_id: row for row in self._episodes.rows}
         self._left_out: dict[str, str] = {}

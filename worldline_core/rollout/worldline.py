@@ -34,6 +34,7 @@ from worldline_core.rollout.observation import (
 )
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts
+from worldline_core.store.artifact_files import verify_artifact
 
 
 class WorldLine:
@@ -119,12 +120,16 @@ class WorldLine:
                 chained. By default all is predicted at once.
 
         Raises:
+            ArtifactError: files of an artifact differ from its manifest.
             CheckpointError: a folder is not what it should be, or tokenizer or decoder are not the model's.
             UnavailableError: the hub does not give it, or the device is not there.
             ConfigError: fewer than one step.
         """
         require_device(device)
         folder = pretrained_folder(folder)
+        for name, place in (("Model", folder), ("Decoder", decoder)):
+            if place is not None:
+                verify_artifact(Path(place), what=name)  # the tokenizer is compared by its fingerprint
         kinds: tuple[CheckpointKind, ...] = ("stage2", "causal") if expect_kind is None else (expect_kind,)
         model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation", dtype=getattr(torch, weights))
         codec, fingerprint, _ = load_model_tokenizer(info, folder, tokenizer, device, getattr(torch, weights))
