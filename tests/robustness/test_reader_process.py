@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -82,6 +83,14 @@ for _ in range(8):
     still_reading()
 """
     read_limited(ReaderLimits(seconds=2), exec, code)
+
+
+def test_what_a_function_imports_is_no_time_of_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine the first recording of a reader, whose imports took longer than the limit, was `out_of_time`."""
+    slow = "import os, time\n'PYTEST_CURRENT_TEST' in os.environ or time.sleep(3)\ndef answer(): return 42\n"
+    (tmp_path / "slow_module.py").write_text(slow)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert read_limited(ReaderLimits(seconds=1), importlib.import_module("slow_module").answer) == 42
 
 
 def test_a_reader_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -55,3 +58,33 @@ def test_a_step_is_continued_on_the_threads_that_it_began_with(
     assert torch.get_num_threads() == 1
     manifest = json.loads((artifact.path / "manifest.json").read_text())
     assert manifest["environment"]["threads"] == 3
+
+
+FREED = """
+import sys
+from worldline_core.scale.process import keep_freed_memory
+
+kept = keep_freed_memory()
+block = b"x" * (256 << 20)
+del block
+resident = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmRSS"))
+print(kept, resident > 256 << 10)
+"""
+
+
+@pytest.mark.skipif("glibc" not in str(os.confstr("CS_GNU_LIBC_VERSION")), reason="glibc's malloc")
+@pytest.mark.parametrize(("environment", "said"), [({}, "True True"), ({"MALLOC_ARENA_MAX": "2"}, "False False")])
+def test_freed_memory_is_kept_unless_the_environment_says_otherwise(
+    project_root: Path, environment: dict[str, str], said: str
+) -> None:
+    chosen = {"GLIBC_TUNABLES", "LD_PRELOAD", *(name for name in os.environ if name.startswith("MALLOC_"))}
+    others = {name: value for name, value in os.environ.items() if name not in chosen}
+    done = subprocess.run(
+        [sys.executable, "-c", FREED],
+        capture_output=True,
+        text=True,
+        cwd=project_root,
+        env=others | environment,
+        check=True,
+    )
+    assert done.stdout.strip() == said

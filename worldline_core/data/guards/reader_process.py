@@ -120,7 +120,7 @@ class _Reader:
         """
         try:
             self._connection.send((limits, function, arguments))
-            content = _SIGN_OF_LIFE
+            content = self._connection.recv_bytes()  # the function is imported, which is no time of the recording's
             while content == _SIGN_OF_LIFE:
                 if not self._connection.poll(limits.seconds):
                     raise RejectedInputError(
@@ -201,6 +201,7 @@ def serve(descriptor: int, parent: int) -> None:
                 limits, function, arguments = _caller.recv()
             except EOFError:
                 return
+            _caller.send_bytes(_SIGN_OF_LIFE)
             _caller.send(_answer(limits, function, arguments))
 
 
