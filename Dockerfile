@@ -17,6 +17,7 @@ RUN python3 -m venv .bootstrap && .bootstrap/bin/pip install --no-cache-dir --re
     && .bootstrap/bin/uv sync --frozen --no-install-project --extra sim --no-dev
 COPY configs configs
 COPY worldline_core worldline_core
+COPY worldline worldline
 COPY tasks tasks
 COPY flows flows
 COPY artifacts artifacts

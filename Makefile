@@ -30,7 +30,7 @@ lint: install-scale
 
 install: $(filter .bootstrap/bin/uv,$(UV))
 	$(UV) sync --frozen --inexact --extra sim $(call compile_new,prefect)
-	@$(RUN) python -m compileall -q flows tasks worldline_core
+	@$(RUN) python -m compileall -q flows tasks worldline worldline_core
 
 install-scale: install
 	$(UV) sync --frozen --inexact --extra sim --group scale $(call compile_new,ray)

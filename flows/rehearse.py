@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
+import tasks
 import worldline_core
 from flows.pipeline import chain
 from tasks.execution.chain import find_artifacts, outline, ready_inputs
@@ -63,8 +64,8 @@ def train_in_processes(
             "--name",
             call.name,
         ]
-        code = Path(worldline_core.__file__).parents[1]
-        search = os.pathsep.join([str(code), *filter(None, [os.environ.get("PYTHONPATH")])])
+        code = [str(Path(str(package.__file__)).parents[1]) for package in (tasks, worldline_core)]
+        search = os.pathsep.join([*code, *filter(None, [os.environ.get("PYTHONPATH")])])
         ended = subprocess.run(command, env={**os.environ, "PYTHONPATH": search}, check=False)  # noqa: S603
         if ended.returncode:
             raise TrainingError(

@@ -24,12 +24,15 @@ def installed(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFact
     for wheel in wheels:
         with zipfile.ZipFile(wheel) as archive:
             archive.extractall(site)  # built just now
+    for name in ("flows", "tasks"):  # a user's packages of these names
+        (site / name).mkdir()
+        (site / name / "__init__.py").write_text("raise RuntimeError('not of this project')")
     return site
 
 
 def _worldline(installed: Path, folder: Path, *arguments: str) -> str:
     # -P and the order of PYTHONPATH keep the checkout out of sight.
-    code = "import sys; from flows.command_line import main; main(sys.argv[1:])"
+    code = "import sys; from importlib.metadata import entry_points; entry_points(group='console_scripts')['worldline'].load()()"
     result = subprocess.run(
         [sys.executable, "-P", "-c", code, *arguments],
         cwd=folder, env={**os.environ, "PYTHONPATH": str(installed)}, capture_output=True, text=True, check=False,
@@ -49,3 +52,13 @@ def test_an_empty_folder_is_enough(installed: Path, tmp_path: Path) -> None:
     made = _worldline(installed, tmp_path, "task", "rollout", "--preset", "smoke", "--name", "rollout.copy_first_frame")
     assert Path(made.split()[0], "manifest.json").is_file()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["artifacts"]
+    loaded = "from prefect.flows import load_flow_from_entrypoint as load; print(load('worldline.workflows.flows.pipeline:pipeline').name)"
+    for arguments, said in (
+        (["-c", loaded], "pipeline"),
+        (["-m", "worldline.workflows.tasks.filter", "--help"], "segments"),
+    ):
+        result = subprocess.run(
+            [sys.executable, "-P", *arguments],
+            cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(installed)}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert said in result.stdout, result.stderr
