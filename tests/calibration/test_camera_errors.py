@@ -30,8 +30,9 @@ from worldline_core.calibration.check_report import (
     diagnosis_picture,
     verdict_text,
 )
-from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, diagnose_source
+from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, Explanation, diagnose_source
 from worldline_core.calibration.observation import Motion
+from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.filters.calibration import detect_mistake
 from worldline_core.filters.filter_config import FilterDoctorConfig
@@ -181,6 +182,24 @@ def test_many_episodes_say_more_than_one_and_a_broken_one_does_not_speak_for_the
     (spoiled_by_one,) = combine([(camera_error(value),) for value in (*values, 90.0)])
     assert spoiled_by_one.estimate == pytest.approx(together.estimate, abs=1.0)
     assert (together.contradicting, spoiled_by_one.contradicting) == (0, 1)
+
+
+def test_a_translation_is_named_beside_a_rotation_alone() -> None:
+    """Also where a focal length explains the pictures too."""
+    solved, toward = np.zeros(PARAMETERS), np.zeros((2, PARAMETERS))
+    solved[4], toward[0, [4, 6]], toward[1, 0] = 300.0, (1.0, 20.0), 1.0
+    information = toward.T @ np.diag([1e-2, 1e-1]) @ toward
+    assert CameraError("head", solved, information, 0.0).named == ("rotation", "translation", "focal length")
+
+
+def test_what_one_episode_alone_shows_is_not_said_of_its_source() -> None:
+    def one(gain: float) -> Diagnosis:
+        written = Explanation(RecordedConventions(), -20.0, {"flow head": -20.0})
+        late = Explanation(RecordedConventions(image_lag_frames=1), gain - 20.0, {"flow head": 0.0})
+        return Diagnosis(verdict="unexplained", best=written, ranked=(late, written), episode_id="e")
+
+    assert diagnose_source("source", [one(20.0), *[one(0.0)] * 4]).verdict != "explained"
+    assert diagnose_source("source", [one(4.0)] * 5).best.mistake == "image_lag_frames"
 
 
 def test_episodes_beyond_their_bounds_are_mixed() -> None:

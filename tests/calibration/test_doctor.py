@@ -12,6 +12,7 @@ import pytest
 from benchmarks import calibration as benchmark
 from tools.corrupted.conventions import corrupt
 from worldline_core.calibration.calibration_doctor import diagnose
+from worldline_core.calibration.check_report import verdict_text
 from worldline_core.calibration.diagnosis import MAX_GAIN, MIN_MARGIN, Diagnosis, diagnose_source
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
@@ -203,16 +204,18 @@ def agibot(shared_data: Path, layout: str) -> list[tuple[Episode, dict[str, np.n
     return [(item.episode, {view: item.frames(view) for view in item.views}) for item in loaded]
 
 
-def test_agibot_v1_extrinsics_are_camera_to_base_and_trail_by_two_frames(shared_data: Path) -> None:
+def test_agibot_v1_extrinsics_are_camera_to_base_and_may_trail(shared_data: Path) -> None:
+    """Four pictures show no motion, so a lag that only makes the poses fit better is noted, and claimed of none."""
     diagnoses = [diagnose(episode, frames, None) for episode, frames in agibot(shared_data, "agibot_gesim")]
     for diagnosis in diagnoses:
         by_name = {e.mistake: e.score for e in reversed(diagnosis.ranked)}
         assert by_name["extrinsics"] < diagnosis.as_recorded.score - 40  # camera-to-base as read, not the inverse
         assert by_name["quaternion"] < diagnosis.as_recorded.score - 30
-        assert diagnosis.best.mistake == "camera_lag_frames"
-        assert abs(diagnosis.best.conventions.camera_lag_frames - 2) <= 1
+        assert (diagnosis.verdict, diagnosis.best.mistake) == ("consistent", "none")
+        assert verdict_text(diagnosis).endswith("not judged: head, left_wrist, right_wrist")
+        assert any(note.startswith("camera_lag_frames: 2 would fit the poses better") for note in diagnosis.notes)
     together = diagnose_source("agibot", diagnoses)
-    assert together.best.conventions == RecordedConventions(camera_lag_frames=2)
+    assert (together.verdict, together.best.mistake) == ("consistent", "none")
 
 
 def test_agibot_v2_wrist_extrinsics_follow_the_action(shared_data: Path) -> None:

@@ -10,8 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from worldline_core.calibration.calibration_doctor import camera_lags, intrinsics_sizes
+from worldline_core.calibration.diagnosis import Explanation, bad_terms
 from worldline_core.calibration.evidence import (
     finger_flow,
+    image_terms,
     pose_terms,
     rms_hand_eye,
     still_view_agreement,
@@ -115,6 +117,16 @@ def test_flow_of_the_tool_agrees_with_a_right_camera_only(seen: dict[str, np.nda
     assert abs(abs(rolled_turn) - 40) < 12
     mirrored = seen_as(episode(), seen, camera_axes="opengl", views=("head",))
     assert still_view_agreement(*mirrored, "head") == (0.0, 0.0, 0.0)  # the tool is behind the camera
+
+
+def test_a_motion_of_few_cells_vetoes_nothing(seen: dict[str, np.ndarray]) -> None:
+    """A wrong camera is bad by the motion of many cells; by that of a few steps it is no more than suspicious."""
+    other = texture(COUNT * HEIGHT, WIDTH, 4).reshape(COUNT, HEIGHT, WIDTH).astype(np.uint8)
+    shown = seen["head"].copy()
+    for first, bad in ((2, True), (COUNT - 1, False)):
+        pictures = np.where(np.arange(COUNT)[:, None, None] < first, shown[:1], other)
+        terms = image_terms(*seen_as(episode(), {"head": pictures}))
+        assert bool(bad_terms(Explanation(RecordedConventions(), 0.0, terms))) == bad
 
 
 @pytest.mark.parametrize("lag", [0, 2])

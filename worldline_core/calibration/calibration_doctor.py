@@ -19,11 +19,13 @@ from worldline_core.calibration.diagnosis import (
     MIN_MARGIN,
     SUSPICION,
     TERM_LIMITS,
+    VIEWS_COST,
     Diagnosis,
     Explanation,
     bad_terms,
     decide,
     nearest_texts,
+    unjudged_gain,
 )
 from worldline_core.calibration.evidence import (
     MIN_IMAGE_PAIRS,
@@ -116,11 +118,14 @@ def diagnose(
         notes = (*notes, f"{ranked[0].text}: at the edge of what is tried; the lag may be larger")
     if verdict == "unexplained":
         notes = (*notes, *(f"{view}: its pictures stay the same while its arm moves" for view in search.frozen))
+    near = ranked[0] if verdict == "consistent" and ranked[0].score - as_recorded.score >= MIN_MARGIN else best
+    if near is not best and unjudged_gain(near, as_recorded) > 0.0:
+        notes = (*notes, f"{near.text} would fit the poses better; without pictures this is not judged")
     if rivals:
         notes = (*notes, f"These explain it equally well, nothing recorded tells which: {'; '.join(rivals)}")
     if best.other is not None:
         notes = (*notes, REMEDIES[best.other[0]].format(best.other[1], episode.embodiment))
-    if best.conventions.camera_lag_frames < 0 and recorded.action_tools is None:
+    if near.conventions.camera_lag_frames < 0 and recorded.action_tools is None:
         notes = (*notes, "The camera poses lead the states; they may follow the commands: give the kinematics to see")
     travel = np.linalg.norm(np.diff(recorded.tools[..., :3, 3], axis=0), axis=-1).sum(axis=0).max()
     if verdict == "consistent" and travel < MIN_TRAVEL_M and not observable_views(observation):
@@ -160,7 +165,7 @@ class _Search:
     def explain(self, reading: Reading, terms: dict[str, float], other: tuple[str, str] | None = None) -> Explanation:
         """A reading with its score: the sum of its terms, less the cost of departing from the contract."""
         departures = len(reading.conventions.departures) + (other is not None)
-        cost = COMPLEXITY * (departures + (reading.conventions.views is not None) / 2)
+        cost = COMPLEXITY * departures + VIEWS_COST * (reading.conventions.views is not None)
         # That no video is frozen in a reading is no gain: the picture of an arm that rests stays the same.
         thawed = len(self.frozen) - sum(name.startswith("frozen ") for name in terms)
         cost -= WORST_TERM * max(0, thawed)
@@ -219,16 +224,15 @@ class _Search:
         return [*found, *self.exchanged_wrist_cameras()]
 
     def lags_by_view(self, late: Reading) -> Iterator[Explanation]:
-        """A lag of all pictures, and of those views alone whose own pictures fit better with it while the others' fit worse."""
+        """A lag of all pictures, and of those views alone whose own pictures fit better with it."""
         terms, written = self.terms(late, self.recorded_poses), self.as_recorded.evidence
         yield self.explain(late, terms)
         views = [view for view in late.cameras if view in self.observation.gray]
-        better = [view for view in views if _of_view(terms, view) > _of_view(written, view)]
-        clearly = [view for view in better if _of_view(terms, view) > _of_view(written, view) + 1.0]
-        for chosen in dict.fromkeys([*((view,) for view in better), tuple(clearly)]):
-            others = [view for view in views if view not in chosen]
-            lost = sum(_of_view(written, view) - _of_view(terms, view) for view in others)
-            if not chosen or lost < MIN_MARGIN:
+        gains = {view: _of_view(terms, view) - _of_view(written, view) for view in views}
+        better = [(view,) for view in views if gains[view] > 1.0]
+        clearly = tuple(view for view in views if gains[view] > MIN_MARGIN)
+        for chosen in dict.fromkeys([*better, clearly]):
+            if not chosen or len(chosen) == len(views):
                 continue
             own = tuple(f" {view}" for view in chosen)
             merged = {name: value for name, value in written.items() if not name.endswith(own)}

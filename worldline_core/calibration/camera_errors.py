@@ -177,13 +177,15 @@ class CameraError:
         best = min(left.values())
         if best <= LEFT_OVER:
             alike = [name for name in left if left[name] <= best + ALIKE]
-            if alike == ["translation"]:  # a turn does nearly the same to a robot at one distance
-                alike = ["rotation", "translation"]
-            focal = next(each for each in self.kinds if each.kind == "focal length")
-            # Where a turn and a shift look alike, the focal length that goes with them is known no better.
-            beside = len(alike) > 1 and focal.half_interval > FOCAL_KNOWN
-            return tuple(name for name in left if name in alike or (beside and name == focal.kind))
-        return tuple(each.kind for each in self.kinds if each.kind in KINDS and each.size > each.half_interval)
+        else:
+            alike = [each.kind for each in self.kinds if each.kind in KINDS and each.size > each.half_interval]
+        if "translation" in alike:  # a turn does nearly the same to a robot at one distance
+            alike.append("rotation")
+        focal = next(each for each in self.kinds if each.kind == "focal length")
+        # Where a turn and a shift look alike, the focal length that goes with them is known no better.
+        if best <= LEFT_OVER and len(alike) > 1 and focal.half_interval > FOCAL_KNOWN:
+            alike.append(focal.kind)
+        return tuple(name for name in left if name in alike)
 
     def __str__(self) -> str:
         named = [str(each) for each in self.kinds if each.kind in self.named]

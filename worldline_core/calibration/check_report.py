@@ -99,11 +99,12 @@ class CalibrationCheck:
 
     @property
     def consistent(self) -> bool:
-        """True if some episode is consistent, and nothing is wrong with any other."""
+        """True if some episode is consistent by its pictures, and nothing is wrong with any other."""
         verdicts = {episode.verdict for episode in self.episodes}
+        seen = any(e.diagnosis is not None and e.diagnosis.camera_errors for e in self.episodes)
         sound = not verdicts & {"off", "explained", "unexplained", "unreadable", "not_judged"}
         together = all(s.verdict not in ("off", "explained", "mixed") for s in self.sources)
-        return sound and "consistent" in verdicts and together
+        return sound and seen and "consistent" in verdicts and together
 
     @property
     def counted(self) -> dict[str, int]:
@@ -169,19 +170,20 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
 
 
 def _single_episodes(check: CalibrationCheck) -> list[str]:
-    """Episodes that the conclusion over their source does not cover: what repairs them, or what comes nearest."""
+    """Episodes that the conclusion over their source does not cover: what repairs them, what comes nearest, and notes."""
     together = {found.source: found for found in check.sources}
     lines = []
     for episode in check.episodes:
         found, diagnosis = together.get(episode.source), episode.diagnosis
-        if diagnosis is None or diagnosis.verdict not in ("explained", "unexplained"):
+        if diagnosis is None or (found is not None and diagnosis.verdict not in ("explained", "unexplained")):
             continue
         if found is not None and (found.verdict, found.config_lines) == (diagnosis.verdict, episode.config_lines):
             continue
         notes = (*diagnosis.notes, *episode.notes) if found is None else ()  # else printed with the source
-        lines += [f"  {episode.episode_id}:", *(f"    note: {note}" for note in notes)]
-        lines += [f"    near: {near}" for near in diagnosis.nearest]
-        lines += [f"    {line}" for line in episode.config_lines]
+        own = [f"    note: {note}" for note in notes]
+        own += [f"    near: {near}" for near in diagnosis.nearest]
+        own += [f"    {line}" for line in episode.config_lines]
+        lines += [f"  {episode.episode_id}:", *own] if own else []
     header = ["", "single episodes (give those that differ a source of their own, by `include`):"]
     return [*header, *lines] if lines else []
 

@@ -30,20 +30,22 @@ MIN_TERM = -9.0
 SUSPICION = -4.0
 """A term below this starts the search."""
 TERM_LIMITS = {
-    "flow": correlation_log_likelihood(0.5, ARM_FLOW),
+    "flow": correlation_log_likelihood(0.3, ARM_FLOW),
     "turn": turn_log_likelihood(35.0),
     "hand-eye": hand_eye_log_likelihood(0.012, 0.0),
     **dict.fromkeys(("change", "wrist", "energy", "fingers", "finger"), -np.inf),
 }
 """By the first word of a term's name, where it is not MIN_TERM; noisy signs cannot veto."""
-COMPLEXITY = 2.0
-"""Cost of a reading for each departure from the contract."""
+COMPLEXITY, VIEWS_COST = 2.0, 0.5
+"""Cost of a reading for each departure from the contract, and for being of some views alone."""
 RIVAL_MARGIN = 1.0
 """Another mistake with a score this near explains the recording as well."""
 MAX_GAIN = 20.0
 """Most that one episode can contribute to a reading of its whole source."""
 CONTRADICTING_SHARE = 0.1
 """Largest share of the episodes that fit by themselves which a reading of the whole source may break."""
+FEWEST_SHOWING = 3
+"""From this many episodes on, what one of them shows alone is not said of the source."""
 FEWEST_TOGETHER = 5
 """From this many episodes on, their scatter measures their common uncertainty."""
 ESTIMATED = {"intrinsics_size", "tool_offset_z_m", "embodiment"}
@@ -181,6 +183,16 @@ def bad_terms(explanation: Explanation, as_recorded: Explanation | None = None) 
     return bad
 
 
+def unjudged_gain(explanation: Explanation, as_recorded: Explanation) -> float:
+    """Gain of a reading from views whose pictures say nothing; 0 where the recording as written is bad, which poses show alone."""
+    if bad_terms(as_recorded):
+        return 0.0
+    views = [name.removeprefix("intrinsics ") for name in as_recorded.evidence if name.startswith("intrinsics ")]
+    blind = tuple(f" {view}" for view in views if f"energy {view}" not in as_recorded.evidence)
+    gains = ((name, value - as_recorded.evidence.get(name, value)) for name, value in explanation.evidence.items())
+    return sum(max(0.0, gain) for name, gain in gains if name.endswith(blind))
+
+
 def nearest_texts(ranked: Iterable[Explanation], as_recorded: Explanation) -> tuple[str, ...]:
     """The best readings without a common mistake, each with what is still wrong under it."""
     texts: list[str] = []
@@ -199,7 +211,7 @@ def nearest_texts(ranked: Iterable[Explanation], as_recorded: Explanation) -> tu
 def decide(as_recorded: Explanation, ranked: Sequence[Explanation]) -> tuple[VerdictName, Explanation, list[str]]:
     """The verdict, the reading to believe, and the mistakes that explain the recording equally well, if several do."""
     best, bad = ranked[0], bool(bad_terms(as_recorded))
-    gain = best.score - as_recorded.score
+    gain = best.score - as_recorded.score - unjudged_gain(best, as_recorded)
     if best is not as_recorded and gain >= MIN_MARGIN and not bad_terms(best, as_recorded):
         # Of mistakes that occur together, the one that explains most alone is compared with the others.
         alone = next((e for e in ranked if len(e.departures) == 1 and e.departures[0] in best.departures), best)
@@ -211,11 +223,21 @@ def decide(as_recorded: Explanation, ranked: Sequence[Explanation]) -> tuple[Ver
             and not set(other.departures) & set(best.departures)
             and (len(best.departures) > 1 or not bad_terms(other, as_recorded))
         ]
+        near = [other for other in ranked if _of_fewer_views(other, best)]
+        in_doubt = [other.text for other in near if best.score - other.score < VIEWS_COST]
+        rivals += in_doubt
         if not rivals:
             return ("unexplained", as_recorded, []) if best.lag_at_edge else ("explained", best, [])
-        if bad:
+        if bad or in_doubt:
             return "unexplained", as_recorded, [best.text, *rivals]
     return "unexplained" if bad else "consistent", as_recorded, []
+
+
+def _of_fewer_views(other: Explanation, best: Explanation) -> bool:
+    """True for the mistake of all pictures in some views alone: what it leaves out loses by the mistake, if hardly."""
+    everywhere = other.conventions.model_copy(update={"views": None})
+    late = best.departures == ("image_lag_frames",)
+    return late and other.conventions.views is not None and everywhere == best.conventions
 
 
 def tolerated_episodes(count: int) -> float:
@@ -238,8 +260,7 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
     readings = _source_readings(listed)
     as_recorded = _summed([d.as_recorded for d in listed], sum(d.as_recorded.score for d in listed))
     ranked = sorted([as_recorded, *(r.summed(as_recorded.score) for r in readings)], key=lambda e: -e.score)
-    winning = [r for r in readings if r.gain >= MIN_MARGIN + 0.5 * count and r.healthy > count / 2]
-    sound = [r for r in winning if r.contradicting <= CONTRADICTING_SHARE * count]
+    sound = [r for r in readings if r.wins and r.contradicting <= CONTRADICTING_SHARE * count]
     sound = sorted(sound, key=lambda r: r.regret(sound))
     rivals = [r for r in sound[1:] if r.fits_like(sound[0], sound)]
     verdict: VerdictName = "mixed"
@@ -289,19 +310,33 @@ class _SourceReading:
         self.names = {name for name, _ in key}
         self.tried = [found[key] for found in by_key if key in found]
         tolerated = MIN_MARGIN + COMPLEXITY * len(key)
-        self.scores, self.gain, self.healthy, self.contradicting = [], 0.0, 0, 0
+        self.scores: list[float] = []
+        self.gains: list[float] = []
+        self.healthy = self.contradicting = 0
         for diagnosis, found in zip(listed, by_key, strict=True):
             as_recorded = diagnosis.as_recorded
             own = found.get(key) or _instead_of(key, found)
             bad = bool(bad_terms(own, as_recorded))
             self.scores.append(own.score)
-            self.gain += float(np.clip(own.score - as_recorded.score, -MAX_GAIN, MAX_GAIN))
+            gain = own.score - as_recorded.score - unjudged_gain(own, as_recorded)
+            self.gains.append(float(np.clip(gain, -MAX_GAIN, MAX_GAIN)))
             self.healthy += not bad
             fits = diagnosis.verdict in ("consistent", "off")
             worse = fits and own.score < as_recorded.score - tolerated
             unseen = fits and self.names & ESTIMATED and key not in found
             bad_here = bad and (fits or diagnosis.verdict == "explained")
             self.contradicting += bool(worse or unseen or bad_here)
+
+    @property
+    def gain(self) -> float:
+        return sum(self.gains)
+
+    @property
+    def wins(self) -> bool:
+        """True for a reading that is clearly better than the recordings as written, and under which most are healthy."""
+        count = len(self.gains)
+        enough = self.gain >= MIN_MARGIN + 0.5 * count and self.healthy > count / 2
+        return enough and (count < FEWEST_SHOWING or self.gain - max(self.gains) >= MIN_MARGIN)
 
     def regret(self, others: list[_SourceReading]) -> float:
         """Score of the best of several readings above this one, summed over the episodes."""

@@ -61,8 +61,10 @@ FINGERS, FINGER_LINKS = (0.75, 0.4), (0.5, 0.3)
 FLOW_TURN_DEG, WORST_TURN_TERM = 8.0, -12.0
 MIN_STEP_PX = 0.7
 """Smallest predicted motion of a cell that flow is compared with."""
-FOLLOWS_CORRELATION = 0.5
-"""Above it an angle between measured and predicted flow means something."""
+FOLLOWS_CORRELATION, FOLLOWS_WELL = 0.5, 0.75
+"""An angle between measured and predicted flow means nothing below the first, and has its full weight from the second on."""
+FULL_CELLS = 600
+"""Cells with a clear change for a still view's motion to have its full weight."""
 INVERSE_DEPTHS_PER_M = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
 """Scene before a wrist camera, tried one by one."""
 MIN_TEXTURE, MIN_CHANGE = 4.0, 5.0
@@ -216,10 +218,11 @@ def image_terms(observation: Observation, reading: Reading, *, wrist_flow: bool 
             terms[f"wrist flow {view}"] = correlation_log_likelihood(flow, WRIST_FLOW)
         elif view not in observation.wrists:
             flow, change, turn_deg = still_view_agreement(observation, reading, view)
-            terms[f"turn {view}"] = turn_log_likelihood(turn_deg)
             typical = (ARM_FLOW, ARM_CHANGE) if reading.shape != "hands" else (TOOL_FLOW, TOOL_CHANGE)
-            terms[f"flow {view}"] = correlation_log_likelihood(flow, typical[0])
-            terms[f"change {view}"] = correlation_log_likelihood(change, typical[1])
+            weight = min(1.0, observation.motion(view).clear_cells / FULL_CELLS)  # the same for all readings
+            terms[f"turn {view}"] = weight * turn_log_likelihood(turn_deg)
+            terms[f"flow {view}"] = weight * correlation_log_likelihood(flow, typical[0])
+            terms[f"change {view}"] = weight * correlation_log_likelihood(change, typical[1])
         energy = energy_correlation(observation, reading, view)
         terms[f"energy {view}"] = correlation_log_likelihood(energy, WRIST_ENERGY)
     return terms
@@ -269,8 +272,8 @@ def turn_log_likelihood(turn_deg: float) -> float:
 def still_view_agreement(observation: Observation, reading: Reading, view: str) -> tuple[float, float, float]:
     """Agreement of a fixed view with the robot's predicted motion; all 0 without predicted motion in the picture.
 
-    Returns: correlations of predicted with measured flow and change; angle [deg] by which the flow is turned as a whole, 0
-        where it does not follow at all.
+    Returns: correlations of predicted with measured flow and change; angle [deg] by which the flow is turned as a whole,
+        smaller where it hardly follows, and 0 where it does not.
     """
     states, images = reading.steps(observation.num_images, view)
     motion, vector = observation.motion(view), reading.predicted(view)[states]
@@ -284,8 +287,8 @@ def still_view_agreement(observation: Observation, reading: Reading, view: str) 
     expected = expected * np.minimum(1.0, 20.0 / np.maximum(lengths(expected)[:, None], 1e-9))
     agreement = cosine(measured, expected)
     across = cosine(measured, np.stack([-expected[:, 1], expected[:, 0]], axis=-1))
-    follows = np.hypot(agreement, across) > FOLLOWS_CORRELATION
-    turn_deg = float(np.degrees(np.arctan2(across, agreement))) if follows else 0.0
+    follows = (np.hypot(agreement, across) - FOLLOWS_CORRELATION) / (FOLLOWS_WELL - FOLLOWS_CORRELATION)
+    turn_deg = float(np.degrees(np.arctan2(across, agreement)) * np.sqrt(np.clip(follows, 0.0, 1.0)))
     x, y = np.log1p(np.minimum(step, 20.0)).ravel(), np.log1p(change).ravel()
     if x.std() < 1e-9 or y.std() < 1e-9:
         return agreement, 0.0, turn_deg

@@ -23,8 +23,8 @@ from worldline_core.geometry.transforms import hand_eye_residual, lengths, rigid
 
 GRAY_WIDTH = 96
 CELL_PX = 4
-STILL_CHANGE = 4.0
-"""Changes below this many grey levels are compression or sensor noise."""
+STILL_CHANGE, CLEAR_CHANGE = 4.0, 8.0
+"""Changes below this many grey levels are compression or sensor noise; above the second something moves there."""
 METRES_PER_RADIAN = 0.15
 """A wrist camera that turns by one radian shows about as much change as one that travels this far."""
 MIN_SHAPED_LINKS = 3
@@ -70,6 +70,11 @@ class Motion:
     @cached_property
     def mean_change(self) -> np.ndarray:
         return self.change.mean(axis=(1, 2))
+
+    @cached_property
+    def clear_cells(self) -> int:
+        """Number of cells that change clearly, over all steps."""
+        return int((self.change > CLEAR_CHANGE).sum())
 
 
 @dataclass(frozen=True)
