@@ -42,12 +42,12 @@ def test_frames_that_are_dropped_anyway_do_not_count(
     noisy = dict(signals.gray)
     noisy["head"] = noisy["head"].copy()
     noise = np.random.default_rng(0).integers(0, 255, noisy["head"].shape, dtype=np.uint8)
-    noisy["head"][18:] = noise[18:]
+    noisy["head"][9:] = noise[9:]
     spoilt = detect_mistake(episode, noisy, none_bad, CONFIG)
     assert (spoilt.passed, spoilt.reason) == (False, "calibration_unexplained")
     assert "flow head" in str(spoilt.numbers["bad"])
     bad = none_bad.copy()
-    bad[18:] = True
+    bad[9:] = True
     assert detect_mistake(episode, noisy, bad, CONFIG).passed
     nothing_left = detect_mistake(episode, noisy, ~none_bad, CONFIG)
     assert nothing_left.passed
@@ -69,6 +69,18 @@ def test_an_explanation_comes_before_what_it_explains(
     clean = inspect(FilterConfig(), measure(episode, thumbnails))
     assert all(finding.verdict.passed for finding in clean)
     assert clean[-1].detector == "doctor"
+
+
+def test_an_inverted_gripper_is_named_and_bars_nothing(project_root: Path) -> None:
+    """Fingers of one episode are a weak sign: the evidence has the line, and sends the user to the whole source."""
+    episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
+    i = episodes.position("panda_ivory-ood_test-s1-00000")
+    signals = measure(episodes.episode(i), {view: episodes.thumbnails(i, view) for view in episodes.rows[i].views})
+    inverted = corrupt(signals.episode, RecordedConventions(gripper="inverted"))
+    found = detect_mistake(inverted, signals.gray, np.zeros(inverted.num_frames, dtype=bool), CONFIG)
+    assert (found.passed, found.numbers["mistake"]) == (True, "gripper")
+    assert found.numbers["config"] == "curate.sources[].conventions.gripper: inverted"
+    assert "worldline calibrate check" in str(found.numbers["warning"])
 
 
 def test_kinematics_that_do_not_fit_are_not_used(recording: tuple[Episode, dict[str, ViewThumbnails], Signals]) -> None:

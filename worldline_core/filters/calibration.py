@@ -7,7 +7,8 @@ camera poses are rigid, wrist cameras are fixed to their arm, fixed cameras stay
 
 The calibration doctor is a detector as well: no usual mistake explains the recording better than its own calibration
 does. An explained mistake excludes the episode from Stage II: its evidence names the configuration line that repairs the
-source, and nothing is repaired silently. A camera that is off by an estimate is a warning in the evidence, and bars nothing.
+source, and nothing is repaired silently. A camera that is off by an estimate and an inverted gripper are warnings in the
+evidence, and bar nothing.
 """
 
 from __future__ import annotations
@@ -340,9 +341,11 @@ def detect_mistake(
         reason = "time_alignment" if lags else "calibration"
     elif diagnosis.verdict == "unexplained" and diagnosis.ranked[0].lag_at_edge:
         reason = "time_alignment"
+    # A camera that is off is an estimate, and one episode's fingers are a weak sign of polarity: both warn.
+    unsure = diagnosis.verdict == "off" or diagnosis.best.departures == ("gripper",)
     return Verdict(
         reason,
-        diagnosis.verdict in ("consistent", "off", "too_little_evidence"),  # "off" is an estimate: it warns
+        unsure or diagnosis.verdict in ("consistent", "too_little_evidence"),
         _numbers(diagnosis, step) | {"first_frame": start, "every_frame": step},
     )
 
@@ -376,6 +379,8 @@ def _numbers(diagnosis: Diagnosis, step: int) -> Numbers:
         numbers |= {f"{kind} [{each.unit}]": round(each.size, 3), f"{kind} unseen up to": round(each.bound, 3)}
     for view, why in diagnosis.not_judged.items():
         numbers[f"{view} not judged"] = why
+    if diagnosis.best.departures == ("gripper",):
+        numbers["warning"] = "polarity is judged over a source: worldline calibrate check, then the line `config`"
     if diagnosis.off:
         numbers |= {"off": "; ".join(map(str, diagnosis.off))}
     if diagnosis.verdict == "unexplained":
