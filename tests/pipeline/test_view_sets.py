@@ -93,7 +93,7 @@ def test_one_arm_goes_through_every_step(
     first, _ = environment.reset(seed=0)
     assert set(first["pixels"]) == set(views)
     assert environment.step(first["agent_pos"])[0]["agent_pos"].shape == (8,)
-    host = SessionHost(world, ServeConfig(episodes=folders["filter"]))
+    host = SessionHost(world, ServeConfig.model_validate({"episodes": folders["filter"]}))
     simulation = host.simulate(host.starts.rows[0].episode_id, [1, 2])
     frames = simulation.step(np.repeat(simulation.state[:, None], simulation.frames_per_step, 1))
     assert set(frames[0]) == set(views)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.rollout.conftest import SIZE, N, recorded, write_recordings
+from tests.rollout.conftest import SIZE, N, recorded, write_recordings  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.episode_tracks import ActionTracks, open_controls, write_index
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import QuarantineRow, read_quarantine, write_quarantine
@@ -139,11 +139,12 @@ def test_an_environment_a_server_and_the_page_drive_a_robot_without_cameras(
     made = write_recordings(tmp_path, [("a", "test", N, VIEWS, cameras)])
     environment = WorldLineEnv(model=world, recordings=made["episodes"], success=None, episode_frames=16)
     first, _ = environment.reset(seed=0)
+    seen = first
     for _ in range(16):
         seen, *_ = environment.step(first["agent_pos"])
     assert not np.array_equal(seen["pixels"]["left_wrist"], first["pixels"]["left_wrist"])
 
-    host = SessionHost(world, ServeConfig(episodes=made["episodes"], output=tmp_path / "played"))
+    host = SessionHost(world, ServeConfig.model_validate({"episodes": made["episodes"], "output": tmp_path / "played"}))
     assert host.metadata()["needs_cameras"] is False
     start = {"op": "start", "images": IMAGES, "embodiment": ROBOT, "state": CONTROLS[0]}
     played: list[Any] = []
@@ -208,7 +209,7 @@ def test_what_was_refused_for_its_controls_is_no_vector_either(
     tracks = open_controls(made, episodes, vectors=True)
     assert set(tracks.episode_ids) == known
     assert tracks.calibrated_views("a") == VIEWS
-    assert all(
-        np.array_equal(tracks.tracks(name).native, episodes.episode(episodes.position(name)).action) for name in known
-    )
+    for name in known:
+        native = tracks.tracks(name).native
+        assert native is not None and np.array_equal(native, episodes.episode(episodes.position(name)).action)
     assert set(open_controls(made, episodes, vectors=False).episode_ids) == {"a"}
