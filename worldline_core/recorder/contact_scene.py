@@ -26,15 +26,21 @@ LOOSE = {"box": 3, "cylinder": 3, "ball": 1, "bar": 1, "tray": 1}
 FIXED = {"wall": 8, "pad": 2}
 _LARGEST = 0.12
 BAR_HALF, TRAY_HALF, RAIL_AWAY = (0.10, 0.020, 0.025), (0.075, 0.140, 0.008), 0.120
-# What has parts is as it is, a dark weight on its +x side: half sizes, place and mass of each part, the weight last.
+# What has parts is as it is: half sizes, place and mass of each part. The last two are dark: a weight on the +x side, and as much flat paint
+# on the other, without which the middle of the colour would point away from the weight.
 _Part = tuple[tuple[float, float, float], tuple[float, float, float], float]
 _RAIL = (0.075, 0.019, 0.034)
 PARTS: dict[str, tuple[_Part, ...]] = {
-    "bar": ((BAR_HALF, (0.0, 0.0, 0.0), 0.1), ((0.020, 0.020, 0.042), (0.078, 0.0, 0.017), 0.3)),
+    "bar": (
+        (BAR_HALF, (0.0, 0.0, 0.0), 0.1),
+        ((0.020, 0.0202, 0.0252), (-0.078, 0.0, 0.0), 0.001),
+        ((0.020, 0.020, 0.042), (0.078, 0.0, 0.017), 0.3),
+    ),
     "tray": (
         (TRAY_HALF, (0.0, 0.0, 0.0), 0.2),
         (_RAIL, (0.0, RAIL_AWAY, 0.042), 0.05),
         (_RAIL, (0.0, -RAIL_AWAY, 0.042), 0.05),
+        ((0.022, 0.050, 0.0085), (-0.052, 0.0, 0.0), 0.001),
         ((0.022, 0.050, 0.030), (0.052, 0.0, 0.038), 1.7),
     ),
 }
@@ -100,8 +106,8 @@ def apply_contact_layout(scene: SceneModel, data: Any, layout: Layout) -> None:
         body, geom = model.body(name).id, model.geom(name).id
         model.geom_rgba[geom] = layout.rgba(thing)
         for part in range(1, len(PARTS.get(thing.kind, ()))):
-            last = part + 1 == len(PARTS[thing.kind])
-            model.geom_rgba[model.geom(f"{name}_{part}").id] = _DARK if last else layout.rgba(thing)
+            dark = part + 2 >= len(PARTS[thing.kind])
+            model.geom_rgba[model.geom(f"{name}_{part}").id] = _DARK if dark else layout.rgba(thing)
         if thing.kind not in PARTS:
             model.geom_size[geom] = thing.half
             if thing.kind in LOOSE:
