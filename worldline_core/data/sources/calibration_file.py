@@ -12,7 +12,8 @@
 
 Instead of T a view may name a feature of the dataset that holds the pose of each frame: `T_feature: {name: ..., format:
 xyz_rpy_fixed}` (x y z [m], roll pitch yaw [rad] about fixed axes) or `format: matrix` (16 numbers, row by row). Or, of a wrist
-camera, `mount: embodiment`: where the robot's description mounts it, by the measured joints (no T, maps or axes then).
+camera, `mount: embodiment`: where the robot's description mounts it, by the measured joints (no T, maps or axes then); or
+`T_tool_camera: [[...], ...]`: where it is in its tool's frame (OpenCV axes, metres), by the measured joints.
 """
 
 from __future__ import annotations
@@ -45,6 +46,9 @@ class PoseFeature(StrictModel):
     format: Literal["xyz_rpy_fixed", "matrix"]
 
 
+Row = tuple[float, float, float, float]
+
+
 class CameraEntry(StrictModel):
     """One view. `T` is checked for its shape when it is read: it may have thousands of rows."""
 
@@ -56,16 +60,22 @@ class CameraEntry(StrictModel):
     T: list[Any] | None = None
     T_feature: PoseFeature | None = None
     mount: Literal["embodiment"] | None = None
+    T_tool_camera: tuple[Row, Row, Row, Row] | None = None
     distortion: LensConfig | None = None
 
     @model_validator(mode="after")
     def _one_pose(self) -> CameraEntry:
-        if sum(given is not None for given in (self.T, self.T_feature, self.mount)) != 1:
-            raise ValueError("give T, T_feature or mount, one of them")
+        if sum(given is not None for given in (self.T, self.T_feature, self.mount, self.T_tool_camera)) != 1:
+            raise ValueError("give T, T_feature, mount or T_tool_camera, one of them")
         conventions = self.maps is not None, self.axes is not None
-        if any(conventions) if self.mount is not None else not all(conventions):
+        if any(conventions) if self.on_hand else not all(conventions):
             raise ValueError("maps and axes belong to T and T_feature, and to nothing else")
         return self
+
+    @property
+    def on_hand(self) -> bool:
+        """True if the camera is placed by the measured joints."""
+        return self.mount is not None or self.T_tool_camera is not None
 
 
 class CalibrationFile(StrictModel):
@@ -104,14 +114,14 @@ def add_calibrated_view(
     num_frames: int,
     read_feature: Callable[[str], np.ndarray],
     where: str,
-    mounted: Callable[[str], np.ndarray] | None = None,
+    mounted: Callable[[str, CameraEntry], np.ndarray] | None = None,
 ) -> None:
     """Add the camera of a view, and its lens where images still show it; nothing where the dataset's own column holds no
     pose (all zeros: it was never measured).
 
     Args:
         image_size: (height, width) of the recorded video. K follows where only the scale differs.
-        mounted: poses (num_frames, 4, 4) of a wrist camera by its robot's description; None where nothing has joints.
+        mounted: poses (num_frames, 4, 4) of a wrist camera by the measured joints; None where nothing has joints.
 
     Raises: RejectedInputError: missing_calibration (K is of another picture), length_mismatch, invalid_extrinsics,
         missing_column.
@@ -127,10 +137,10 @@ def add_calibrated_view(
             next_step="give K for the recorded image: the sizes do not show what was cropped",
         )
     extrinsics, axes = entry.maps or "camera_to_base", entry.axes or "opencv"
-    if entry.mount is not None:
+    if entry.on_hand:
         if mounted is None:
             raise RejectedInputError("missing_calibration", "A mount needs joints", where=f"{where}, view {view}")
-        matrices = mounted(view)
+        matrices = mounted(view, entry)
     elif entry.T_feature is not None:
         matrices = _feature_poses(entry.T_feature, read_feature, num_frames, f"{where}, view {view}")
         if matrices is None:
@@ -142,15 +152,22 @@ def add_calibrated_view(
     cameras.add(view, K, pose, image_size, None if entry.distortion is None else entry.distortion.distortion)
 
 
-def mounted_camera(embodiment: str, state: np.ndarray, view: str, where: str) -> np.ndarray:
-    """T_base_camera (n, 4, 4) of a wrist camera by its robot's description, from the measured joints (n, j).
+def mounted_camera(embodiment: str, state: np.ndarray, view: str, entry: CameraEntry, where: str) -> np.ndarray:
+    """T_base_camera (n, 4, 4) of a wrist camera, by its robot's description or in its tool's frame, from the measured joints (n, j).
 
-    Raises: RejectedInputError (missing_calibration) where the description is not here, or mounts no camera for the view.
+    Raises: RejectedInputError (missing_calibration) where the description is not here, or has no such arm or camera.
     """
     from worldline_core.geometry.kinematics import ArmKinematics  # needs torch, which configurations do without
 
     try:
-        poses = ArmKinematics(load_embodiment(embodiment)).wrist_camera_poses(state.astype(np.float64))
+        kinematics = ArmKinematics(load_embodiment(embodiment))
+        if entry.T_tool_camera is not None:
+            tools = kinematics.tool_poses(state.astype(np.float64)).numpy()
+            names = [arm.camera_view for arm in kinematics.embodiment.arms]
+            poses = {name: tools[:, i] @ np.array(entry.T_tool_camera) for i, name in enumerate(names)}
+        else:
+            described = kinematics.wrist_camera_poses(state.astype(np.float64))
+            poses = {name: pose.numpy() for name, pose in described.items()}
     except (ConfigError, UnavailableError) as error:
         raise RejectedInputError(
             "missing_calibration", "The robot's description mounts no camera", where=f"{where}, view {view}",
@@ -162,7 +179,7 @@ def mounted_camera(embodiment: str, state: np.ndarray, view: str, where: str) ->
             expected=f"one of {', '.join(poses)}" if poses else f"wrist_camera in {embodiment}.yaml", got=view,
             next_step="give T or T_feature, or add wrist_camera to the embodiment (docs/embodiments.md)",
         )  # fmt: skip
-    return poses[view].numpy()
+    return poses[view]
 
 
 def _matrices(listed: list[Any], num_frames: int, where: str) -> np.ndarray:

@@ -558,7 +558,9 @@ class LeRobotSource:
                 num_frames=length,
                 read_feature=lambda feature: self._dataset.column(index, feature),
                 where=where,
-                mounted=lambda view: mounted_camera(self._config.embodiment, self._read_columns(index)[0], view, where),
+                mounted=lambda view, entry: mounted_camera(
+                    self._config.embodiment, self._read_columns(index)[0], view, entry, where
+                ),
             )
         return cameras
 
