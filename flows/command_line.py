@@ -162,6 +162,24 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     )
     check.add_argument("--json", action="store_true", help="print JSON instead of the table")
     check.set_defaults(run=_calibrate_check)
+    estimate = actions.add_parser(
+        "estimate",
+        help="estimate the cameras that nobody measured, from the recorded episodes alone",
+        description="Estimate the cameras of a source: of the views that have none, or of those named. Exit status: 0 all"
+        " are sure, 1 at least one is not, 2 wrong usage.",
+    )
+    estimate.add_argument("config", type=Path, metavar="SOURCE_CONFIG.yaml", help="a file with a curate section")
+    estimate.add_argument(
+        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value of the file"
+    )
+    estimate.add_argument("--view", action="append", default=[], dest="views", help="only this one (repeatable)")
+    estimate.add_argument(
+        "--output",
+        type=Path,
+        help="where cameras.json and pictures go (default: artifacts/calibration/<name>_estimate)",
+    )
+    estimate.add_argument("--json", action="store_true", help="print JSON instead of lines")
+    estimate.set_defaults(run=_calibrate_estimate)
 
 
 def _checked_preset(arguments: argparse.Namespace, *, weights: bool = False) -> str | None:
@@ -313,6 +331,27 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
         raise SystemExit(2) from error
     print(json.dumps(as_json(found), indent=1) if arguments.json else table_text(found))
     raise SystemExit(0 if found.consistent else 1)
+
+
+def _calibrate_estimate(arguments: argparse.Namespace) -> None:
+    import json
+    import sys
+
+    from worldline_core.errors import WorldLineError
+
+    try:
+        from worldline_core.calibration.estimate.estimate import estimate_command
+        from worldline_core.calibration.estimate.estimate_report import as_json, estimate_text
+
+        found = estimate_command(
+            arguments.config, overrides=arguments.overrides, views=arguments.views, output=arguments.output
+        )
+    except WorldLineError as error:
+        # 1 says that a camera is not sure; what cannot be estimated at all is another status.
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+    print(json.dumps(as_json(found), indent=1) if arguments.json else estimate_text(found))
+    raise SystemExit(0 if found.sure else 1)
 
 
 def _embodiment_list(_arguments: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ Axis legend: n steps, r c rows and columns of cells, m cells in one row, p point
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -52,6 +53,7 @@ LEAST_INFORMATION = 1e-20
 """A parameter that a resting camera cannot show is bounded by its prior alone."""
 _STEPS = np.array([0.01] * 3 + [0.0] * 3 + [0.02, 0.25])
 """Differences by which a wrist view's slopes are measured; its camera's place on the hand hardly shows."""
+_STEPS_AND_PLACE = _STEPS + np.array([0.0] * 3 + [0.005] * 3 + [0.0, 0.0])
 HAND_REACH_M = 0.2
 BLURS_FAR, BLURS = (2.5, 2.5, 1.2, 1.2, 0.7, 0.7), (0.7, 0.7)
 """Blur of the maps in cells, one solution after another: from far away, and near."""
@@ -217,13 +219,35 @@ def moved_camera(camera: CameraTrack, theta: np.ndarray) -> CameraTrack:
 class StillView:
     """A fixed view: the measured motion of the arms, compared with the predicted one."""
 
-    def __init__(self, camera: CameraTrack, points: np.ndarray, radii: np.ndarray, motion: Motion) -> None:
-        """points: (n + 1, p, 3), radii: (p,) [m]; motion of the n steps."""
+    def __init__(
+        self,
+        camera: CameraTrack,
+        points: np.ndarray,
+        radii: np.ndarray,
+        motion: Motion,
+        certainty: np.ndarray | None = None,
+    ) -> None:
+        """points: (n + 1, p, 3), radii: (p,) [m]; motion of the n steps, and how far its flow is trusted (n, r, c), 0 to 1."""
         self.camera, self.points, self.radii = camera, points, radii
+        self.certainty = certainty
         change = np.log1p(np.maximum(motion.change - NOISE_CHANGE, 0.0))
         self.measured = np.concatenate([motion.flow, change[..., None]], axis=-1).astype(np.float32)
         self._by_blur: dict[float, np.ndarray] = {}
         self._maps: dict[bytes, tuple[np.ndarray, ...]] = {}
+
+    def at(self, camera: CameraTrack) -> StillView:
+        """The same measured motion, compared with what another camera predicts."""
+        other = copy(self)
+        other.camera, other._maps = camera, {}
+        return other
+
+    def mirrored(self) -> StillView:
+        """The same robot before pictures with left and right exchanged."""
+        other = copy(self)
+        other.measured = self.measured[:, :, ::-1] * np.array([-1.0, 1.0, 1.0], np.float32)
+        other.certainty = None if self.certainty is None else self.certainty[:, :, ::-1]
+        other._by_blur, other._maps = {}, {}
+        return other
 
     def equations(self, theta: np.ndarray, blur: float) -> Equations:
         """Normal equations at `theta`, on maps with this blur [cells]."""
@@ -239,19 +263,20 @@ class StillView:
         columns = np.arange(size)
         information, gradient, likelihood = np.zeros((size + 2, size + 2)), np.zeros(size + 2), 0.0
         for gain_index, channels in ((size, (0, 1)), (size + 1, (2,))):
-            predicted, seen = value[..., channels], measured[..., channels]
+            trust = np.ones(1, np.float32) if self.certainty is None or channels == (2,) else np.sqrt(self.certainty)
+            predicted, seen = (trust[..., None] * each[..., channels] for each in (value, measured))
             gain = max(float((predicted * seen).sum()) / max(float((predicted**2).sum()), 1e-9), 0.05)
-            error = seen - gain * predicted
-            weight = 1.0 / max(float((error**2).sum()) / max(int(active.sum()), 1), 1e-9)
+            error, cells = seen - gain * predicted, float((trust**2 * active).sum())
+            weight = 1.0 / max(float((error**2).sum()) / max(cells, 1.0), 1e-9)
             left_open = float((error**2).sum()) / max(float((seen**2).sum()), 1e-9)
-            likelihood -= len(channels) * int(active.sum()) / 2 * np.log(max(left_open, 1e-9))
+            likelihood -= len(channels) * cells / 2 * np.log(max(left_open, 1e-9))
             for c, channel in enumerate(channels):
                 slope = -gain * (
                     across[..., channel, None] * shift[..., 0, :] + down[..., channel, None] * shift[..., 1, :]
                 )
                 if channel < 2:
                     slope[..., :-1] += gain * cover[..., None] * growth[..., channel, :]
-                slope = slope.reshape(-1, len(columns))
+                slope = (trust[..., None] * slope).reshape(-1, len(columns))
                 scaled = gain * predicted[..., c].reshape(-1)
                 residual = error[..., c].reshape(-1)
                 information[np.ix_(columns, columns)] += weight * (slope.T @ slope)
@@ -264,9 +289,21 @@ class StillView:
         samples = SAMPLE_CELLS_STILL
         return _without_nuisance(Equations(information / samples, gradient / samples, likelihood / samples))
 
+    def agreement(self, lag: float, blur: float) -> np.ndarray:
+        """(3,) sums over all cells and steps: predicted times measured flow, predicted squared, measured squared."""
+        theta = np.zeros(PARAMETERS)
+        theta[LAG] = lag
+        value = self._predicted(theta)[0]
+        if blur not in self._by_blur:
+            self._by_blur[blur] = _blurred(self.measured, blur)
+        seen, value = self._by_blur[blur][..., :2], _blurred(value, blur)[..., :2]
+        if self.certainty is not None:
+            seen, value = (np.sqrt(self.certainty)[..., None] * each for each in (seen, value))
+        return np.array([(value * seen).sum(), (value**2).sum(), (seen**2).sum()], dtype=np.float64)
+
     def shown(self, theta: np.ndarray) -> np.ndarray:
         """(2, k) mean displacement of the robot in the picture by each parameter [% of the width]; none by the lag."""
-        _, _, ahead, slope = _projected(self.points, moved_camera(self.camera, theta))
+        _, _, ahead, slope = projected(self.points, moved_camera(self.camera, theta))
         mean = slope[ahead].mean(axis=0) if ahead.any() else np.zeros((2, LAG))
         return 100 / self.camera.width * np.c_[mean, np.zeros(2)]
 
@@ -274,8 +311,8 @@ class StillView:
         """Maps in cells: motion (n, r, c, 3), shift by each of k parameters and the links' thickness
         (n, r, c, 2, k + 1) [cells], growth of the step by each parameter (n, r, c, 2, k) [px], cover (n, r, c)."""
         camera = moved_camera(self.camera, theta)
-        uv, depth, ahead, slope = _projected(self.points, camera)
-        uv = _delayed(uv, float(theta[LAG]))
+        uv, depth, ahead, slope = projected(self.points, camera)
+        uv = delayed(uv, float(theta[LAG]))
         step = np.diff(uv, axis=0)
         length = lengths(step)
         alive = ahead[1:] & ahead[:-1] & (length > STILL_STEP_PX)
@@ -331,7 +368,7 @@ class StillView:
         return value, shift, growth, cover
 
 
-def _projected(points: np.ndarray, camera: CameraTrack) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def projected(points: np.ndarray, camera: CameraTrack) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Pixels (n, p, 2), depth and visibility (n, p), and the pixels' derivatives by the camera's parameters (n, p, 2, k - 1)."""
     pose, K = camera.T_base_camera[0], camera.K
     seen = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -345,7 +382,7 @@ def _projected(points: np.ndarray, camera: CameraTrack) -> tuple[np.ndarray, np.
     return uv, depth, ahead, np.stack([np.stack(u, axis=-1), np.stack(v, axis=-1)], axis=-2)
 
 
-def _delayed(values: np.ndarray, frames: float) -> np.ndarray:
+def delayed(values: np.ndarray, frames: float) -> np.ndarray:
     """A series (n, ...) delayed by this many frames, constant before its start and after its end."""
     if frames == 0.0:
         return values
@@ -384,7 +421,7 @@ class WristView:
         self, camera: CameraTrack, gray: np.ndarray, motion: Motion, hand: np.ndarray, radii: np.ndarray
     ) -> None:
         """camera of n + 1 poses, gray (n + 1, h, w), motion of the n steps; hand (n + 1, p, 3), radii (p,) [m]."""
-        self.camera = camera
+        self.camera, self.differences = camera, _STEPS
         self._steps: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         shows = (motion.texture > MIN_TEXTURE) & (motion.change > MIN_CHANGE)
         shows &= ~_covered(camera, hand, radii, shows.shape)
@@ -402,27 +439,49 @@ class WristView:
         error_px = FLOW_ERROR_PX + FLOW_ERROR_SHARE * lengths(self.flow)
         self.certainty = sharp.astype(np.float64) / error_px[:, None, None] ** 2
 
-    def equations(self, theta: np.ndarray, blur: float) -> Equations:
-        """Normal equations at `theta`; flow is not blurred."""
-        del blur
-        columns = np.flatnonzero(_STEPS)
-        information, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    def at(self, camera: CameraTrack) -> WristView:
+        """The same cells, compared with the flow that another camera predicts; its place on the hand is a parameter, too."""
+        other = copy(self)
+        other.camera, other._steps, other.differences = camera, {}, _STEPS_AND_PLACE
+        return other
+
+    def agreement(self, lag: float) -> np.ndarray:
+        """(2,) sums over all cells of the logarithms of errors: with the predicted flow, and with none."""
         if len(self.step) < MIN_CELLS:
-            return Equations(information, gradient, 0.0)
+            return np.zeros(2)
+        theta = np.zeros(PARAMETERS)
+        theta[LAG] = lag
         seen = self._seen(theta)
+        left = self._errors(seen, self._depth(seen))[3]
+        none = (self.flow * (self.certainty @ self.flow[..., None])[..., 0]).sum(-1)
+        return np.array([self.share @ np.log1p(left), self.share @ np.log1p(none)])
+
+    def _depth(self, seen: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """(m,) inverse depths that explain the flow best, a plane in each step."""
         depth = np.full(len(self.step), DEPTH_START_PER_M)
         for _ in range(2):
             error, by_depth, weight, _ = self._errors(seen, depth)
             fitted = self._per_step(by_depth, weight, error[..., None])[1]
             depth = np.clip(depth + (self.plane * fitted[self._of, :, 0]).sum(-1), 0.0, MOST_PER_M)
+        return depth
+
+    def equations(self, theta: np.ndarray, blur: float) -> Equations:
+        """Normal equations at `theta`; flow is not blurred."""
+        del blur
+        columns = np.flatnonzero(self.differences)
+        information, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+        if len(self.step) < MIN_CELLS:
+            return Equations(information, gradient, 0.0)
+        seen = self._seen(theta)
+        depth = self._depth(seen)
         error, by_depth, weight, distance = self._errors(seen, depth)
         both = np.empty((*self.flow.shape, len(columns) + 1))
         both[..., -1] = error
         now = self._flow(seen, depth)
         for column, i in enumerate(columns):
             changed = theta.copy()
-            changed[i] += _STEPS[i]
-            both[..., column] = (self._flow(self._seen(changed), depth) - now) / _STEPS[i]
+            changed[i] += self.differences[i]
+            both[..., column] = (self._flow(self._seen(changed), depth) - now) / self.differences[i]
         cross, fitted = self._per_step(by_depth, weight, both)
         found = np.tensordot(both, weight @ both, ((0, 1), (0, 1)))
         found -= np.tensordot(cross, fitted, ((0, 1), (0, 1)))
@@ -474,8 +533,8 @@ def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.nda
     from scipy.spatial.transform import Rotation  # slow to import
 
     vectors = Rotation.from_matrix(relative[:, :3, :3]).as_rotvec()  # a loop over OpenCV's took a sixth of a diagnosis
-    turns = Rotation.from_rotvec(_delayed(vectors, frames)).as_matrix()
-    return turns, _delayed(relative[:, :3, 3], frames)
+    turns = Rotation.from_rotvec(delayed(vectors, frames)).as_matrix()
+    return turns, delayed(relative[:, :3, 3], frames)
 
 
 def _covered(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -142,7 +142,7 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName) 
         check_times(episode)
         for camera in episode.cameras.values():
             check_camera(episode, camera)
-        frames = {view: _images(loaded, view) for view in loaded.views}
+        frames = {view: episode_images(loaded, view) for view in loaded.views}
         arms, note = _kinematics_of(episode, kinematics)
         notes = (note,) if note else ()
         diagnosis = diagnose(episode, frames, arms)
@@ -171,7 +171,7 @@ def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmK
     return None, f"without kinematics of {episode.embodiment}: it has other arms than the recording"
 
 
-def _images(loaded: LoadedEpisode, view: str) -> MadeFrames:
+def episode_images(loaded: LoadedEpisode, view: str) -> MadeFrames:
     """A view's pictures, read anew by each iteration: an episode may be too long for memory."""
     expected = loaded.episode.num_video_frames
 

@@ -170,13 +170,15 @@ def cell_means(values: np.ndarray) -> np.ndarray:
     return rows.reshape(n, r, c, CELL_PX, *values.shape[3:]).sum(axis=3) / np.float32(CELL_PX**2)
 
 
-def measured_motion(gray: np.ndarray) -> Motion:
-    """Image motion of a view's small grey images (n, h, w)."""
+def measured_motion(gray: np.ndarray, *, exact: bool = False) -> Motion:
+    """Image motion of a view's small grey images (n, h, w); `exact` takes three times as long."""
     if len(gray) < 2:
         empty = np.zeros((0, gray.shape[1] // CELL_PX, gray.shape[2] // CELL_PX), dtype=np.float32)
         return Motion(np.zeros((*empty.shape, 2), dtype=np.float32), empty, empty)
-    engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-    engine.setFinestScale(1)
+    engine = cv2.DISOpticalFlow.create(
+        cv2.DISOPTICAL_FLOW_PRESET_FAST if exact else cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST
+    )
+    engine.setFinestScale(0 if exact else 1)
     parts: list[tuple[np.ndarray, ...]] = []
     # Cells alone are kept of an episode: flow of every pixel of some minutes would fill gigabytes.
     for begin in range(0, len(gray) - 1, _STEPS_AT_ONCE):
@@ -197,13 +199,7 @@ def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ..
         count = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
         names = {1: ("right",), 2: ("left", "right")}.get(count, tuple(f"arm_{i}" for i in range(count)))
         return tuple(Arm(name, f"{name}_wrist", None) for name in names)
-    arms = []
-    for arm in kinematics.embodiment.arms:
-        mount, camera = None, arm.wrist_camera
-        if camera is not None and camera.link == arm.end_effector_link:
-            T_tool_link = np.linalg.inv(arm.T_link_tool.matrix())
-            mount = T_tool_link @ np.asarray(camera.T_link_camera, dtype=np.float64)
-        arms.append(Arm(arm.name, arm.camera_view, mount))
+    arms = arms_of_embodiment(kinematics)
     if episode.T_base_ee is not None and episode.T_base_ee.shape[1] != len(arms):
         raise DataError(
             "Recorded tool poses and embodiment differ in the number of arms",
@@ -211,6 +207,18 @@ def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ..
             expected=f"{len(arms)} arms",
             got=f"{episode.T_base_ee.shape[1]} tool poses per frame",
         )
+    return arms
+
+
+def arms_of_embodiment(kinematics: ArmKinematics) -> tuple[Arm, ...]:
+    """The arms of a robot, and where its description mounts their cameras."""
+    arms = []
+    for arm in kinematics.embodiment.arms:
+        mount, camera = None, arm.wrist_camera
+        if camera is not None and camera.link == arm.end_effector_link:
+            T_tool_link = np.linalg.inv(arm.T_link_tool.matrix())
+            mount = T_tool_link @ np.asarray(camera.T_link_camera, dtype=np.float64)
+        arms.append(Arm(arm.name, arm.camera_view, mount))
     return tuple(arms)
 
 

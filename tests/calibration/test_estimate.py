@@ -1,0 +1,111 @@
+"""Cameras estimated from recorded episodes alone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import calibration as benchmark
+from worldline_core.calibration.camera_errors import moved_camera
+from worldline_core.calibration.estimate import recordings
+from worldline_core.calibration.estimate.camera_file import camera_file
+from worldline_core.calibration.estimate.estimate import estimate_views
+from worldline_core.calibration.estimate.recordings import recorded_views
+from worldline_core.calibration.estimate.refine import fit_still
+from worldline_core.calibration.estimate.still_camera import agreement, tools_apart
+from worldline_core.calibration.estimate.verdict import ViewEstimate, full_size
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.recorded_poses import RecordedCameras
+from worldline_core.data.sources.calibration_file import add_calibrated_view, mounted_camera, read_calibration
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+
+Loaded = list[tuple[Episode, dict[str, np.ndarray]]]
+BANKS = benchmark.RECORDINGS.parent / "banks"
+
+
+@pytest.fixture(scope="module")
+def bank() -> Loaded:
+    """Six attempts of one body before one camera."""
+    found = EpisodeSet.open(BANKS)
+    chosen = [i for i, row in enumerate(found.rows) if row.bank == "bank_carry_ur5e"][:24:4]
+    return [(found.episode(i), {"head": found.frames(i, "head")}) for i in chosen]
+
+
+@pytest.fixture(scope="module")
+def kinematics(bank: Loaded) -> ArmKinematics:
+    return ArmKinematics(load_embodiment(bank[0][0].embodiment))
+
+
+def test_a_camera_is_made_exact_from_a_start_nearby(bank: Loaded, kinematics: ArmKinematics) -> None:
+    recorded = recorded_views(iter(bank[:2]), kinematics, 2)["head"]
+    views = recorded.still_views(fine=False)
+    size = views[0].camera
+    true = bank[0][0].cameras["head"].resized(size.width, size.height)
+    start = moved_camera(true, np.array([0.05, -0.06, 0.04, 0.03, 0.05, 0.05, 0.1, 0.0]))
+    fitted = fit_still(views, start, 0.5, (2.5, 1.2), 6)
+    assert tools_apart(start, true, recorded) > 0.06
+    assert tools_apart(fitted.camera, true, recorded) < 0.03
+    assert abs(fitted.lag) < 0.2
+    assert min(agreement(view, fitted) for view in views) > 0.6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("spoil", "reason"), [
+    ("nothing", ""), ("mirrored", "mirrored"), ("other states", "not the robot"), ("moved half way", "stands elsewhere"),
+])  # fmt: skip
+def test_a_still_camera_is_found_and_a_bad_set_is_named(
+    bank: Loaded, kinematics: ArmKinematics, spoil: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recordings, "MOST_FRAMES", 17 * len(bank))
+    (found,) = estimate_views(iter(benchmark.SPOILED[spoil](bank)), kinematics, len(bank))
+    assert found.verdict == ("unsure" if reason else "sure"), found.reasons
+    assert any(reason in each for each in (*found.reasons, ""))
+    if not reason:
+        tools = np.concatenate([kinematics.tool_poses(e.state.astype(np.float64)).numpy() for e, _ in bank])
+        assert found.camera is not None
+        assert benchmark.estimate_errors(found, bank[0][0].cameras["head"], tools, None)["tool"] < 3
+
+
+def test_what_cannot_be_estimated_is_named(bank: Loaded, kinematics: ArmKinematics) -> None:
+    for episodes, reason in ((bank[:2], "2 episodes"), (benchmark.SPOILED["still"](bank), "not enough motion")):
+        (found,) = estimate_views(iter(episodes), kinematics, len(episodes))
+        assert found.camera is None and reason in found.reasons[0]
+    arms = [arm.model_copy(update={"wrist_camera": None}) for arm in kinematics.embodiment.arms]
+    bare = ArmKinematics(kinematics.embodiment.model_copy(update={"arms": tuple(arms)}))
+    wrist = [(episode, {"left_wrist": frames["head"]}) for episode, frames in bank[:3]]
+    (found,) = estimate_views(iter(wrist), bare, 3)
+    assert found.camera is None and "wrist_camera" in found.reasons[0]
+
+
+def test_sure_cameras_are_read_back_as_a_calibration_file(
+    tmp_path: Path, bank: Loaded, kinematics: ArmKinematics
+) -> None:
+    episode = bank[0][0]
+    K = np.array([[90.0, 0, 47.5], [0, 90.0, 31.5], [0, 0, 1]])
+    pose = np.array([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, -0.1], [0, 0, 0, 1.0]])
+    camera = CameraTrack("left_wrist", K, pose[None], 96, 64)
+    sure = [
+        ViewEstimate("left_wrist", wrist=True, verdict="sure", camera=full_size(camera, (128, 192))),
+        ViewEstimate("head", wrist=False, verdict="sure", camera=replace(camera, view="head")),
+        ViewEstimate("right_wrist", wrist=True, verdict="unsure", camera=camera),
+    ]
+    (tmp_path / "cameras.json").write_text(json.dumps(camera_file(sure)))
+    views = read_calibration(tmp_path / "cameras.json").views
+    assert views.keys() == {"left_wrist", "head"}
+    cameras = RecordedCameras()
+    for view, entry in views.items():
+        add_calibrated_view(
+            cameras, view, entry, image_size=(128, 192), num_frames=episode.num_frames,
+            read_feature=lambda _: np.empty(0), where="here",
+            mounted=lambda view, entry: mounted_camera(episode.embodiment, episode.state, view, entry, "here"),
+        )  # fmt: skip
+    tools = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()[:, 0]
+    assert np.allclose(cameras.tracks["left_wrist"].T_base_camera, tools @ pose, atol=1e-5)
+    assert np.allclose(cameras.tracks["head"].T_base_camera, pose[None])
+    assert np.allclose(cameras.tracks["head"].K[:2, 2], (95.5, 63.5))

@@ -1,0 +1,137 @@
+"""`worldline calibrate estimate`: the cameras of a source from its recorded episodes alone.
+
+Writes `cameras.json` (the cameras that are sure, as a calibration file), `estimate.json`, `index.html` and a picture of each
+view into one folder. Nothing is changed in the source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from worldline_core.calibration.check import OUTPUT_ROOT, ListedEpisode, episode_images, episodes_of_config
+from worldline_core.calibration.estimate.camera_file import camera_file
+from worldline_core.calibration.estimate.estimate_report import as_json, page, view_picture
+from worldline_core.calibration.estimate.recordings import RecordedView, recorded_views
+from worldline_core.calibration.estimate.still_camera import estimate_still
+from worldline_core.calibration.estimate.verdict import ViewEstimate, judge_still, judge_wrist, too_few, too_little
+from worldline_core.calibration.estimate.wrist_camera import estimate_wrist
+from worldline_core.calibration.observation import arms_of_embodiment
+from worldline_core.data.curation.episode_checks import check_values
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.errors import DataError
+from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
+from worldline_core.pictures import evenly_spaced, jpeg_bytes
+from worldline_core.progress import Progress
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+
+MOST_EPISODES = 20
+"""More say little that these do not."""
+PICTURES = 3
+
+
+@dataclass(frozen=True)
+class SourceEstimate:
+    """The estimated cameras of a source, and the folder that they were written to; `cameras` is None where none is sure."""
+
+    source: str
+    views: tuple[ViewEstimate, ...]
+    output: Path
+    cameras: Path | None
+
+    @property
+    def sure(self) -> bool:
+        return all(view.verdict == "sure" for view in self.views)
+
+
+def estimate_views(
+    loaded: Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]], kinematics: ArmKinematics, count: int
+) -> list[ViewEstimate]:
+    """The camera of every view of about `count` episodes, by the images by view (gone through once) and the states alone.
+
+    Raises: DataError as `recorded_views`.
+    """
+    return [_estimate(view, kinematics) for view in recorded_views(loaded, kinematics, count).values()]
+
+
+def _estimate(recorded: RecordedView, kinematics: ArmKinematics) -> ViewEstimate:
+    arms = {arm.wrist_view: (i, arm.T_tool_mount) for i, arm in enumerate(arms_of_embodiment(kinematics))}
+    arm, mount = arms.get(recorded.view, (None, None))
+    reason = too_few(recorded)
+    if reason is None and arm is None:
+        reason = too_little(recorded)
+    elif reason is None and mount is None:
+        reason = "the robot's description mounts no camera here: add about where (`wrist_camera`, docs/embodiments.md)"
+    if reason is not None:
+        count = len(recorded.episodes)
+        return ViewEstimate(recorded.view, arm is not None, "unsure", None, reasons=(reason,), episodes=count)
+    if arm is not None and mount is not None:
+        return judge_wrist(recorded, estimate_wrist(recorded, arm, mount))
+    return judge_still(recorded, estimate_still(recorded))
+
+
+def estimate_command(
+    config: Path, *, overrides: Sequence[str] = (), views: Sequence[str] = (), output: Path | None = None
+) -> SourceEstimate:
+    """Estimate the cameras of a configuration's source: of `views`, or of those that have none (all where all have one).
+
+    Raises:
+        ConfigError: the file has a mistake, or configures several sources.
+        DataError: the source cannot be opened, has no such view, or an episode cannot be read.
+    """
+    listed, descriptions = episodes_of_config(config, overrides)
+    sources = {item.source for item in listed}
+    if len(sources) != 1:
+        raise DataError(
+            "Cameras are estimated of one source", where=config, expected="one source with episodes",
+            got=", ".join(sorted(sources)) or "none", next_step="--set 'curate.sources=[...]' with one of them",
+        )  # fmt: skip
+    chosen = [listed[i] for i in evenly_spaced(len(listed), MOST_EPISODES)]
+    first = chosen[0].load()
+    if unknown := set(views) - set(first.views):
+        raise DataError("No such view", expected=", ".join(first.views), got=", ".join(sorted(unknown)))
+    wanted = tuple(views) or tuple(v for v in first.views if v not in first.episode.cameras) or first.views
+    kinematics = KinematicsByName(descriptions).get(first.episode.embodiment)
+
+    def loaded() -> Iterator[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]]:
+        with Progress("calibrate estimate: reading", len(chosen), "episode") as progress:
+            for item in chosen:
+                found = item.load()
+                check_values(found.episode)
+                yield found.episode, {view: episode_images(found, view) for view in wanted if view in found.views}
+                progress.advance()
+
+    estimates = estimate_views(loaded(), kinematics, len(chosen))
+    folder = output or OUTPUT_ROOT / f"{config.stem}_estimate"
+    pictures = dict(_pictures(estimates, chosen, kinematics, folder))
+    cameras = folder / "cameras.json" if any(each.verdict == "sure" for each in estimates) else None
+    found = SourceEstimate(next(iter(sources)), tuple(estimates), folder, cameras)
+    if cameras is not None:
+        write_json_atomic(cameras, camera_file(estimates))
+    write_json_atomic(folder / "estimate.json", as_json(found))
+    write_bytes_atomic(folder / "index.html", page(found, pictures).encode())
+    return found
+
+
+def _pictures(
+    estimates: Sequence[ViewEstimate], chosen: Sequence[ListedEpisode], kinematics: ArmKinematics, folder: Path
+) -> Iterator[tuple[str, str]]:
+    """Writes a picture of each view that has a camera; yields the view and the picture's name in the folder."""
+    for estimate in estimates:
+        if estimate.camera is None:
+            continue
+        shown: list[tuple[Episode, int, np.ndarray]] = []
+        for number in evenly_spaced(len(chosen), PICTURES):
+            found = chosen[number].load()
+            if estimate.view in found.views:
+                middle = found.episode.num_video_frames // 2
+                image = next(islice(found.each_image(estimate.view), middle, None))
+                shown.append((found.episode, middle, image))
+        name = f"{safe_stem(estimate.view)}.jpg"
+        write_bytes_atomic(folder / name, jpeg_bytes(view_picture(estimate, shown, kinematics)))
+        yield estimate.view, name

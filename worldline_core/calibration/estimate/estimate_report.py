@@ -1,0 +1,131 @@
+"""Results of an estimate: lines for the terminal, JSON, and a page with a picture of each view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip
+from worldline_core.calibration.check_report import SIGMA_PX_REF, TILE_HEIGHT, recorded_tracks
+from worldline_core.pages.page import render
+from worldline_core.pictures import Picture, SheetRow, contact_sheet, draw_tag, scale_frames, scaled_size
+
+if TYPE_CHECKING:
+    from worldline_core.calibration.estimate.estimate import SourceEstimate
+    from worldline_core.calibration.estimate.verdict import ViewEstimate
+    from worldline_core.data.episodes.episode import Episode
+    from worldline_core.geometry.kinematics import ArmKinematics
+
+
+def headline(estimate: ViewEstimate) -> str:
+    """The result of one view in one line."""
+    camera = estimate.camera
+    if camera is None:
+        return f"{estimate.view}: no camera"
+    place = ", ".join(f"{value:.3f}" for value in camera.T_base_camera[0, :3, 3])
+    where = f"at {place} m in the tool's frame" if estimate.wrist else f"at {place} m"
+    return (
+        f"{estimate.view}: {estimate.verdict}, focal length {camera.K[0, 0]:.0f} px of {camera.width}, {where},"
+        f" lag {estimate.lag_frames:+.1f} frames, agreement {estimate.agreement:.2f}"
+    )
+
+
+def interval_text(estimate: ViewEstimate) -> str:
+    """The 95 % intervals in one line."""
+    return ", ".join(f"{each.kind} ± {each.half_interval:.1f} {each.unit}" for each in estimate.intervals)
+
+
+def estimate_text(found: SourceEstimate) -> str:
+    """The lines for the terminal."""
+    lines = [f"source {found.source}"]
+    for each in found.views:
+        lines += ["", headline(each)]
+        lines += [f"  95 %: {interval_text(each)}"] if each.intervals else []
+        lines += [f"  not sure: {reason}" for reason in each.reasons]
+        if each.rival_agreement is not None:
+            lines.append(f"  the best camera elsewhere agrees by {each.rival_agreement:.2f}")
+        lines += [f"  note: {note}" for note in each.notes]
+        if each.verdict == "sure" and abs(each.lag_frames) >= 0.75:
+            lag = f"{{image_lag_frames: {round(each.lag_frames)}, views: [{each.view}]}}"
+            lines.append(f"  in the configuration of this source: conventions: {lag}")
+    lines += ["", f"pictures: {found.output / 'index.html'}"]
+    if found.cameras is not None:
+        lines.append(f"cameras: {found.cameras}")
+        lines.append("next: copy it into the dataset's folder, add `calibration: cameras.json` to the source, and run")
+        lines.append("  worldline calibrate check on the same configuration")
+    return "\n".join(lines)
+
+
+def as_json(found: SourceEstimate) -> dict[str, Any]:
+    """Everything in plain values."""
+    return {
+        "source": found.source,
+        "sure": found.sure,
+        "cameras": None if found.cameras is None else found.cameras.name,
+        "views": [_view_json(each) for each in found.views],
+    }
+
+
+def _view_json(each: ViewEstimate) -> dict[str, Any]:
+    camera, rival = each.camera, each.rival
+    return {
+        "view": each.view,
+        "verdict": each.verdict,
+        "wrist": each.wrist,
+        "K": None if camera is None else camera.K.tolist(),
+        "T_tool_camera" if each.wrist else "T_base_camera": None
+        if camera is None
+        else camera.T_base_camera[0].tolist(),
+        "lag_frames": each.lag_frames,
+        "intervals_95": {k.kind: {"half": k.half_interval, "unit": k.unit} for k in each.intervals},
+        "agreement": each.agreement,
+        "rival": None if rival is None else {"K": rival.K.tolist(), "T_base_camera": rival.T_base_camera[0].tolist()},
+        "rival_agreement": each.rival_agreement,
+        "reasons": each.reasons,
+        "notes": each.notes,
+        "moved_at": each.moved_at,
+        "episodes": each.episodes,
+    }
+
+
+def view_picture(
+    estimate: ViewEstimate, shown: Sequence[tuple[Episode, int, np.ndarray]], kinematics: ArmKinematics
+) -> Picture:
+    """Frames of some episodes; above as recorded, below with the robot where the estimated camera puts it."""
+    camera, style = estimate.camera, OverlayStyle(SIGMA_PX_REF, heat=0.5, outline=True)
+    before, after = [], []
+    arms: Sequence[str] = ()
+    for episode, n, image in shown:
+        size = scaled_size(image.shape[0], image.shape[1], TILE_HEIGHT)
+        recorded = episode.cameras.get(estimate.view)
+        tile = scale_frames(image[None], size)[0]
+        if recorded is not None:
+            tile = draw_overlay(
+                image, recorded_tracks(episode, estimate.view, kinematics), n, estimate.view,
+                tile_height=TILE_HEIGHT, style=style,
+            )  # fmt: skip
+        before.append(draw_tag(tile, f"{episode.episode_id} frame {n}", size_px=11))
+        if camera is not None:
+            tracks = recorded_tracks(replace(episode, cameras={estimate.view: camera}), estimate.view, kinematics)
+            arms = tracks.arms
+            tile = draw_overlay(image, tracks, n, estimate.view, tile_height=TILE_HEIGHT, style=style)
+        after.append(tile)
+    rows = [SheetRow("recorded", np.stack(before)), SheetRow("estimated", np.stack(after))]
+    body = contact_sheet(rows, tile_height=TILE_HEIGHT, title=headline(estimate))
+    return np.concatenate([body, legend_strip(arms, body.shape[1], outline=True)])
+
+
+def page(found: SourceEstimate, pictures: Mapping[str, str]) -> str:
+    """The page: each view with its camera, its intervals, the reasons against it and its picture."""
+    return render(
+        "calibration/estimate_page.html",
+        title="Estimated cameras",
+        subtitle=f"{found.source}: what the recorded episodes show of their cameras.",
+        found=found,
+        pictures=pictures,
+        headline=headline,
+        intervals=interval_text,
+    )

@@ -1,0 +1,165 @@
+"""What the estimate needs of a set of episodes: thinned grey pictures of one view, and where the robot was meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import islice
+
+import cv2
+import numpy as np
+
+from worldline_core.calibration.camera_errors import ESTIMATED_AT_HZ, StillView, delayed
+from worldline_core.calibration.estimate.camera_search import MotionOfSteps
+from worldline_core.calibration.observation import GRAY_WIDTH, Motion, measured_motion, observe, read
+from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.errors import DataError
+from worldline_core.geometry.kinematics import ArmKinematics
+
+FINE_WIDTH = 2 * GRAY_WIDTH
+CHANGE_FROM, TEXTURE_FROM, SURE_ABOVE, LEAST_TRUST = 2.0, 2.0, 6.0, 0.15
+"""Grey levels; and the trust in flow where nothing is to be seen."""
+MOST_FRAMES, FEWEST_FRAMES = 800, 9
+"""Pictures of a view that are used of all episodes together, and fewer of one episode tell nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewOfEpisode:
+    """One view of one episode, thinned: grey pictures (n, h, FINE_WIDTH), and of the robot points (n, p, 3) with radii (p,)
+    [m], tool poses (n, a, 4, 4) and gripper openings (n, a), None where the state has none."""
+
+    episode_id: str
+    gray: np.ndarray
+    points: np.ndarray
+    radii: np.ndarray
+    tools: np.ndarray
+    gripper: np.ndarray | None
+
+    @cached_property
+    def fine(self) -> Motion:
+        return measured_motion(self.gray, exact=True)
+
+    @cached_property
+    def rough_gray(self) -> np.ndarray:
+        """(n, h, GRAY_WIDTH)."""
+        height = max(2, round(self.gray.shape[1] * GRAY_WIDTH / self.gray.shape[2]))
+        return np.stack([cv2.resize(g, (GRAY_WIDTH, height), interpolation=cv2.INTER_AREA) for g in self.gray])
+
+    @cached_property
+    def rough(self) -> Motion:
+        return measured_motion(self.rough_gray)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedView:
+    """One view of all episodes; frames lie `frame_s` seconds (`every` recorded frames) apart.
+
+    Attributes:
+        image_size: (height, width) of the recorded pictures.
+        surfaces: whether the points lie on the links' surfaces.
+    """
+
+    view: str
+    image_size: tuple[int, int]
+    every: int
+    frame_s: float
+    surfaces: bool
+    episodes: tuple[ViewOfEpisode, ...]
+
+    def of(self, episodes: Sequence[ViewOfEpisode]) -> RecordedView:
+        return replace(self, episodes=tuple(episodes))
+
+    def unknown_camera(self, *, fine: bool) -> CameraTrack:
+        """A camera of a focal length of one width at the base, to be replaced."""
+        first = self.episodes[0]
+        height, width = (first.gray if fine else first.rough_gray).shape[1:]
+        K = np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]])
+        return CameraTrack(self.view, K, np.eye(4)[None], width, height)
+
+    def still_views(self, *, fine: bool) -> list[StillView]:
+        """The evidence of a still camera, one for each episode."""
+        camera = self.unknown_camera(fine=fine)
+        motions = [e.fine if fine else e.rough for e in self.episodes]
+        return [
+            StillView(camera, e.points, e.radii, m, certainty(m)) for e, m in zip(self.episodes, motions, strict=True)
+        ]
+
+    def motion(self, delay: float) -> MotionOfSteps:
+        """All steps of all episodes, with pictures that trail by `delay` frames."""
+        points = [delayed(e.points, delay) for e in self.episodes]
+        flow = np.concatenate([e.rough.flow for e in self.episodes])
+        height, width = self.episodes[0].rough_gray.shape[1:]
+        before, after = (np.concatenate([p[part] for p in points]) for part in (slice(None, -1), slice(1, None)))
+        return MotionOfSteps(before, after, flow, width, height)
+
+
+def certainty(motion: Motion) -> np.ndarray:
+    """(n, r, c) trust in the flow: full where the picture changes or has edges; in flat parts flow spreads from beside them."""
+    sure = np.maximum(motion.change - CHANGE_FROM, motion.texture - TEXTURE_FROM) / SURE_ABOVE
+    return (LEAST_TRUST + (1 - LEAST_TRUST) * np.clip(sure, 0, 1)).astype(np.float32)
+
+
+def recorded_views(
+    loaded: Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]], kinematics: ArmKinematics, count: int
+) -> dict[str, RecordedView]:
+    """The views of about `count` episodes, each gone through once.
+
+    Raises: DataError when images or kinematics do not fit an episode, or recorded cameras say nothing of the robot.
+    """
+    found: dict[str, list[ViewOfEpisode]] = {}
+    sizes: dict[str, tuple[int, int]] = {}
+    every, frame_s, surfaces = 1, 1.0, True
+    for episode, frames in loaded:
+        every = max(1, round(episode.fps / ESTIMATED_AT_HZ))
+        frame_s = every / episode.fps
+        reading = read(observe(replace(episode, cameras={}), {}, kinematics), RecordedConventions())
+        if reading is None:
+            raise DataError("The states do not say where the robot is", where=f"episode {episode.episode_id}")
+        surfaces = reading.shape == "surfaces"
+        joints = episode.state_kind == "joints"
+        openings = kinematics.gripper(episode.state.astype(np.float64)).numpy() if joints else None
+        length = len(reading.tools[::every])
+        kept = _busiest(reading.points[::every], max(FEWEST_FRAMES, MOST_FRAMES // count))
+        for view, images in frames.items():
+            gray: list[np.ndarray] = []
+            for image in islice(images, 0, None, every):
+                if view not in sizes:
+                    sizes[view] = image.shape[:2]
+                if image.shape[:2] != sizes[view]:
+                    raise DataError(
+                        "Pictures of one view differ in size", where=f"episode {episode.episode_id}, view {view}",
+                        expected=f"{sizes[view][1]}x{sizes[view][0]}", got=f"{image.shape[1]}x{image.shape[0]}",
+                        next_step="give each size a source of its own",
+                    )  # fmt: skip
+                gray.append(_fine_gray(image))
+            frames_of = slice(kept.start, min(kept.stop, len(gray), length))
+            if frames_of.stop - frames_of.start < FEWEST_FRAMES:
+                continue
+            gripper = None if openings is None else openings[::every][frames_of]
+            shown = ViewOfEpisode(
+                episode.episode_id, np.stack(gray[frames_of]), reading.points[::every][frames_of], reading.radii,
+                reading.tools[::every][frames_of], gripper,
+            )  # fmt: skip
+            found.setdefault(view, []).append(shown)
+    return {
+        view: RecordedView(view, sizes[view], every, frame_s, surfaces, tuple(episodes))
+        for view, episodes in found.items()
+    }
+
+
+def _busiest(points: np.ndarray, count: int) -> slice:
+    """The window of this many frames in which points (n, p, 3) travel most."""
+    if len(points) <= count:
+        return slice(0, len(points))
+    travel = np.linalg.norm(np.diff(points, axis=0), axis=-1).mean(axis=1)
+    sums = np.convolve(travel, np.ones(count - 1), "valid")
+    start = int(sums.argmax())
+    return slice(start, start + count)
+
+
+def _fine_gray(image: np.ndarray) -> np.ndarray:
+    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    height = max(2, round(image.shape[0] * FINE_WIDTH / image.shape[1]))
+    return cv2.resize(gray, (FINE_WIDTH, height), interpolation=cv2.INTER_AREA)

@@ -1,0 +1,245 @@
+"""How sure an estimated camera is: intervals, and every reason not to believe it.
+
+A camera is sure only if it agrees with episodes that it was not fitted to, better than every rival, two halves of the
+episodes give it alone, and its interval in the picture is small. In doubt it is unsure, with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from worldline_core.calibration.camera_errors import (
+    LAG,
+    PARAMETERS,
+    SCALE,
+    CameraError,
+    KindOfError,
+    StillView,
+    projected,
+)
+from worldline_core.calibration.estimate.recordings import RecordedView
+from worldline_core.calibration.estimate.refine import FittedCamera, equations_at
+from worldline_core.calibration.estimate.still_camera import (
+    AGREEMENT_BLUR,
+    StillCamera,
+    shown_by,
+    tools_apart,
+    tools_in_view,
+)
+from worldline_core.calibration.estimate.wrist_camera import WristCamera
+from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.geometry.cameras import Resize, project_points
+
+SHARED_SURFACES, SHARED_CAPSULES = 2.0, 8.0
+"""Variance that more episodes do not reduce, in variances of one episode; from recordings whose cameras are known."""
+LEAST_AGREEMENT, LEAST_EPISODE = 0.5, 0.25
+"""Cosine of predicted and measured flow on episodes that are held out: the median, and of one that says nothing else."""
+RIVAL_DEVIATIONS = 3.0
+LARGEST_HALVES_APART, LARGEST_INTERVAL = 0.035, 6.0
+"""Between the tools of the two halves [widths], and of the interval in the picture [% of the width]."""
+MIRRORED_GAIN = 8.0
+LEAST_IN_VIEW = 0.1
+SHARED_WRIST_CAMERA = 1.5
+LEAST_WRIST_AGREEMENT, FEWEST_FINGER_STEPS = 0.3, 20
+LARGEST_WRIST_HALVES_APART, LARGEST_WRIST_INTERVAL = 0.05, 10.0
+"""The same of wrist cameras, which are nearer to what they see."""
+FEWEST_EPISODES = 3
+LEAST_TRAVEL_M, LEAST_CHANGE = 1.0, 0.02
+MOVED_SHARE, MOVED_DEVIATIONS = 2.5, 5.0
+"""Of the width, and standard deviations, by which the robot is displaced in the picture from one episode on."""
+
+Verdict = Literal["sure", "unsure"]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewEstimate:
+    """The camera of one view.
+
+    Attributes:
+        camera: at the recorded size of pictures; `T_base_camera` is T_tool_camera of a wrist view; None where there is none.
+        intervals: each kind of error that the estimate may have, whatever the others are (95 %).
+        agreement: cosine of predicted and measured flow in held-out episodes.
+        reasons: why it is not sure; notes: what else is worth knowing.
+        moved_at: the episode from which on the camera stands elsewhere.
+    """
+
+    view: str
+    wrist: bool
+    verdict: Verdict
+    camera: CameraTrack | None
+    lag_frames: float = 0.0
+    intervals: tuple[KindOfError, ...] = ()
+    agreement: float = 0.0
+    rival: CameraTrack | None = None
+    rival_agreement: float | None = None
+    reasons: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    moved_at: str | None = None
+    episodes: int = 0
+
+
+def too_few(recorded: RecordedView) -> str | None:
+    """Why a view has too few episodes; None where it has enough."""
+    count = len(recorded.episodes)
+    return None if count >= FEWEST_EPISODES else f"{count} episodes: {FEWEST_EPISODES} are needed to hold some out"
+
+
+def too_little(recorded: RecordedView) -> str | None:
+    """Why a still view cannot be estimated at all; None where it can."""
+    episodes = recorded.episodes
+    travel = sum(float(np.linalg.norm(np.diff(e.tools[..., :3, 3], axis=0), axis=-1).sum(0).max()) for e in episodes)
+    if travel < LEAST_TRAVEL_M:
+        return f"not enough motion: a tool travels {travel:.2f} m in all episodes together, {LEAST_TRAVEL_M} needed"
+    if np.median([e.rough.change.mean() for e in episodes]) < LEAST_CHANGE:
+        return "nothing changes in the pictures while the robot moves: it is not in view, or the video is frozen"
+    return None
+
+
+def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
+    """The estimate of a still view with its intervals and all reasons against it."""
+    fitted, views = found.fitted, recorded.still_views(fine=True)
+    error = _error(recorded, fitted, views)
+    reasons: list[str] = []
+    typical = float(np.median(found.agreements))
+    if typical < LEAST_AGREEMENT:
+        reasons.append(
+            f"what moves in the pictures is not the robot of these states (agreement {typical:.2f},"
+            f" {LEAST_AGREEMENT} needed): it is hardly in view, the states or the robot are others, or the view is"
+        )
+    if (inside := tools_in_view(fitted.camera, recorded)) < LEAST_IN_VIEW:
+        reasons.append(f"the tools are in the picture {inside:.0%} of the time")
+    if found.mirrored > MIRRORED_GAIN:
+        reasons.append(f"mirrored pictures fit better (by {found.mirrored:.0f}): left and right are exchanged")
+    if found.rival is not None and found.rival_agreements is not None:
+        apart = 100 * tools_apart(fitted.camera, found.rival.camera, recorded)
+        gain = found.agreements - found.rival_agreements
+        deviations = float(gain.mean() / max(gain.std(ddof=1) / np.sqrt(len(gain)), 1e-6))
+        if deviations < RIVAL_DEVIATIONS:
+            reasons.append(
+                f"another camera, {apart:.0f} % of the width away, fits as well ({deviations:.1f} deviations)"
+            )
+    halves = 100 * tools_apart(found.halves[0].camera, found.halves[1].camera, recorded)
+    if halves > 100 * LARGEST_HALVES_APART:
+        reasons.append(f"two halves of the episodes give cameras {halves:.1f} % of the width apart")
+    interval = next((k.half_interval for k in error.kinds if k.kind == "in the picture"), np.inf)
+    if interval > LARGEST_INTERVAL:
+        reasons.append(f"the robot's place in the picture is known to {interval:.1f} % of the width only")
+    moved = _moved_at(recorded, found, views)
+    if moved is not None:
+        reasons.append(f"from episode {moved} on the camera stands elsewhere: give the two parts a source each")
+    low = [e.episode_id for e, a in zip(recorded.episodes, found.agreements, strict=True) if a < LEAST_EPISODE]
+    notes = (f"episodes that do not fit: {', '.join(low)}",) if low and moved is None else ()
+    if 2 * len(low) > len(recorded.episodes):
+        reasons.append(f"{len(low)} of {len(recorded.episodes)} episodes do not fit")
+    rival = None if found.rival is None else full_size(found.rival.camera, recorded.image_size)
+    return ViewEstimate(
+        recorded.view,
+        wrist=False,
+        verdict="unsure" if reasons else "sure",
+        camera=full_size(fitted.camera, recorded.image_size),
+        lag_frames=fitted.lag * recorded.every,
+        intervals=error.kinds,
+        agreement=typical,
+        rival=rival,
+        rival_agreement=None if found.rival_agreements is None else float(np.median(found.rival_agreements)),
+        reasons=tuple(reasons),
+        notes=notes,
+        moved_at=moved,
+        episodes=len(recorded.episodes),
+    )
+
+
+def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
+    """The estimate of a wrist view with its intervals and all reasons against it."""
+    fitted = found.fitted
+    scale = np.append(SCALE[:-1], recorded.every)
+    _, _, ahead, slope = projected(np.zeros((1, 1, 3)), fitted.camera)
+    shown = 100 / fitted.camera.width * np.c_[slope[0, 0], np.zeros(2)] / scale
+    information = fitted.information / np.outer(scale, scale)
+    error = CameraError(
+        recorded.view, np.zeros(PARAMETERS), information, SHARED_WRIST_CAMERA, shown, len(recorded.episodes)
+    )
+    reasons: list[str] = []
+    known = found.agreements[np.isfinite(found.agreements)]
+    typical = float(np.median(known)) if len(known) else 0.0
+    if len(known) < FEWEST_EPISODES:
+        reasons.append(f"the scene's motion is seen in {len(known)} episodes, {FEWEST_EPISODES} needed")
+    elif typical < LEAST_WRIST_AGREEMENT:
+        reasons.append(
+            f"the scene does not move as the hand does (agreement {typical:.2f}, {LEAST_WRIST_AGREEMENT} needed): the"
+            " states, the robot or the arm are others, or the mount is far from the described one"
+        )
+    if found.fingers < FEWEST_FINGER_STEPS:
+        reasons.append(
+            f"the fingers move in {found.fingers} pictures, {FEWEST_FINGER_STEPS} needed to see where the tool is"
+        )
+    places = [project_points(np.zeros((1, 3)), c.camera.K, c.camera.T_base_camera)[0] for c in found.halves]
+    halves = 100 * float(np.linalg.norm(places[1] - places[0])) / fitted.camera.width
+    if not ahead.all():
+        reasons.append("the tool is behind the camera")
+    elif halves > 100 * LARGEST_WRIST_HALVES_APART:
+        reasons.append(f"two halves of the episodes give cameras {halves:.1f} % of the width apart")
+    interval = error.kinds[-1].half_interval
+    if interval > LARGEST_WRIST_INTERVAL:
+        reasons.append(f"the tool's place in the picture is known to {interval:.1f} % of the width only")
+    return ViewEstimate(
+        recorded.view,
+        wrist=True,
+        verdict="unsure" if reasons else "sure",
+        camera=full_size(fitted.camera, recorded.image_size),
+        lag_frames=fitted.lag * recorded.every,
+        intervals=error.kinds,
+        agreement=typical,
+        reasons=tuple(reasons),
+        episodes=len(recorded.episodes),
+    )
+
+
+def full_size(camera: CameraTrack, image_size: tuple[int, int]) -> CameraTrack:
+    """A camera of pictures of another size, with square pixels and the principal point in the middle."""
+    height, width = image_size
+    K = Resize((camera.height, camera.width), image_size).affine @ camera.K
+    K[1, 1] = K[0, 0]
+    K[0, 2], K[1, 2] = (width - 1) / 2, (height - 1) / 2
+    return CameraTrack(camera.view, K, camera.T_base_camera, width, height)
+
+
+def _error(recorded: RecordedView, fitted: FittedCamera, views: Sequence[StillView]) -> CameraError:
+    """The error that the estimate may have, as the doctor states it: none was found, this much may be there."""
+    scale = np.append(SCALE[:-1], recorded.every)
+    shared = SHARED_SURFACES if recorded.surfaces else SHARED_CAPSULES
+    information = fitted.information / np.outer(scale, scale)
+    shown = shown_by(fitted, views) / scale
+    return CameraError(recorded.view, np.zeros(PARAMETERS), information, shared, shown, len(views))
+
+
+def _moved_at(recorded: RecordedView, found: StillCamera, views: Sequence[StillView]) -> str | None:
+    """The first episode that the camera of those before it does not fit; None where all have one camera."""
+    fitted, count = found.fitted, len(views)
+    places, weak = np.zeros((count, 2)), np.diag(np.array([0.2] * 3 + [0.2] * 3 + [0.02, 0.3]) ** -2.0)
+    for i, view in enumerate(views):
+        own = equations_at([view], fitted.camera, fitted.lag, AGREEMENT_BLUR)
+        change = np.linalg.solve(own.information + weak, own.gradient)
+        change[LAG] = 0.0
+        places[i] = view.at(fitted.camera).shown(np.zeros(PARAMETERS)) @ change
+    split = _clearest_split(places, MOVED_SHARE)
+    if split is None:
+        split = _clearest_split(found.agreements[:, None], LEAST_EPISODE)
+    return None if split is None else recorded.episodes[split].episode_id
+
+
+def _clearest_split(values: np.ndarray, least: float) -> int | None:
+    """Where a series (n, k) steps by `least` and by many standard deviations of what remains; None where it does not."""
+    best, at = 0.0, None
+    for k in range(2, len(values) - 1):
+        before, after = values[:k], values[k:]
+        step = float(np.linalg.norm(np.median(after, axis=0) - np.median(before, axis=0)))
+        spread = np.median(np.abs(np.concatenate([before - np.median(before, 0), after - np.median(after, 0)])))
+        error = 1.48 * max(float(spread), least / 20) * np.sqrt(1 / k + 1 / (len(values) - k))
+        if step > least and step / error > max(best, MOVED_DEVIATIONS):
+            best, at = step / error, k
+    return at
