@@ -1,7 +1,8 @@
-"""How often the calibration check names a mistake, and how well it measures a camera error: both injected into healthy recordings.
+"""How often the calibration check names a mistake, how well it measures a camera error, and how well cameras are estimated.
 
     python -m benchmarks.calibration mistakes [--splits test,ood_test] [--every 1]
     python -m benchmarks.calibration cameras [--foreign FOLDER] [--sources 8] [--episodes 6] [--seed 0]
+    python -m benchmarks.calibration estimate [--hidden FOLDER] [--foreign FOLDER] [--episodes 20] [--spoil NAME]
 
 Recordings with an injected defect (injected_defects.json) are left out.
 
@@ -11,6 +12,9 @@ Recordings with an injected defect (injected_defects.json) are left out.
   robots are the shipped ones and those of `benchmarks.foreign_robots`. A row says how often it was found in single episodes
   and in the source, how often the bounds held (of every kind, those without an error included), and how often a line was
   wrong: a kind is named and it is another one, or a mistake is claimed. The first rows are false alarms.
+- `estimate`: the cameras of sets of `benchmarks.hidden_cameras` and `benchmarks.foreign_robots`, taken away and estimated.
+  `held`: how many of the 95 % intervals (rotation, translation, focal length, lag, place in the picture) hold the truth.
+  With `--spoil` the sets are spoiled first, and nothing may be sure but what the spoiling leaves right.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -30,14 +34,17 @@ from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.camera_errors import KINDS, LAG, PARAMETERS, SCALE, moved_camera
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, diagnose_source
+from worldline_core.calibration.estimate.estimate import estimate_views
+from worldline_core.calibration.estimate.verdict import ViewEstimate
 from worldline_core.calibration.evidence import MIN_IMAGE_PAIRS
 from worldline_core.calibration.observation import small_gray
 from worldline_core.data.episodes.conventions import RecordedConventions, applicable
-from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.geometry.cameras import inside_image, project_points
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.transforms import quaternion_xyzw_from_rotation
+from worldline_core.geometry.transforms import quaternion_xyzw_from_rotation, rigid_inverse
 
 LAGS = (-4, -3, -2, -1, 1, 2, 3, 4)
 OFFSETS_M = (-0.1, -0.06, -0.03, 0.03, 0.06, 0.1, 0.15)
@@ -313,17 +320,167 @@ def measure_cameras(by_source: dict[str, list[Healthy]], draws: int, count: int,
     print("", *(f"wrong: {line}" for line in wrong), sep="\n")
 
 
+# Estimated cameras
+
+Recorded = list[tuple[Episode, dict[str, np.ndarray]]]
+
+
+def _moved_half_way(episodes: Recorded) -> Recorded:
+    """The pictures of the second half are those of a camera that was turned by 5 degrees: shifted by a tenth."""
+    half, found = len(episodes) // 2, []
+    for number, (episode, frames) in enumerate(episodes):
+        later = {view: np.roll(shown, shown.shape[2] // 10, axis=2) for view, shown in frames.items()}
+        found.append((episode, later if number >= half else frames))
+    return found
+
+
+def _with_states_of_others(episodes: Recorded) -> Recorded:
+    states = [episode.state for episode, _ in episodes]
+    shuffled = []
+    for number, (episode, frames) in enumerate(episodes):
+        other = states[(number + 1) % len(states)]
+        count = min(len(other), episode.num_frames)
+        cut = {view: shown[:count] for view, shown in frames.items()}
+        shuffled.append(
+            (replace(episode, state=other[:count], action=other[:count], timestamps=episode.timestamps[:count]), cut)
+        )
+    return shuffled
+
+
+def _late(frames: int) -> Callable[[Recorded], Recorded]:
+    def spoil(episodes: Recorded) -> Recorded:
+        rows = [np.clip(np.arange(e.num_frames) - frames, 0, None) for e, _ in episodes]
+        return [(replace(e, state=e.state[r], action=e.action[r]), f) for r, (e, f) in zip(rows, episodes, strict=True)]
+
+    return spoil
+
+
+def _still(episodes: Recorded) -> Recorded:
+    return [
+        (replace(e, state=np.repeat(e.state[:1], e.num_frames, axis=0)), {v: np.repeat(i[:1], len(i), axis=0) for v, i in f.items()})
+        for e, f in episodes
+    ]  # fmt: skip
+
+
+SPOILED: dict[str, Callable[[Recorded], Recorded]] = {
+    "nothing": lambda episodes: episodes,
+    "moved half way": _moved_half_way,
+    "mirrored": lambda es: [(e, {v: np.ascontiguousarray(i[:, :, ::-1]) for v, i in f.items()}) for e, f in es],
+    "other states": _with_states_of_others,
+    "states late by 3 frames": _late(3),
+    "still": _still,
+    "wrist shown as head": lambda es: [(e, {"head": next(i for v, i in f.items() if v != "head")}) for e, f in es],
+}
+
+
+def hidden_sets(hidden: Path | None, foreign: Path | None, count: int) -> Iterator[tuple[str, ArmKinematics, Recorded]]:
+    for path in sorted(hidden.glob("*.json")) if hidden else ():
+        from benchmarks.hidden_cameras import read_set  # imports mujoco
+
+        episodes = read_set(path)[:count]
+        yield path.stem, ArmKinematics(load_embodiment(episodes[0][0].embodiment)), episodes
+    for path in sorted(foreign.glob("*.json")) if foreign else ():
+        from benchmarks.foreign_robots import read_source
+
+        embodiment, episodes = read_source(path)
+        yield path.stem, ArmKinematics(embodiment), episodes[:count]
+
+
+def measure_estimates(sets: Iterator[tuple[str, ArmKinematics, Recorded]], spoil: str) -> None:
+    held: Counter[str] = Counter()
+    ratios: dict[str, list[float]] = defaultdict(list)
+
+    def rows() -> Iterator[tuple[object, ...]]:
+        for name, kinematics, episodes in sets:
+            start = time.process_time()
+            true = episodes[0][0]
+            tools = np.concatenate([kinematics.tool_poses(e.state.astype(np.float64)).numpy() for e, _ in episodes])
+            mounts = {arm.camera_view: number for number, arm in enumerate(kinematics.embodiment.arms)}
+            for found in estimate_views(iter(SPOILED[spoil](episodes)), kinematics, len(episodes)):
+                said = found.reasons[0] if found.reasons else "; ".join(found.notes)
+                if found.camera is None or found.view not in true.cameras:
+                    yield name, found.view, found.verdict, "", "", "", "", "", "", said
+                    continue
+                camera = true.cameras[found.view]
+                arm = mounts.get(found.view) if found.wrist else None
+                errors = estimate_errors(found, camera, tools, arm)
+                for kind in found.intervals:
+                    size = float(np.linalg.norm(errors[kind.kind]))
+                    held[f"{kind.kind} {'wrist' if found.wrist else 'still'}"] += size <= kind.half_interval
+                    ratios[f"{kind.kind} {'wrist' if found.wrist else 'still'}"].append(size / kind.half_interval)
+                interval = [k.half_interval for k in found.intervals if k.kind == "in the picture"]
+                columns = [float(np.linalg.norm(errors[k])) for k in ("rotation", "translation", "focal length", "lag")]
+                yield (
+                    name, found.view, found.verdict, f"{errors['tool']:.2f}", f"{interval[0]:.1f}" if interval else "",
+                    *(f"{value:.1f}" for value in columns), f"{found.agreement:.2f} {said}",
+                )  # fmt: skip
+            print(f"    {name}: {time.process_time() - start:.0f} s of CPU", flush=True)
+
+    print_table(
+        (
+            "set",
+            "view",
+            "verdict",
+            "tool error, % of the width",
+            "95 %",
+            "deg",
+            "mm",
+            "% focal",
+            "frames",
+            "agreement, reason",
+        ),
+        rows(),
+    )
+    for kind, values in ratios.items():
+        worst = f"{np.quantile(values, 0.95):.2f}"
+        print(f"{kind}: {held[kind]} of {len(values)} intervals hold; 95 % of the errors are within {worst} intervals")
+
+
+def estimate_errors(
+    found: ViewEstimate, true: CameraTrack, tools: np.ndarray, arm: int | None
+) -> dict[str, np.ndarray | float]:
+    """Error by kind, in the units of the intervals, and of the projected tools: their median in % of the width."""
+    camera = found.camera or true
+    right = true.resized(camera.width, camera.height)
+    if arm is not None:  # of a wrist camera, in the tool's frame
+        right = replace(
+            right, T_base_camera=(rigid_inverse(tools[: len(right.T_base_camera), arm]) @ right.T_base_camera)[:1]
+        )
+        points = np.zeros((1, 3))
+    else:
+        points = tools[:, :, :3, 3].reshape(-1, 3)
+    change = np.linalg.inv(right.T_base_camera[0]) @ camera.T_base_camera[0]
+    (a, ahead), (b, _) = (project_points(points, c.K, c.T_base_camera) for c in (right, camera))
+    shown = inside_image(a, (right.height, right.width)) & (ahead > 0) if arm is None else ahead > 0
+    apart = 100 / right.width * (b - a)[shown]
+    return {
+        "rotation": np.degrees(cv2.Rodrigues(change[:3, :3])[0][:, 0]),
+        "translation": 1e3 * change[:3, 3],
+        "focal length": np.array([100 * (camera.K[0, 0] / right.K[0, 0] - 1)]),
+        "lag": np.array([found.lag_frames]),
+        "in the picture": apart.mean(axis=0) if len(apart) else np.zeros(2),
+        "tool": float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else float("nan"),
+    }
+
+
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("what", choices=("mistakes", "cameras"))
+    parser.add_argument("what", choices=("mistakes", "cameras", "estimate"))
     parser.add_argument("--recordings", type=Path, default=RECORDINGS)
     parser.add_argument("--splits", default="test,ood_test")
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--foreign", type=Path, help="cameras: what benchmarks.foreign_robots wrote")
+    parser.add_argument("--hidden", type=Path, help="estimate: what benchmarks.hidden_cameras wrote")
+    parser.add_argument(
+        "--spoil", choices=list(SPOILED), default="nothing", help="estimate: what is done to the sets first"
+    )
     parser.add_argument("--sources", type=int, default=8, help="cameras: sources for each kind and size of error")
-    parser.add_argument("--episodes", type=int, default=6, help="cameras: episodes of a source")
+    parser.add_argument("--episodes", type=int, default=6, help="cameras, estimate: episodes of a source")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    if arguments.what == "estimate":
+        measure_estimates(hidden_sets(arguments.hidden, arguments.foreign, arguments.episodes), arguments.spoil)
+        return
     shipped = healthy(arguments.recordings, set(arguments.splits.split(",")), arguments.every)
     if arguments.what == "mistakes":
         measure_mistakes(shipped)

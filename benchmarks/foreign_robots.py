@@ -23,7 +23,6 @@ import numpy as np
 
 from benchmarks.harness import command_line
 from tools.description_import import kinematics_text
-from worldline_core.calibration.observation import small_gray
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.embodiment import Embodiment
 
@@ -232,7 +231,7 @@ def record(name: str, site: Path, output: Path, source: int, episodes: int) -> N
                 K = np.array([[f, 0, (WIDTH - 1) / 2], [0, f, (HEIGHT - 1) / 2], [0, 0, 1]])
                 arrays[f"{number}/K/{view}"] = K
                 arrays[f"{number}/T/{view}"] = np.stack(poses[view][:1] if view == "head" else poses[view])
-                arrays[f"{number}/gray/{view}"] = small_gray(images[view])
+                arrays[f"{number}/gray/{view}"] = np.stack([cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in images[view]])
             if number == 0:
                 for view, frames in images.items():
                     cv2.imwrite(str(output / f"{name}_{source}_{view}.png"), frames[len(state) // 2][..., ::-1])
