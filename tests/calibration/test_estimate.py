@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks import calibration as benchmark
+from flows.command_line import main
 from worldline_core.calibration.camera_errors import moved_camera
-from worldline_core.calibration.estimate import recordings
+from worldline_core.calibration.estimate import estimate, recordings
 from worldline_core.calibration.estimate.camera_file import camera_file
 from worldline_core.calibration.estimate.estimate import estimate_views
 from worldline_core.calibration.estimate.recordings import recorded_views
@@ -109,3 +110,30 @@ def test_sure_cameras_are_read_back_as_a_calibration_file(
     assert np.allclose(cameras.tracks["left_wrist"].T_base_camera, tools @ pose, atol=1e-5)
     assert np.allclose(cameras.tracks["head"].T_base_camera, pose[None])
     assert np.allclose(cameras.tracks["head"].K[:2, 2], (95.5, 63.5))
+
+
+def test_the_command_writes_cameras_pages_and_pictures(
+    tmp_path: Path, bank: Loaded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "my.yaml").write_text(
+        f"curate:\n  sources:\n  - {{kind: episode_set, path: {BANKS}, name: banks, include: ['bank_carry_ur5e-00[0-3]']}}\n"
+    )
+    true = bank[0][0].cameras["head"]
+    found = [
+        ViewEstimate("head", wrist=False, verdict="sure", camera=true, lag_frames=2.1, agreement=0.9, episodes=4),
+        ViewEstimate("left_wrist", wrist=True, verdict="unsure", camera=None, reasons=("<b>too little</b>",)),
+    ]
+    monkeypatch.setattr(estimate, "estimate_views", lambda loaded, *_: list(loaded) and found)
+    with pytest.raises(SystemExit) as ended:
+        main(["calibrate", "estimate", str(tmp_path / "my.yaml"), "--view", "head", "--output", str(tmp_path / "out")])
+    said, page = capsys.readouterr().out, (tmp_path / "out" / "index.html").read_text()
+    assert ended.value.code == 1
+    assert "image_lag_frames: 2, views: [head]" in said and "<b>too little</b>" in said
+    assert "<b>too little</b>" not in page and "head.jpg" in page
+    assert (tmp_path / "out" / "head.jpg").is_file()
+    assert read_calibration(tmp_path / "out" / "cameras.json").views.keys() == {"head"}
+    listed = json.loads((tmp_path / "out" / "estimate.json").read_text())
+    assert [view["verdict"] for view in listed["views"]] == ["sure", "unsure"] and not listed["sure"]
+    with pytest.raises(SystemExit) as ended:
+        main(["calibrate", "estimate", str(tmp_path / "my.yaml"), "--view", "front", "--output", str(tmp_path / "out")])
+    assert ended.value.code == 2 and "No such view" in capsys.readouterr().err
