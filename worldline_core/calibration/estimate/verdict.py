@@ -41,14 +41,16 @@ LEAST_AGREEMENT, LEAST_EPISODE = 0.5, 0.25
 RIVAL_DEVIATIONS = 3.0
 LARGEST_HALVES_APART, LARGEST_INTERVAL = 0.035, 6.0
 """Between the tools of the two halves [widths], and of the interval in the picture [% of the width]."""
-MIRRORED_GAIN = 8.0
+MIRRORED_GAIN = -20.0
+"""Log-likelihood above which mirrored pictures cannot be told apart; of usual sets it is -90 to -260."""
 LEAST_IN_VIEW = 0.1
 SHARED_WRIST_CAMERA = 1.5
 LEAST_WRIST_AGREEMENT, FEWEST_FINGER_STEPS = 0.3, 20
 LARGEST_WRIST_HALVES_APART, LARGEST_WRIST_INTERVAL = 0.05, 10.0
 """The same of wrist cameras, which are nearer to what they see."""
 FEWEST_EPISODES = 3
-LEAST_TRAVEL_M, LEAST_CHANGE = 1.0, 0.02
+LEAST_TRAVEL_M, LEAST_CHANGE = 2.5, 0.02
+"""Of the busiest tool over all episodes together: of less, a mirrored camera can look right."""
 MOVED_SHARE, MOVED_DEVIATIONS = 2.5, 5.0
 """Of the width, and standard deviations, by which the robot is displaced in the picture from one episode on."""
 
@@ -113,7 +115,10 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     if (inside := tools_in_view(fitted.camera, recorded)) < LEAST_IN_VIEW:
         reasons.append(f"the tools are in the picture {inside:.0%} of the time")
     if found.mirrored > MIRRORED_GAIN:
-        reasons.append(f"mirrored pictures fit better (by {found.mirrored:.0f}): left and right are exchanged")
+        how = (
+            "better: left and right are exchanged" if found.mirrored > 0 else "as well: the motion shows no difference"
+        )
+        reasons.append(f"mirrored pictures fit {how}")
     if found.rival is not None and found.rival_agreements is not None:
         apart = 100 * tools_apart(fitted.camera, found.rival.camera, recorded)
         gain = found.agreements - found.rival_agreements
