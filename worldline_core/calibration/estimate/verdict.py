@@ -140,6 +140,8 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     notes = (f"episodes that do not fit: {', '.join(low)}",) if low and moved is None else ()
     if 2 * len(low) > len(recorded.episodes):
         reasons.append(f"{len(low)} of {len(recorded.episodes)} episodes do not fit")
+    if typical < LEAST_AGREEMENT:  # then nothing else means anything
+        reasons, moved = reasons[:1], None
     rival = None if found.rival is None else full_size(found.rival.camera, recorded.image_size)
     return ViewEstimate(
         recorded.view,
