@@ -7,7 +7,6 @@ view into one folder. Nothing is changed in the source.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
@@ -18,7 +17,14 @@ from worldline_core.calibration.estimate.camera_file import camera_file
 from worldline_core.calibration.estimate.estimate_report import as_json, page, view_picture
 from worldline_core.calibration.estimate.recordings import RecordedView, recorded_views
 from worldline_core.calibration.estimate.still_camera import estimate_still
-from worldline_core.calibration.estimate.verdict import ViewEstimate, judge_still, judge_wrist, too_few, too_little
+from worldline_core.calibration.estimate.verdict import (
+    SourceEstimate,
+    ViewEstimate,
+    judge_still,
+    judge_wrist,
+    too_few,
+    too_little,
+)
 from worldline_core.calibration.estimate.wrist_camera import estimate_wrist
 from worldline_core.calibration.observation import arms_of_embodiment
 from worldline_core.data.curation.episode_checks import check_values
@@ -33,20 +39,6 @@ from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 MOST_EPISODES = 20
 """More say little that these do not."""
 PICTURES = 3
-
-
-@dataclass(frozen=True)
-class SourceEstimate:
-    """The estimated cameras of a source, and the folder that they were written to; `cameras` is None where none is sure."""
-
-    source: str
-    views: tuple[ViewEstimate, ...]
-    output: Path
-    cameras: Path | None
-
-    @property
-    def sure(self) -> bool:
-        return all(view.verdict == "sure" for view in self.views)
 
 
 def estimate_views(

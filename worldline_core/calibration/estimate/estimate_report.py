@@ -14,8 +14,7 @@ from worldline_core.pages.page import render
 from worldline_core.pictures import Picture, SheetRow, contact_sheet, draw_tag, scale_frames, scaled_size
 
 if TYPE_CHECKING:
-    from worldline_core.calibration.estimate.estimate import SourceEstimate
-    from worldline_core.calibration.estimate.verdict import ViewEstimate
+    from worldline_core.calibration.estimate.verdict import SourceEstimate, ViewEstimate
     from worldline_core.data.episodes.episode import Episode
     from worldline_core.geometry.kinematics import ArmKinematics
 

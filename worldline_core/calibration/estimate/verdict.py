@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -82,6 +83,20 @@ class ViewEstimate:
     notes: tuple[str, ...] = ()
     moved_at: str | None = None
     episodes: int = 0
+
+
+@dataclass(frozen=True)
+class SourceEstimate:
+    """The estimated cameras of a source, and the folder that they were written to; `cameras` is None where none is sure."""
+
+    source: str
+    views: tuple[ViewEstimate, ...]
+    output: Path
+    cameras: Path | None
+
+    @property
+    def sure(self) -> bool:
+        return all(view.verdict == "sure" for view in self.views)
 
 
 def too_few(recorded: RecordedView) -> str | None:
