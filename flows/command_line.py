@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 from flows.exchange_commands import add_exchange_commands
+from flows.fit_command import add_fit_command
 from flows.full_size_commands import add_plan_command, add_rehearse_command
 from tasks.execution.artifact_task import find_task, task_names
 from tasks.execution.command_line import add_config_arguments, add_task_arguments
@@ -23,6 +24,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"worldline {metadata.version('worldline')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_init(commands)
+    add_fit_command(commands)
     pipeline = commands.add_parser("pipeline", help="run every step, from recordings to the report")
     pipeline.set_defaults(run=_pipeline)
     nightly = commands.add_parser("nightly", help="evaluate the shipped checkpoints and compare with earlier nights")

@@ -6,7 +6,7 @@ Writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg` into one fold
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.data.sources.open import open_source
+from worldline_core.data.sources.open import SourceConfig, open_source
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
@@ -77,8 +77,13 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
         raise ConfigError("The file configures no source", where=path, expected="a section `curate` with `sources`")
     config = validate(CurateConfig, values["curate"], where=f"{path}: curate")
     descriptions = (values.get("render_actions") or {}).get("description_paths") or {}
+    return episodes_of_sources(config.sources), {str(name): str(file) for name, file in descriptions.items()}
+
+
+def episodes_of_sources(sources: Iterable[SourceConfig]) -> list[ListedEpisode]:
+    """The episodes of every source."""
     listed: list[ListedEpisode] = []
-    for number, source_config in enumerate(config.sources):
+    for number, source_config in enumerate(sources):
         source = open_source(source_config, source_config.path)
         prefix = f"curate.sources[{number}].conventions"
         declared, robot = source_config.conventions, "embodiment" in type(source_config).model_fields
@@ -86,7 +91,7 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
             ListedEpisode(episode_id, source_config.label, partial(source.load, episode_id), prefix, declared, robot)
             for episode_id in source.episode_ids()
         ]
-    return listed, {str(name): str(file) for name, file in descriptions.items()}
+    return listed
 
 
 def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:

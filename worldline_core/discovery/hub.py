@@ -47,6 +47,11 @@ def fetch_sample(repo_id: str) -> HubDataset:
     return HubDataset(folder, f"hf download {repo_id} --repo-type dataset --revision {folder.name}")
 
 
+def fetch_dataset(repo_id: str) -> Path:
+    """Fetch a whole dataset into the hub's local cache; what is there is not fetched again. Raises: UnavailableError as `fetch_sample`."""
+    return _snapshot(repo_id, ["*"])
+
+
 def _sample_files(folder: Path) -> list[str]:
     """Files of the first episodes."""
     info = read_info(folder)

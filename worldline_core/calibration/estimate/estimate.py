@@ -6,15 +6,24 @@ view into one folder. Nothing is changed in the source.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
+from pydantic import Field
 
-from worldline_core.calibration.check import OUTPUT_ROOT, ListedEpisode, episode_images, episodes_of_config
+from worldline_core.calibration.check import (
+    OUTPUT_ROOT,
+    ListedEpisode,
+    episode_images,
+    episodes_of_config,
+    episodes_of_sources,
+)
 from worldline_core.calibration.estimate.camera_file import camera_file
-from worldline_core.calibration.estimate.estimate_report import as_json, page, view_picture
+from worldline_core.calibration.estimate.estimate_report import as_json, headline, page, view_picture
 from worldline_core.calibration.estimate.recordings import RecordedView, recorded_views
 from worldline_core.calibration.estimate.still_camera import estimate_still
 from worldline_core.calibration.estimate.verdict import (
@@ -27,18 +36,44 @@ from worldline_core.calibration.estimate.verdict import (
 )
 from worldline_core.calibration.estimate.wrist_camera import estimate_wrist
 from worldline_core.calibration.observation import arms_of_embodiment
+from worldline_core.config import StrictModel
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.episode_checks import check_values
-from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode import NO_EMBODIMENT, Episode
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.sources.open import SourceConfig
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures import evenly_spaced, jpeg_bytes
 from worldline_core.progress import Progress
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
+logger = logging.getLogger(__name__)
+
+CAMERAS = "cameras.json"
 MOST_EPISODES = 20
 """More say little that these do not."""
 PICTURES = 3
+
+
+class EstimateConfig(StrictModel):
+    """One source, and files of robots' kinematic descriptions by their names, as `render_actions` takes them."""
+
+    source: SourceConfig
+    description_paths: dict[str, str] = Field(default_factory=dict)
+
+    @classmethod
+    def of(cls, curate: CurateConfig, description_paths: Mapping[str, str]) -> Self | None:
+        """Of recordings that have a robot with a description and could name a calibration file, but do not; else None."""
+        source = curate.sources[0]
+        robot = getattr(source, "embodiment", NO_EMBODIMENT)
+        if len(curate.sources) > 1 or getattr(source, "calibration", "") is not None or robot == NO_EMBODIMENT:
+            return None
+        return cls(source=source, description_paths=dict(description_paths))
+
+    def weights_read(self) -> Mapping[str, Path | None]:
+        return CurateConfig(sources=(self.source,)).weights_read()
 
 
 def estimate_views(
@@ -83,7 +118,26 @@ def estimate_command(
             "Cameras are estimated of one source", where=config, expected="one source with episodes",
             got=", ".join(sorted(sources)) or "none", next_step="--set 'curate.sources=[...]' with one of them",
         )  # fmt: skip
-    chosen = [listed[i] for i in evenly_spaced(len(listed), MOST_EPISODES)]
+    return _estimate_source(listed, descriptions, views, output or OUTPUT_ROOT / f"{config.stem}_estimate")
+
+
+def estimate_cameras(config: EstimateConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    """The same as a task, of the views that have no camera: views and verdicts. Nothing is sure is a result like any other.
+
+    Raises: DataError as `estimate_command`.
+    """
+    del inputs  # they are in the configuration, and in the cache key
+    found = _estimate_source(episodes_of_sources([config.source]), config.description_paths, (), output)
+    verdicts = {view.view: view.verdict for view in found.views}
+    for view in found.views:
+        logger.info("%s", headline(view))
+    return {"views": verdicts, "reasons": {view.view: list(view.reasons) for view in found.views if view.reasons}}
+
+
+def _estimate_source(
+    listed: Sequence[ListedEpisode], descriptions: Mapping[str, str], views: Sequence[str], folder: Path
+) -> SourceEstimate:
+    chosen = _readable(listed)
     first = chosen[0].load()
     if unknown := set(views) - set(first.views):
         raise DataError("No such view", expected=", ".join(first.views), got=", ".join(sorted(unknown)))
@@ -94,20 +148,40 @@ def estimate_command(
         with Progress("calibrate estimate: reading", len(chosen), "episode") as progress:
             for item in chosen:
                 found = item.load()
-                check_values(found.episode)
                 yield found.episode, {view: episode_images(found, view) for view in wanted if view in found.views}
                 progress.advance()
 
     estimates = estimate_views(loaded(), kinematics, len(chosen))
-    folder = output or OUTPUT_ROOT / f"{config.stem}_estimate"
     pictures = dict(_pictures(estimates, chosen, kinematics, folder))
-    cameras = folder / "cameras.json" if any(each.verdict == "sure" for each in estimates) else None
-    found = SourceEstimate(next(iter(sources)), tuple(estimates), folder, cameras)
+    cameras = folder / CAMERAS if any(each.verdict == "sure" for each in estimates) else None
+    found = SourceEstimate(chosen[0].source, tuple(estimates), folder, cameras)
     if cameras is not None:
         write_json_atomic(cameras, camera_file(estimates))
     write_json_atomic(folder / "estimate.json", as_json(found))
     write_bytes_atomic(folder / "index.html", page(found, pictures).encode())
     return found
+
+
+def _readable(listed: Sequence[ListedEpisode]) -> list[ListedEpisode]:
+    """Up to MOST_EPISODES of them, evenly spaced as far as they can be read; curation names the others. Raises: the first one's fault
+    where none can.
+    """
+    chosen: list[ListedEpisode] = []
+    faults: list[RejectedInputError | DataError] = []
+    for number in dict.fromkeys([*evenly_spaced(len(listed), MOST_EPISODES), *range(len(listed))]):
+        try:
+            check_values(listed[number].load().episode)
+        except (RejectedInputError, DataError) as error:
+            faults.append(error)
+            continue
+        chosen.append(listed[number])
+        if len(chosen) == MOST_EPISODES:
+            break
+    if not chosen:
+        raise faults[0]
+    if faults:
+        logger.warning("%d episodes cannot be read and are left out, the first: %s", len(faults), faults[0])
+    return chosen
 
 
 def _pictures(

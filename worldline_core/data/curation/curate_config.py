@@ -151,10 +151,14 @@ class CurateConfig(StrictModel):
         return self.model_copy(update={"sources": sources})
 
     def weights_read(self) -> Mapping[str, Path | None]:
-        """Descriptions of robots, whose content counts in the cache key."""
+        """Descriptions of robots, and calibration files outside of the recordings, whose content counts in the cache key."""
+        named = {
+            f"sources.{n}.calibration": getattr(source, "calibration", None) for n, source in enumerate(self.sources)
+        }
+        cameras = {key: Path(name) for key, name in named.items() if name and Path(name).is_absolute()}
         robots = {f"sources.{n}.embodiment": path for n, path in self.own_robots().items()}
         described = {f"{key}.description": load_embodiment(path).description_path for key, path in robots.items()}
-        return {**robots, **described}
+        return {**robots, **described, **cameras}
 
     def for_source(self, number: int) -> CurateConfig:
         """The configuration as it holds for sources[number]: what the source says of itself goes before what is said for

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache, lru_cache
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -141,8 +142,8 @@ class LeRobotSourceConfig(ForeignSourceConfig):
     collection: bool = Field(default=False, description="read every dataset below the folder")
     calibration: str | None = Field(
         default=None,
-        description="file in the dataset's folder with K and poses of the views (docs/sources.md); a name with "
-        "{episode_index:06d} is one file per episode",
+        description="file with K and poses of the views (docs/sources.md): in the dataset's folder, where a name with "
+        "{episode_index:06d} is one file per episode, or an absolute path",
     )
     task_column: str = Field(default="task_index", description="column of indices into the dataset's tasks")
     task_separator: str | None = Field(
@@ -432,7 +433,12 @@ class LeRobotSource:
         if depth := [key for key in config.views if is_depth(features.get(key, {}))]:
             raise depth_picture(root, f"is_depth_map of {', '.join(depth)} in meta/info.json")
         self._columns = state_columns(config, features, str(root))
-        self._calibration = lru_cache(maxsize=1)(lambda name: read_calibration(inside(root, name)))
+        absolute = Path(
+            config.calibration or ""
+        ).is_absolute()  # the user's own file; a name of the dataset stays in its folder
+        self._calibration = lru_cache(maxsize=1)(
+            lambda name: read_calibration(Path(name) if absolute else inside(root, name))
+        )
 
     def episode_ids(self) -> list[str]:
         return [f"{self._label}-{int(index):06d}" for index in self._dataset.episodes.indices]

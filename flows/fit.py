@@ -1,0 +1,36 @@
+"""From a folder of recordings to a simulator of them: cameras are estimated where none is known, then the chain runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from prefect import flow
+
+from flows.pipeline import STORE, chain
+from tasks.estimate_cameras import estimate_cameras
+from tasks.execution.prefect_artifacts import run_chain
+from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+from worldline_core.calibration.estimate.estimate import CAMERAS, EstimateConfig
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+
+
+@flow(name="fit", flow_run_name="fit-{config}", retries=0)
+def fit(config: Path, overrides: tuple[str, ...] = (), artifacts: Path = STORE) -> ArtifactReference:
+    """Estimated cameras, where recordings have none, and then everything that `pipeline` does. Finished steps are not repeated."""
+    settings = PipelineConfig.load(None, config, overrides)
+    drawn = settings.render_actions
+    wanted = EstimateConfig.of(settings.curate, {} if drawn is None else drawn.description_paths)
+    if wanted is not None:
+        with PrefectRun(artifacts.resolve(), settings.runner) as run:
+            estimate_cameras.submit(wanted, source=settings.sources_of(settings.curate, {}))
+        cameras = run.artifacts["estimate_cameras"].folder / CAMERAS
+        settings = with_cameras(settings, cameras) if cameras.is_file() else settings
+    return run_chain(chain, settings, settings.runner, artifacts.resolve())["report"]
+
+
+def with_cameras(settings: PipelineConfig, cameras: Path) -> PipelineConfig:
+    """The run with a calibration file of its one source: controls are drawn into its views, the others take the commands."""
+    source = settings.curate.sources[0].model_copy(update={"calibration": str(cameras)})
+    curate = settings.curate.model_copy(update={"sources": (source,)})
+    drawn = settings.render_actions or PipelineConfig.load("tiny").render_actions
+    return settings.model_copy(update={"curate": curate, "render_actions": drawn})

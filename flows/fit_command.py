@@ -1,0 +1,105 @@
+"""`worldline fit`: one command from recordings of one's own to a simulator that can be driven."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from tasks.execution.temporary_server import prepare_prefect
+
+SHARES = {
+    "train_stage1": 0.2,
+    "train_stage2": 0.5,
+    "distill.teacher_forcing": 0.15,
+    "distill.trajectory_regression": 0.075,
+    "distill.distribution_matching": 0.075,
+}
+"""Parts of the minutes that each training gets."""
+ON_A_GPU = ("encode_latents.device", *(f"{training}.trainer.device" for training in SHARES))
+ROLLOUTS = ("stage2", "stage2_shuffled", "causal")
+IGNORED_AFTER = 300
+"""Steps of Stage II after which a small model that listens to its controls does so measurably."""
+
+
+def add_fit_command(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add it to the command line's parser."""
+    fit = commands.add_parser(
+        "fit",
+        help="from recordings of your own to a simulator that you can drive, in one command",
+        description="Look at the recordings (as `init` does), estimate the cameras that nobody measured, read, filter, train,"
+        " distill, evaluate, report. Interrupted or stopped, the same command continues. It stops, with the next step, where"
+        " a person has to decide.",
+    )
+    fit.add_argument("recordings", metavar="PATH_OR_HUB_ID", help="a folder, an MCAP file, or ORG/NAME of the hub")
+    fit.add_argument(
+        "--config", type=Path, default=Path("my.yaml"), metavar="FILE",
+        help="written by the first call, and read when it is there (default: my.yaml)",
+    )  # fmt: skip
+    fit.add_argument("--minutes", type=float, metavar="N", help="of training, all stages together (default: 20)")
+    fit.add_argument("--gpu", metavar="SIZE", help="train and predict on the GPU, which has so much memory: 24GB")
+    fit.add_argument(
+        "--stop-when-ignored", type=int, nargs="?", const=IGNORED_AFTER, metavar="STEPS",
+        help=f"end a training in which, from this step on, the controls make no difference (default: {IGNORED_AFTER})",
+    )  # fmt: skip
+    fit.add_argument(
+        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
+    )
+    fit.add_argument("--artifacts", type=Path, default=Path("artifacts"), help="root of the store (default: artifacts)")
+    fit.set_defaults(run=fit_command)
+
+
+def overrides_of(minutes: float | None, gpu: str | None, ignored_after: int | None) -> tuple[str, ...]:
+    """The options as changes of the configuration."""
+    changes: list[str] = []
+    if minutes is not None:
+        changes += [f"{name}.trainer.minutes={share * minutes:.4g}" for name, share in SHARES.items()]
+    if gpu is not None:
+        changes += [f"{key}=cuda" for key in ON_A_GPU]
+        changes += [f"rollouts.{name}.config.device=cuda" for name in ROLLOUTS]
+    if ignored_after is not None:
+        changes.append(f"train_stage2.action_following.stop_when_ignored={ignored_after}")
+    return tuple(changes)
+
+
+def fit_command(arguments: argparse.Namespace) -> None:
+    """Write the configuration or take the one that is there, check it, and run the flow."""
+    from worldline_core.discovery.hub import fetch_dataset, hub_id
+
+    recordings = Path(arguments.recordings) if (name := hub_id(arguments.recordings)) is None else fetch_dataset(name)
+    if not arguments.config.exists():
+        from worldline_core.discovery.configuration import write_config
+        from worldline_core.discovery.look import discover
+        from worldline_core.discovery.report import as_text
+
+        found = discover(recordings)
+        write_config(found, arguments.config, arguments.recordings)
+        print(as_text(found, arguments.config, []))
+    changes = (*overrides_of(arguments.minutes, arguments.gpu, arguments.stop_when_ignored), *arguments.overrides)
+    from worldline_core.config import validate
+    from worldline_core.pipeline.pipeline_config import PipelineConfig, check_recordings, check_weights
+
+    config = PipelineConfig.load(None, arguments.config, changes)
+    check_recordings(config, Path.cwd())
+    check_weights(config, Path.cwd())
+    if arguments.gpu is not None:
+        from worldline_core.errors import ConfigError
+        from worldline_core.model.tokenizers import require_device
+        from worldline_core.pipeline.size_sheet import SizeSheet
+
+        card = {"config": config, "project": Path.cwd(), "devices": 1, "memory": arguments.gpu}
+        rows = list(validate(SizeSheet, card, where="--gpu").rows())
+        if too_large := [row.title for row, setting in rows if setting]:
+            raise ConfigError(
+                "A training does not fit this card", where="--gpu", expected=arguments.gpu, got=", ".join(too_large),
+                next_step=f"worldline plan --config {arguments.config} --gpus 1 --memory {arguments.gpu}",
+            )  # fmt: skip
+        require_device("cuda")
+    prepare_prefect(arguments.artifacts)
+    from flows.fit import fit
+    from tasks.execution.prefect_artifacts import run_flow
+
+    print(f"how far it is, and then the report: {arguments.artifacts / 'report' / 'latest' / 'index.html'}")
+    report = run_flow(fit, arguments.config, changes, arguments.artifacts)
+    latest = arguments.artifacts / "latest"
+    print(f"report: {report.path / 'index.html'}")
+    print(f"drive it: worldline play --set model={latest / 'distill'} --set episodes={latest / 'filter'}")

@@ -1,0 +1,15 @@
+"""`estimate_cameras`: cameras that nobody measured, from the recorded episodes alone."""
+
+from tasks.execution.artifact_task import ArtifactTask
+
+estimate_cameras = ArtifactTask(
+    name="estimate_cameras",
+    summary="cameras that nobody measured, from the recorded episodes alone",
+    version=1,
+    function="worldline_core.calibration.estimate.estimate:estimate_cameras",
+    config="worldline_core.calibration.estimate.estimate:EstimateConfig",
+    optional_inputs=("source.*",),
+)
+
+if __name__ == "__main__":
+    estimate_cameras.main()
