@@ -10,7 +10,7 @@ from flows.pipeline import STORE, chain
 from tasks.estimate_cameras import estimate_cameras
 from tasks.execution.prefect_artifacts import run_chain
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
-from worldline_core.calibration.estimate.estimate import CAMERAS, EstimateConfig
+from worldline_core.calibration.estimate.estimate_config import CAMERAS, EstimateConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 
 

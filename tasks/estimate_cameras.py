@@ -7,7 +7,7 @@ estimate_cameras = ArtifactTask(
     summary="cameras that nobody measured, from the recorded episodes alone",
     version=1,
     function="worldline_core.calibration.estimate.estimate:estimate_cameras",
-    config="worldline_core.calibration.estimate.estimate:EstimateConfig",
+    config="worldline_core.calibration.estimate.estimate_config:EstimateConfig",
     optional_inputs=("source.*",),
 )
 

@@ -14,7 +14,7 @@ import flows.fit_command
 from flows.command_line import main
 from flows.fit import with_cameras
 from flows.fit_command import overrides_of
-from worldline_core.calibration.estimate.estimate import EstimateConfig
+from worldline_core.calibration.estimate.estimate_config import EstimateConfig
 from worldline_core.data.sources.open import open_source
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rollout.worldline import WorldLine

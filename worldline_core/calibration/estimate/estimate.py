@@ -10,10 +10,9 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from worldline_core.calibration.check import (
     OUTPUT_ROOT,
@@ -23,6 +22,7 @@ from worldline_core.calibration.check import (
     episodes_of_sources,
 )
 from worldline_core.calibration.estimate.camera_file import camera_file
+from worldline_core.calibration.estimate.estimate_config import CAMERAS, EstimateConfig
 from worldline_core.calibration.estimate.estimate_report import as_json, headline, page, view_picture
 from worldline_core.calibration.estimate.recordings import RecordedView, recorded_views
 from worldline_core.calibration.estimate.still_camera import estimate_still
@@ -36,13 +36,10 @@ from worldline_core.calibration.estimate.verdict import (
 )
 from worldline_core.calibration.estimate.wrist_camera import estimate_wrist
 from worldline_core.calibration.observation import arms_of_embodiment
-from worldline_core.config import StrictModel
-from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.episode_checks import check_values
-from worldline_core.data.episodes.episode import NO_EMBODIMENT, Episode
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.data.sources.open import SourceConfig
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures import evenly_spaced, jpeg_bytes
@@ -51,29 +48,9 @@ from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 logger = logging.getLogger(__name__)
 
-CAMERAS = "cameras.json"
 MOST_EPISODES = 20
 """More say little that these do not."""
 PICTURES = 3
-
-
-class EstimateConfig(StrictModel):
-    """One source, and files of robots' kinematic descriptions by their names, as `render_actions` takes them."""
-
-    source: SourceConfig
-    description_paths: dict[str, str] = Field(default_factory=dict)
-
-    @classmethod
-    def of(cls, curate: CurateConfig, description_paths: Mapping[str, str]) -> Self | None:
-        """Of recordings that have a robot with a description and could name a calibration file, but do not; else None."""
-        source = curate.sources[0]
-        robot = getattr(source, "embodiment", NO_EMBODIMENT)
-        if len(curate.sources) > 1 or getattr(source, "calibration", "") is not None or robot == NO_EMBODIMENT:
-            return None
-        return cls(source=source, description_paths=dict(description_paths))
-
-    def weights_read(self) -> Mapping[str, Path | None]:
-        return CurateConfig(sources=(self.source,)).weights_read()
 
 
 def estimate_views(
