@@ -190,8 +190,8 @@ def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dic
             path = shard_path(folder, number)
             if not path.is_file():
                 drawn, tensors = make(number)
-                clips = json.dumps([asdict(clip) for clip in drawn.clips])
-                header = {"clips": clips, "views": json.dumps(drawn.views)}
+                # One entry: safetensors writes several in an order of its own, another one each time.
+                header = {"clips": json.dumps([[asdict(clip) for clip in drawn.clips], drawn.views])}
                 content = {
                     name: value.to("cpu", torch.uint8 if name == "mask" else torch.float16).contiguous()
                     for name, value in tensors.items()
@@ -256,8 +256,7 @@ class TrajectoryStore:
         return values
 
 
-_CLIPS = TypeAdapter(list[Clip], config=ConfigDict(strict=True))
-_VIEWS = TypeAdapter(tuple[str, ...], config=ConfigDict(strict=True))
+_CLIPS = TypeAdapter(tuple[list[Clip], tuple[str, ...]], config=ConfigDict(strict=True))
 
 
 def _clips(path: Path) -> tuple[list[Clip], tuple[str, ...]]:
@@ -269,7 +268,7 @@ def _clips(path: Path) -> tuple[list[Clip], tuple[str, ...]]:
     try:
         with safe_open(path, framework="pt") as shard:
             header = shard.metadata() or {}
-            clips, views = _CLIPS.validate_json(header.get("clips", "")), _VIEWS.validate_json(header.get("views", ""))
+            clips, views = _CLIPS.validate_json(header.get("clips", ""))
             forms = {name: shard.get_slice(name) for name in ("nodes", "mask")}
             found = {name: (form.get_dtype(), form.get_shape()) for name, form in forms.items()}
     except (OSError, SafetensorError, ValueError) as error:  # pydantic's ValidationError is a ValueError
