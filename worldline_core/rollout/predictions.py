@@ -147,7 +147,9 @@ def _views(
     recorded = tuple(view for view in predictor.views if view in row.views)
     robots = predictor.vector_robots
     drawn = tracks.calibrated_views(row.episode_id) if tracks and predictor.takes_maps and config.cameras else ()
-    free = tracks is None or robots is None or row.embodiment in robots
+    # Of a model of vectors alone that is what an evaluation asks: what they are worth on a robot that it has not seen (the paper's
+    # ablation). A session or a policy is refused there.
+    free = tracks is None or robots is None or row.embodiment in robots or not predictor.takes_maps
     views = tuple(view for view in recorded if free or view in drawn)
     sets = predictor.view_sets or (views, predictor.views[:1])
     if config.views != "all_present":
