@@ -19,7 +19,7 @@ from benchmarks.harness import command_line
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.recorder.bodies import BODIES, CENTRE, CameraMount
 from worldline_core.recorder.record import SPLIT_STREAM
-from worldline_core.recorder.rendering import SceneRenderer
+from worldline_core.recorder.rendering import SceneRenderer, prepare_rendering
 from worldline_core.recorder.scene import TASKS
 from worldline_core.recorder.simulate import SCENES, EpisodeRecorder, Job
 
@@ -112,6 +112,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
+    prepare_rendering()
     for body in arguments.bodies.split(","):
         if not (arguments.output / f"{body}_{arguments.seed}.json").is_file():
             record(body, arguments.output, arguments.episodes, arguments.seed)
