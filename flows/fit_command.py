@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tasks.execution.temporary_server import prepare_prefect
+
+if TYPE_CHECKING:
+    from worldline_core.pipeline.pipeline_config import PipelineConfig
 
 SHARES = {
     "train_stage1": 0.2,
@@ -61,6 +65,41 @@ def overrides_of(minutes: float | None, gpu: str | None, ignored_after: int | No
     return tuple(changes)
 
 
+def check_sources(config: PipelineConfig, recordings: Path, file: Path) -> None:
+    """Raises: ConfigError: the file is of other recordings, or these have no controls."""
+    from worldline_core.errors import ConfigError
+
+    given, named = recordings.resolve(), [Path(str(source.path)).resolve() for source in config.curate.sources]
+    if not any(given.is_relative_to(path) or path.is_relative_to(given) for path in named):
+        raise ConfigError(
+            "The configuration is of other recordings", where=file, expected=str(given), got=", ".join(map(str, named)),
+            next_step="give another file (--config other.yaml), or its own recordings",
+        )  # fmt: skip
+    if {source.kind for source in config.curate.sources} == {"video_folder"}:
+        raise ConfigError(
+            "Videos alone say nothing about controls, which a simulator is driven by", where=given,
+            expected="recordings with states or actions", got="kind: video_folder",
+            next_step=f"Stage I learns from them: worldline task curate --config {file}, then filter, encode_latents, train_stage1",
+        )  # fmt: skip
+
+
+def check_card(config: PipelineConfig, file: Path, memory: str) -> None:
+    """Raises: UnavailableError: there is no GPU. ConfigError: a training does not fit so much memory."""
+    from worldline_core.config import validate
+    from worldline_core.errors import ConfigError
+    from worldline_core.model.tokenizers import require_device
+    from worldline_core.pipeline.size_sheet import SizeSheet
+
+    require_device("cuda")
+    card = {"config": config, "project": Path.cwd(), "devices": 1, "memory": memory}
+    rows = validate(SizeSheet, card, where="--gpu").rows()
+    if too_large := [row.title for row, setting in rows if setting]:
+        raise ConfigError(
+            "A training does not fit this card", where="--gpu", expected=memory, got=", ".join(too_large),
+            next_step=f"worldline plan --config {file} --gpus 1 --memory {memory}",
+        )  # fmt: skip
+
+
 def fit_command(arguments: argparse.Namespace) -> None:
     """Write the configuration or take the one that is there, check it, and run the flow."""
     from worldline_core.discovery.hub import fetch_dataset, hub_id
@@ -75,25 +114,14 @@ def fit_command(arguments: argparse.Namespace) -> None:
         write_config(found, arguments.config, arguments.recordings)
         print(as_text(found, arguments.config, []))
     changes = (*overrides_of(arguments.minutes, arguments.gpu, arguments.stop_when_ignored), *arguments.overrides)
-    from worldline_core.config import validate
     from worldline_core.pipeline.pipeline_config import PipelineConfig, check_recordings, check_weights
 
     config = PipelineConfig.load(None, arguments.config, changes)
+    check_sources(config, recordings, arguments.config)
     check_recordings(config, Path.cwd())
     check_weights(config, Path.cwd())
     if arguments.gpu is not None:
-        from worldline_core.errors import ConfigError
-        from worldline_core.model.tokenizers import require_device
-        from worldline_core.pipeline.size_sheet import SizeSheet
-
-        card = {"config": config, "project": Path.cwd(), "devices": 1, "memory": arguments.gpu}
-        rows = list(validate(SizeSheet, card, where="--gpu").rows())
-        if too_large := [row.title for row, setting in rows if setting]:
-            raise ConfigError(
-                "A training does not fit this card", where="--gpu", expected=arguments.gpu, got=", ".join(too_large),
-                next_step=f"worldline plan --config {arguments.config} --gpus 1 --memory {arguments.gpu}",
-            )  # fmt: skip
-        require_device("cuda")
+        check_card(config, arguments.config, arguments.gpu)
     prepare_prefect(arguments.artifacts)
     from flows.fit import fit
     from tasks.execution.prefect_artifacts import run_flow

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import flows.fit_command
 from flows.command_line import main
@@ -20,7 +21,7 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rollout.worldline import WorldLine
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "discovery"))
-from recorded_sets import SO_NAMES, motion, pictures, so101_states, write_lerobot, write_so101
+from recorded_sets import SO_NAMES, motion, pictures, so101_states, write_lerobot, write_so101, write_video
 
 
 @pytest.fixture
@@ -103,11 +104,38 @@ def test_it_stops_where_a_person_must_decide_and_goes_on_with_the_answer(
 
 
 @pytest.mark.slow
-def test_a_card_that_is_too_small_is_named_before_anything_runs(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_card_that_is_too_small_is_named_before_anything_runs(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_so101(here / "raw")
+    monkeypatch.setattr("worldline_core.model.tokenizers.require_device", lambda device: None)
     with pytest.raises(SystemExit, match="1"):
         main(["fit", "raw", "--gpu", "10MB"])
     assert "worldline plan --config my.yaml" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_missing_gpu_is_said_at_once(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_so101(here / "raw")
+    with pytest.raises(SystemExit, match="1"):
+        main(["fit", "raw", "--gpu", "24GB"])
+    assert "cuda" in capsys.readouterr().err
+
+
+def test_another_dataset_and_videos_alone_are_refused_before_anything_runs(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_so101(here / "raw")
+    main(["init", "raw"])
+    write_so101(here / "other")
+    with pytest.raises(SystemExit, match="1"):
+        main(["fit", "other"])
+    assert "of other recordings" in capsys.readouterr().err
+    frames = pictures(so101_states()[0][:, :5], "still")
+    write_video(here / "videos" / "one.mp4", frames, 30)
+    with pytest.raises(SystemExit, match="1"):
+        main(["fit", "videos", "--config", "videos.yaml"])
+    assert "video_folder" in capsys.readouterr().err and not (here / "artifacts" / "curate").exists()
 
 
 @pytest.mark.slow
