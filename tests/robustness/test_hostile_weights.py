@@ -150,8 +150,8 @@ CLIP = {"episode_id": "a", "start": 0, "num_frames": 5, "stride": 1}
 
 def write_shard(path: Path, clips: object = (CLIP,), **tensors: torch.Tensor) -> None:
     whole = {"nodes": torch.zeros(1, 2, 1, 1, 1, 2, 2).half(), "mask": torch.zeros(1, 1, 2, 2, 2).byte()} | tensors
-    listed = clips if isinstance(clips, str) else json.dumps(clips)
-    save_file(whole, path, metadata={"clips": listed, "views": '["head"]'})
+    listed = clips if isinstance(clips, str) else json.dumps([clips, ["head"]])
+    save_file(whole, path, metadata={"clips": listed})
 
 
 @pytest.fixture
@@ -165,7 +165,7 @@ def trajectories(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     "clips",
     [
-        "[" * 100_000, "{}", "[[]]", "[1]", [CLIP | {"start": "0"}], [CLIP | {"num_frames": 1e99}], [{"start": 1}], [],
+        "[" * 100_000, "{}", "[[]]", "[[1], [\"head\"]]", [CLIP | {"start": "0"}], [CLIP | {"num_frames": 1e99}], [{"start": 1}], [],
         [CLIP, CLIP], [CLIP | {"episode_id": 3}],
     ],
     ids=lambda clips: str(clips)[:30],
