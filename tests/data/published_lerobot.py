@@ -17,8 +17,8 @@ FRAMES, HEIGHT, WIDTH = 12, 72, 128
 
 def picture(seed: int, frame: int) -> np.ndarray:
     """(H, W, 3) with a block whose place tells the frame and whose colour tells the seed."""
-    image = np.full((HEIGHT, WIDTH, 3), (40 + 30 * seed, 90, 60), np.uint8)
-    image[20:52, 8 * frame : 8 * frame + 16] = (230, 200 - 20 * seed, 30)
+    image = np.full((HEIGHT, WIDTH, 3), (40 + 30 * (seed % 8), 90, 60), np.uint8)
+    image[20:52, 8 * frame : 8 * frame + 16] = (230, 200 - 20 * (seed % 8), 30)
     return image
 
 

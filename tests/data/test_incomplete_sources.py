@@ -6,30 +6,24 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
+import numpy as np
 import pytest
-from published_lerobot import FRAMES, write_droid
 
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode_set import EpisodeSet
+from tests.data import published_robomind as robomind
+from tests.data import test_source_robotwin as robotwin
+from tests.data import test_source_unitree_h5 as unitree
+from tests.data.curating import run
+from tests.data.published_lerobot import FRAMES, write_droid
+from tests.data.test_lerobot_rows import DATA, edit
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
 
 
 def videos(folder: Path, seed: int) -> dict[str, Any]:
-    import numpy as np
-
     folder.mkdir()
     frames = np.random.default_rng(seed).integers(0, 255, (6, 16, 24, 3), dtype=np.uint8)
     encode_video(folder / "one.mp4", frames, 5)
     return {"kind": "video_folder", "path": str(folder)}
-
-
-def run(tmp_path: Path, *sources: dict[str, Any], **changes: Any) -> tuple[dict[str, Any], EpisodeSet]:
-    counts = curate(CurateConfig.model_validate({"sources": sources, **changes}), {}, tmp_path / "out")
-    assert counts["kept"] + counts["quarantined"] == counts["found"]
-    return counts, EpisodeSet.open(tmp_path / "out")
 
 
 def test_patterns_that_include_nothing_are_an_error(tmp_path: Path) -> None:
@@ -58,8 +52,6 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_source_without_episodes_is_an_error(tmp_path: Path, kind: str) -> None:
-    if kind in ("agibot_world", "robomind", "robotwin", "unitree_h5"):
-        pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
     (tmp_path / "empty").mkdir()
     empty = {"kind": kind, "path": str(tmp_path / "empty"), "name": "emptied", **KINDS[kind]}
     said = "empty/(meta/info.json|index.parquet)" if kind in ("lerobot_v3", "episode_set") else "source emptied"
@@ -79,16 +71,10 @@ def droid(root: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def shortened(root: Path) -> None:
-    """The table of both episodes loses its last row."""
-    path = root / "data/chunk-000/file-000.parquet"
-    pq.write_table(pq.read_table(path).slice(0, 2 * FRAMES - 1), path)
-
-
 def test_videos_of_a_camera_and_rows_of_the_table_are_missing(tmp_path: Path) -> None:
     source = droid(tmp_path / "raw")
     (tmp_path / "raw/videos/observation.images.exterior_2_left/chunk-000/file-000.mp4").unlink()
-    shortened(tmp_path / "raw")
+    edit(tmp_path / "raw" / DATA, lambda table: table.slice(0, 2 * FRAMES - 1))
     with pytest.raises(DataError, match="2 quarantined") as refused:
         run(tmp_path, source)
     said = str(refused.value)
@@ -106,29 +92,16 @@ def test_videos_of_a_camera_and_rows_of_the_table_are_missing(tmp_path: Path) ->
 
 @pytest.mark.parametrize("kind", ["robomind", "robotwin", "unitree transitions", "unitree hdf5"])
 def test_a_camera_that_a_file_lacks_costs_its_view_alone(tmp_path: Path, kind: str) -> None:
-    pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
-    import published_robomind as robomind
-    import test_source_robotwin as robotwin
-    import test_source_unitree_h5 as unitree
-
     root = tmp_path / "raw"
-    match kind:
-        case "robomind":
-            robomind.write_franka(root)
-            source = {
-                "kind": kind,
-                "path": str(root),
-                "layout": "h5_franka_3rgb",
-                "fps": 10,
-                "gripper_state": robomind.GRIPPER,
-            }
-            source["views"] = {"head": "camera_top"}
-        case "robotwin":
-            robotwin.write_episode(root)
-            source = robotwin.settings(root, views={"head": "head_camera"})
-        case _:
-            (unitree.write_transitions if kind.endswith("transitions") else unitree.write_hdf5)(root)
-            source = unitree.settings(root, views={"head": "cam_left_high"})
+    if kind == "robomind":
+        robomind.write_franka(root)
+        source = {"kind": kind, "path": str(root), "views": {"head": "camera_top"}, **KINDS[kind], "fps": 10}
+    elif kind == "robotwin":
+        robotwin.write_episode(root)
+        source = robotwin.settings(root, views={"head": "head_camera"})
+    else:
+        (unitree.write_transitions if kind.endswith("transitions") else unitree.write_hdf5)(root)
+        source = unitree.settings(root, views={"head": "cam_left_high"})
     source["views"] |= {"left_wrist": "gone", "right_wrist": "gone_too"}
     with pytest.raises(DataError, match=r"(?s)2 things are wrong.*gone.*gone_too"):
         run(tmp_path, source)

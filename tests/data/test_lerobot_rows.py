@@ -11,10 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from published_lerobot import FRAMES, picture, wave, write_droid, write_robocoin
 
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
+from tests.data.curating import run
+from tests.data.published_lerobot import FRAMES, picture, wave, write_droid, write_robocoin
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 
@@ -22,6 +21,7 @@ DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 VIDEO = "videos/observation.images.exterior_1_left"
 RATE = 15
+V21 = {"kind": "lerobot_v21", "arms": None, "views": {"observation.images.cam_high_rgb": "head"}}
 
 
 def source(root: Path, **changes: Any) -> dict[str, Any]:
@@ -31,12 +31,6 @@ def source(root: Path, **changes: Any) -> dict[str, Any]:
         "views": {"observation.images.exterior_1_left": "head"},
         "arms": [{"name": "right", "state": {"joints": columns}}], **changes,
     }  # fmt: skip
-
-
-def run(tmp_path: Path, *sources: dict[str, Any], **changes: Any) -> tuple[dict[str, Any], EpisodeSet]:
-    counts = curate(CurateConfig.model_validate({"sources": sources, **changes}), {}, tmp_path / "out")
-    assert counts["kept"] + counts["quarantined"] == counts["found"]
-    return counts, EpisodeSet.open(tmp_path / "out")
 
 
 def edit(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
@@ -79,20 +73,14 @@ def shuffled(table: pa.Table) -> pa.Table:
     return table.take(pa.array(np.random.default_rng(0).permutation(len(table))))
 
 
-@pytest.mark.parametrize("change", [second_first, shuffled])
-def test_rows_are_found_by_their_numbers(tmp_path: Path, change: Any) -> None:
+@pytest.mark.parametrize(
+    ("file", "change", "found"), [(DATA, second_first, 2), (DATA, shuffled, 2), (EPISODES, without_first, 1)]
+)
+def test_rows_are_found_by_their_numbers(tmp_path: Path, file: str, change: Any, found: int) -> None:
     write_droid(tmp_path / "raw")
-    edit(tmp_path / "raw" / DATA, change)
+    edit(tmp_path / "raw" / file, change)
     counts, curated = run(tmp_path, source(tmp_path / "raw"))
-    assert counts["kept"] == 2
-    assert_paired(curated)
-
-
-def test_rows_of_a_removed_episode_are_passed_over(tmp_path: Path) -> None:
-    write_droid(tmp_path / "raw")
-    edit(tmp_path / "raw" / EPISODES, without_first)
-    counts, curated = run(tmp_path, source(tmp_path / "raw"))
-    assert (counts["found"], counts["kept"]) == (1, 1)
+    assert (counts["found"], counts["kept"]) == (found, found)
     assert_paired(curated)
 
 
@@ -111,9 +99,6 @@ def test_a_stale_data_file_is_searched_for(tmp_path: Path, stale: dict[str, Any]
     assert_paired(curated)
 
 
-BOTH = {"length_mismatch": 2}
-
-
 @pytest.mark.parametrize(
     ("file", "change", "said"),
     [
@@ -130,8 +115,7 @@ def test_rows_that_contradict_the_episode_list_are_refused(tmp_path: Path, file:
     write_droid(tmp_path / "raw")
     edit(tmp_path / "raw" / file, change)
     write_robocoin(tmp_path / "good")  # whose episode is kept
-    good = {"kind": "lerobot_v21", "arms": None, "views": {"observation.images.cam_high_rgb": "head"}}
-    counts, curated = run(tmp_path, source(tmp_path / "raw"), source(tmp_path / "good", **good))
+    counts, curated = run(tmp_path, source(tmp_path / "raw"), source(tmp_path / "good", **V21))
     assert set(counts["reasons"]) == {"length_mismatch"}
     assert said in curated.quarantine()[0].detail
     assert_paired(curated)
@@ -139,17 +123,13 @@ def test_rows_that_contradict_the_episode_list_are_refused(tmp_path: Path, file:
 
 def test_a_file_of_another_episode_is_refused_in_v21(tmp_path: Path) -> None:
     write_robocoin(tmp_path / "raw", episodes=3)
-    first, second = (tmp_path / f"raw/data/chunk-000/episode_{i:06d}.parquet" for i in (0, 1))
-    kept = first.read_bytes()
-    first.write_bytes(second.read_bytes())
-    second.write_bytes(kept)
-    third = tmp_path / "raw/data/chunk-000/episode_000002.parquet"
+    first, second, third = (tmp_path / f"raw/data/chunk-000/episode_{i:06d}.parquet" for i in range(3))
+    contents = second.read_bytes(), first.read_bytes()
+    for path, content in zip((first, second), contents, strict=True):
+        path.write_bytes(content)
     edit(third, lambda table: table.take(pa.array([1, 0, *range(2, FRAMES)])))
-    declared = source(
-        tmp_path / "raw", kind="lerobot_v21", arms=None, views={"observation.images.cam_high_rgb": "head"}
-    )
     with pytest.raises(DataError, match=r"(?s)3 quarantined.*expected: episode_index 0.*got: episode_index 1"):
-        run(tmp_path, declared)
+        run(tmp_path, source(tmp_path / "raw", **V21))
 
 
 def window(start: tuple[float, float], stop: tuple[float, float]) -> Callable[[pa.Table], pa.Table]:
@@ -178,19 +158,17 @@ def test_a_video_window_that_does_not_fit_is_named(tmp_path: Path, change: Any, 
     assert said in detail
 
 
-def test_windows_that_share_pictures_are_refused(tmp_path: Path) -> None:
+def test_windows_that_share_pictures_and_a_rate_that_the_video_leaves_are_refused(tmp_path: Path) -> None:
     write_droid(tmp_path / "raw")
+    whole = (tmp_path / "raw" / EPISODES).read_bytes()
     edit(tmp_path / "raw" / EPISODES, window((1, 12), (13, 24)))
     with pytest.raises(DataError, match=r"(?s)2 quarantined.*windows of two episodes overlap.*and episode 1"):
         run(tmp_path, source(tmp_path / "raw"))
-
-
-def test_a_rate_that_the_video_leaves_is_named(tmp_path: Path) -> None:
-    write_droid(tmp_path / "raw")
+    (tmp_path / "raw" / EPISODES).write_bytes(whole)
     info = tmp_path / "raw/meta/info.json"
     info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": 16}))
     with pytest.raises(DataError, match=r"(?s)2 quarantined.*fps"):
-        run(tmp_path, source(tmp_path / "raw"))
+        run(tmp_path / "second", source(tmp_path / "raw"))
 
 
 @pytest.mark.parametrize(

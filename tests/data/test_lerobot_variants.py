@@ -5,23 +5,31 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from PIL import Image
-from published_lerobot import FRAMES, picture, wave, write_droid, write_robocoin
-from test_lerobot_rows import DATA, EPISODES, edit, run, source, with_values
 
+from tests.data.curating import reasons, run, write_video
+from tests.data.published_lerobot import FRAMES, picture, wave, write_droid, write_robocoin
+from tests.data.test_lerobot_rows import DATA, EPISODES, edit, listed, source
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.sources.lerobot import flat_names
+from worldline_core.data.video.clip import VideoClip, decode_video
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.artifact_files import digest_folder
 
 HEAD = "observation.images.cam_high_rgb"
-V21 = {"kind": "lerobot_v21", "arms": None, "views": {HEAD: "head"}}
+
+
+def v21(root: Path, **changes: Any) -> dict[str, Any]:
+    return source(root, **{"kind": "lerobot_v21", "arms": None, "views": {HEAD: "head"}, **changes})
 
 
 def png(image: np.ndarray, kind: str = "PNG") -> bytes:
@@ -30,7 +38,7 @@ def png(image: np.ndarray, kind: str = "PNG") -> bytes:
     return stream.getvalue()
 
 
-def with_features(root: Path, change: Any, **keys: Any) -> None:
+def with_info(root: Path, change: Callable[[Any], object] = lambda features: None, **keys: Any) -> None:
     path = root / "meta/info.json"
     info = json.loads(path.read_text())
     change(info["features"])
@@ -39,7 +47,7 @@ def with_features(root: Path, change: Any, **keys: Any) -> None:
 
 def as_images(root: Path, key: str, data: str, images: list[Any]) -> None:
     """A camera's pictures in the table, as LeRobot stores them with `use_videos=False`."""
-    with_features(root, lambda features: features[key].update(dtype="image"))
+    with_info(root, lambda features: features[key].update(dtype="image"))
     shutil.rmtree(root / "videos", ignore_errors=True)
     edit(root / data, lambda table: table.append_column(key, pa.array(images)))
 
@@ -71,8 +79,8 @@ def test_images_of_version_21_and_what_is_wrong_with_some(tmp_path: Path) -> Non
     ]
     for number, images in enumerate(per_episode):
         as_images(tmp_path / "raw", HEAD, f"data/chunk-000/episode_{number:06d}.parquet", images)
-    counts, curated = run(tmp_path, source(tmp_path / "raw", **V21))
-    assert (counts["kept"], counts["reasons"]) == (2, {"missing_file": 1, "unreadable": 1})
+    counts, curated = run(tmp_path, v21(tmp_path / "raw"))
+    assert (counts["kept"], reasons(curated)) == (2, {"raw-000002": "missing_file", "raw-000003": "unreadable"})
     assert np.abs(curated.frames(1, "head", [0])[0].astype(int) - picture(3, 0)).mean() < 6
 
 
@@ -93,18 +101,36 @@ def test_names_in_groups_are_joined(names: Any, flat: list[str]) -> None:
     assert flat_names({"names": names}) == flat
 
 
-def test_byte_order_marks_and_numbers_with_a_fraction_of_zero(tmp_path: Path) -> None:
+def test_declared_units_and_what_single_episodes_lack(tmp_path: Path) -> None:
+    raw = tmp_path / "raw"
+    state = write_robocoin(raw, episodes=3)
+    (raw / "data/chunk-000/episode_000001.parquet").unlink()
+    edit(raw / "data/chunk-000/episode_000002.parquet", lambda table: table.slice(0, FRAMES - 1))
+    grippers = {f"{arm}_gripper_open_scale": {"closed": 0.1, "open": 0.8} for arm in ("left", "right")}
+    _, curated = run(tmp_path, v21(raw, angle_unit="deg", grippers=grippers))
+    assert reasons(curated) == {"raw-000001": "missing_file", "raw-000002": "length_mismatch"}
+    opening, episode = (state[:, 6] - 0.1) / 0.7, curated.episode(0)
+    assert np.allclose(episode.state[:, :6], np.deg2rad(state[:, :6]), atol=1e-6)
+    assert np.allclose(episode.state[:, 6], opening.clip(0, 1), atol=1e-6)
+    # Both grippers open alike, in states and in actions.
+    assert episode.conventions["gripper_overshoot"] == 4 * ((opening < 0) | (opening > 1)).sum()
+    with pytest.raises(ValueError, match="angle_unit"):
+        run(tmp_path, v21(raw, angle_unit=None))
+
+
+def test_byte_order_marks_numbers_with_a_fraction_of_zero_and_version_2_0(tmp_path: Path) -> None:
     root = tmp_path / "raw"
     write_robocoin(root, episodes=2)
-    with_features(root, lambda features: None, chunks_size=1000.0)
+    with_info(root, chunks_size=1000.0, codebase_version="v2.0")
     listed = [{"episode_index": float(i), "tasks": ["push"], "length": float(FRAMES)} for i in range(2)]
     (root / "meta/episodes.jsonl").write_text("\n".join(map(json.dumps, listed)))
     for name in ("info.json", "tasks.jsonl", "episodes.jsonl"):
         path = root / "meta" / name
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    counts, curated = run(tmp_path, source(root, **V21))
+    counts, curated = run(tmp_path, v21(root))
     assert counts["kept"] == 2
     assert curated.rows[0].instruction == "move the bread"
+    assert curated.episode(0).conventions["layout"] == "lerobot v2.0"
 
 
 @pytest.mark.parametrize(
@@ -116,25 +142,20 @@ def test_a_line_that_is_no_episode_is_one_message(tmp_path: Path, line: str) -> 
     with (tmp_path / "raw/meta/episodes.jsonl").open("a") as file:
         file.write(f"\n{line}\n")
     with pytest.raises(DataError, match=r"numbers no episodes[\s\S]*episodes\.jsonl"):
-        run(tmp_path, source(tmp_path / "raw", **V21))
+        run(tmp_path, v21(tmp_path / "raw"))
 
 
 @pytest.mark.parametrize("index", [float("nan"), None, 1e300, -1.0, 0.5])
 def test_a_task_index_that_is_no_index_costs_its_episode(tmp_path: Path, index: float | None) -> None:
     write_droid(tmp_path / "raw")
-    values = [index] * FRAMES + [0.0] * FRAMES
-    edit(tmp_path / "raw" / DATA, lambda table: with_values(table, task_index=values))
+    edit(tmp_path / "raw" / DATA, listed(task_index=[index] * FRAMES + [0.0] * FRAMES))
     counts, _ = run(tmp_path, source(tmp_path / "raw"))
     assert (counts["kept"], set(counts["reasons"]) <= {"missing_column", "nan_state"}) == (1, True)
 
 
 def test_lengths_in_version_3_may_be_floats_but_no_fractions(tmp_path: Path) -> None:
     write_droid(tmp_path / "raw")
-    at = pq.read_table(tmp_path / "raw" / EPISODES).column_names.index("length")
-    edit(
-        tmp_path / "raw" / EPISODES,
-        lambda table: table.set_column(at, "length", pa.array([float(FRAMES), FRAMES + 0.5])),
-    )
+    edit(tmp_path / "raw" / EPISODES, listed(length=[float(FRAMES), FRAMES + 0.5]))
     counts, curated = run(tmp_path, source(tmp_path / "raw"))
     assert (counts["kept"], counts["reasons"]) == (1, {"unreadable": 1})
     assert "a whole number" in curated.quarantine()[0].detail
@@ -146,36 +167,26 @@ def test_lengths_in_version_3_may_be_floats_but_no_fractions(tmp_path: Path) -> 
         ({"codebase_version": "v1.6"}, r"got: v1\.6.*next step: convert"),
         ({"codebase_version": "v3.0"}, r"got: v3\.0.*next step: set kind: lerobot_v3"),
         ({"storage_format": "lance"}, r"storage_format: parquet.*got: lance.*next step: export"),
+        ({"codebase_version": "v4.0"}, r"expected: v2\.1.*got: v4\.0"),
     ],
 )
 def test_other_formats_name_the_next_step(tmp_path: Path, keys: dict[str, Any], said: str) -> None:
     write_robocoin(tmp_path / "raw")
-    with_features(tmp_path / "raw", lambda features: None, **keys)
+    with_info(tmp_path / "raw", **keys)
     with pytest.raises(DataError, match=f"(?s){said}"):
-        run(tmp_path, source(tmp_path / "raw", **V21))
-
-
-def test_version_2_0_differs_in_its_statistics_alone(tmp_path: Path) -> None:
-    write_robocoin(tmp_path / "raw")
-    with_features(tmp_path / "raw", lambda features: None, codebase_version="v2.0")
-    counts, curated = run(tmp_path, source(tmp_path / "raw", **V21))
-    assert counts["kept"] == 1
-    assert curated.episode(0).conventions["layout"] == "lerobot v2.0"
+        run(tmp_path, v21(tmp_path / "raw"))
 
 
 def test_a_dataset_that_does_not_fit_never_stops_the_collection(tmp_path: Path) -> None:
     for name in ("good", "other_cameras", "other_state", "lance"):
         write_robocoin(tmp_path / "raw" / name)
-    with_features(tmp_path / "raw/other_cameras", lambda features: features.pop(HEAD))
-    with_features(tmp_path / "raw/other_state", lambda features: features["observation.state"].update(names=None))
-    with_features(tmp_path / "raw/lance", lambda features: None, storage_format="lance")
-    arm = {
-        "name": "right",
-        "state": {"joints": {"feature": "observation.state", "columns": ["right_arm_joint_*_rad"]}},
-    }
-    declared = source(tmp_path / "raw", **(V21 | {"collection": True, "arms": [arm]}))
+    with_info(tmp_path / "raw/other_cameras", lambda features: features.pop(HEAD))
+    with_info(tmp_path / "raw/other_state", lambda features: features["observation.state"].update(names=None))
+    with_info(tmp_path / "raw/lance", storage_format="lance")
+    joints = {"feature": "observation.state", "columns": ["right_arm_joint_*_rad"]}
+    declared = v21(tmp_path / "raw", collection=True, arms=[{"name": "right", "state": {"joints": joints}}])
     counts, curated = run(tmp_path, declared)
-    assert (counts["found"], counts["kept"], counts["quarantined"]) == (4, 1, 3)
+    assert (counts["kept"], counts["quarantined"]) == (1, 3)
     details = {row.episode_id: row.detail for row in curated.quarantine()}
     assert "no camera" in details["raw-other_cameras"]
     assert "no such column" in details["raw-other_state"]
@@ -185,28 +196,19 @@ def test_a_dataset_that_does_not_fit_never_stops_the_collection(tmp_path: Path) 
 
 def test_a_camera_that_a_dataset_lacks_is_absent(tmp_path: Path) -> None:
     write_robocoin(tmp_path / "raw")
-    views = {HEAD: "head", "observation.images.cam_left_wrist": "left_wrist"}
-    declared = source(tmp_path / "raw", **(V21 | {"views": views}))
+    declared = v21(tmp_path / "raw", views={HEAD: "head", "observation.images.cam_left_wrist": "left_wrist"})
     with pytest.raises(DataError, match=r"(?s)missing_view.*no such camera.*cam_left_wrist.*cam_left_wrist_rgb"):
         run(tmp_path, declared)
-    counts, curated = run(tmp_path / "available", declared, views="available")
-    assert counts["kept"] == 1
+    _, curated = run(tmp_path / "available", declared, views="available")
     assert curated.rows[0].views == ("head",)
-
-
-def test_all_that_a_configuration_asks_for_in_vain_is_one_message(tmp_path: Path) -> None:
-    write_robocoin(tmp_path / "raw")
     wrong = {"views": {"none": "head"}, "grippers": {"finger": {"closed": 0, "open": 1}}, "success_column": "won"}
     with pytest.raises(ConfigError, match=r"(?s)no camera and no state column and no feature .*got: none; finger; won"):
-        run(tmp_path, source(tmp_path / "raw", **(V21 | wrong)))
+        run(tmp_path, v21(tmp_path / "raw", **wrong))
 
 
 def test_pictures_of_an_unknown_robot_need_no_arms(tmp_path: Path) -> None:
     write_robocoin(tmp_path / "raw")
-    counts, curated = run(
-        tmp_path, source(tmp_path / "raw", **(V21 | {"embodiment": "none", "angle_unit": "range_m100_100"}))
-    )
-    assert counts["kept"] == 1
+    _, curated = run(tmp_path, v21(tmp_path / "raw", embodiment="none", angle_unit="range_m100_100"))
     assert (curated.episode(0).state_kind, curated.episode(0).state.shape) == ("none", (FRAMES, 0))
 
 
@@ -229,7 +231,7 @@ def test_links_of_the_hubs_cache_are_followed_and_no_others(tmp_path: Path) -> N
     assert counts["kept"] == 2
     assert digest_folder(snapshot) == digest_folder(tmp_path / "raw")
     write_robocoin(tmp_path / "old")
-    counts, _ = run(tmp_path / "v21", source(cached(tmp_path / "old", tmp_path / "other"), **V21))
+    counts, _ = run(tmp_path / "v21", v21(cached(tmp_path / "old", tmp_path / "other")))
     assert counts["kept"] == 1
     # Into the blobs of another repository, beside them, or anywhere else: refused.
     for target in (tmp_path / "other/datasets--a--b/blobs/0", tmp_path / "raw" / DATA):
@@ -252,23 +254,29 @@ def test_all_missing_files_of_version_3_are_said_at_once(tmp_path: Path, info: b
         run(tmp_path, source(tmp_path / "raw"))
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)  # importing LeRobot alone takes minutes on a busy machine
-def test_images_and_stale_file_numbers_as_lerobots_own_class_writes_and_reads_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def lerobot_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    return LeRobotDataset
+
+
+def pixels(item: Any, key: str) -> np.ndarray:
+    return (item[key].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)  # importing LeRobot alone takes minutes on a busy machine
+def test_images_and_stale_file_numbers_as_lerobots_own_class_writes_and_reads_them(
+    tmp_path: Path, lerobot_class: Any
+) -> None:
     key, root = "observation.images.front", tmp_path / "raw"
-    names = [f"joint_{i}" for i in range(7)]
-    features = {
-        key: {"dtype": "image", "shape": (72, 128, 3), "names": ["height", "width", "channels"]},
-        "observation.state": {"dtype": "float32", "shape": (7,), "names": names},
-        "action": {"dtype": "float32", "shape": (7,), "names": names},
-    }
-    written: Any = LeRobotDataset.create("local/raw", 15, features, root=root, use_videos=False)
+    vector = {"dtype": "float32", "shape": (7,), "names": [f"joint_{i}" for i in range(7)]}
+    image = {"dtype": "image", "shape": (72, 128, 3), "names": ["height", "width", "channels"]}
+    features = {key: image, "observation.state": vector, "action": vector}
+    written = lerobot_class.create("local/raw", 15, features, root=root, use_videos=False)
     for number in range(2):
         for frame in range(FRAMES):
             state = wave(7, number)[frame].astype(np.float32)
@@ -278,15 +286,44 @@ def test_images_and_stale_file_numbers_as_lerobots_own_class_writes_and_reads_th
         written.save_episode()
     written.finalize()
     for path in (root / "meta/episodes").rglob("*.parquet"):
-        table = pq.read_table(path)
-        at = table.column_names.index("data/file_index")
-        pq.write_table(table.set_column(at, "data/file_index", pa.array([5, 6])), path)
-    opened: Any = LeRobotDataset("local/raw", root=root)
+        edit(path, listed(data__file_index=[5, 6]))
+    opened = lerobot_class("local/raw", root=root)
     counts, curated = run(tmp_path, source(root, views={key: "head"}))
     assert counts["kept"] == 2
     for number, frame in ((0, 0), (0, FRAMES - 1), (1, 0), (1, 5)):
         item = opened[number * FRAMES + frame]
         assert np.array_equal(curated.episode(number).state[frame], item["observation.state"].numpy())
         assert curated.rows[number].instruction == item["task"]
-        shown = (item[key].permute(1, 2, 0).numpy() * 255).round().astype(int)
-        assert np.abs(curated.frames(number, "head", [frame])[0].astype(int) - shown).mean() < 6
+        assert np.abs(curated.frames(number, "head", [frame])[0].astype(int) - pixels(item, key)).mean() < 6
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_lerobots_own_class_reads_what_is_written_here(tmp_path: Path, sample: Any, lerobot_class: Any) -> None:
+    with EpisodeSetWriter(tmp_path / "set") as writer:
+        for number in range(3):
+            writer.add(*sample(number, num_frames=5 + number))
+    stored = EpisodeSet.open(tmp_path / "set")
+    opened = lerobot_class("local/set", root=tmp_path / "set/datasets/ur5e_pair", video_backend="pyav")
+    assert (opened.num_episodes, len(opened), opened.fps) == (3, 5 + 6 + 7, 8)
+    assert opened.meta.stats["observation.state"]["mean"].shape == (14,)
+    for position, (episode, frame) in {0: (0, 0), 4: (0, 4), 5: (1, 0), 12: (2, 1), 17: (2, 6)}.items():
+        item = opened[position]
+        assert (int(item["episode_index"]), int(item["frame_index"])) == (episode, frame)
+        assert np.array_equal(item["observation.state"].numpy(), stored.episode(episode).state[frame])
+        assert np.array_equal(item["action"].numpy(), stored.episode(episode).action[frame])
+        assert item["task"] == stored.rows[episode].instruction
+        for view in stored.rows[episode].views:
+            assert np.array_equal(pixels(item, f"observation.images.{view}"), stored.frames(episode, view, [frame])[0])
+    # Videos copied as they were recorded, with frames stored out of order, one file an episode.
+    shown = {}
+    with EpisodeSetWriter(tmp_path / "copied") as writer:
+        for number in range(2):
+            episode, frames, _ = sample(number, num_frames=15)
+            path = write_video(tmp_path / f"{number}.mp4", frames["head"], options={"bf": "3"})
+            shown[number] = decode_video(path)
+            recorded = RecordedView(lambda: iter(()), 15, VideoClip.whole_file(path, 15, 8.0))
+            writer.add(replace(episode, cameras={"head": episode.cameras["head"]}), {"head": recorded})
+    copied = lerobot_class("local/copied", root=tmp_path / "copied/datasets/ur5e_pair", video_backend="pyav")
+    for position in (0, 1, 7, 14, 15, 22, 29):
+        assert np.array_equal(pixels(copied[position], "observation.images.head"), shown[position // 15][position % 15])

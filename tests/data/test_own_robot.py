@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from published_lerobot import write_droid
 from pydantic import ValidationError
-from test_lerobot_rows import run, source
 
-from worldline_core.data.curation.curate import curate
+from tests.data.curating import run
+from tests.data.published_lerobot import write_droid
+from tests.data.test_lerobot_rows import source
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
@@ -55,21 +55,17 @@ def test_recordings_of_an_own_robot_carry_it(working_folder: Path, folder: str, 
     write_droid(working_folder / "raw")
     counts, curated = run(working_folder, source(working_folder / "raw", embodiment=named, arms=[ARM]))
     assert (counts["kept"], {row.embodiment for row in curated.rows}) == (2, {"my_arm"})
-    filter_episodes(
-        FilterConfig(min_segment_frames=5),
-        {"episodes": working_folder / "out"},
-        working_folder / "filtered",
-    )
+    filtered = working_folder / "filtered"
+    filter_episodes(FilterConfig(min_segment_frames=5), {"episodes": working_folder / "out"}, filtered)
     # The files that it was described by may go, and another process knows only the set.
     expected = ArmKinematics(load_embodiment(robot)).tool_poses(np.zeros((1, 8)))
     robot.rename(working_folder / "elsewhere.yaml")
     embodiments._carried.clear()
     assert "my_arm" not in embodiment_names()
-    again = {"kind": "episode_set", "path": str(working_folder / "out"), "name": "again"}
-    curate(CurateConfig.model_validate({"sources": [again]}), {}, working_folder / "again")
-    assert (working_folder / "again/embodiments/my_arm.yaml").is_file()
+    run(working_folder / "again", {"kind": "episode_set", "path": str(working_folder / "out"), "name": "again"})
+    assert (working_folder / "again/out/embodiments/my_arm.yaml").is_file()
     embodiments._carried.clear()
-    EpisodeSet.open(working_folder / "filtered")
+    EpisodeSet.open(filtered)
     assert "my_arm" in embodiment_names()
     assert np.array_equal(ArmKinematics(load_embodiment("my_arm")).tool_poses(np.zeros((1, 8))), expected)
 
@@ -97,9 +93,6 @@ def test_one_name_is_one_robot(working_folder: Path) -> None:
     second.write_text(second.read_text().replace("0.155", "0.2"))
     with pytest.raises(ConfigError, match=r"(?s)Two files describe one robot differently.*my_arm"):
         embodiments.carry_embodiments([first, second])
-    for wrong, message in (
-        ("gone.yaml", "gone.yaml"),
-        ("my_robot", "configs/embodiments/my_robot.yaml to the working"),
-    ):
+    for wrong, message in (("gone.yaml", "gone.yaml"), ("my_robot", "configs/embodiments/my_robot.yaml")):
         with pytest.raises((ValidationError, ConfigError), match=message):
             CurateConfig.model_validate({"sources": [source(working_folder, embodiment=wrong)]})

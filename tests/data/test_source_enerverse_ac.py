@@ -8,17 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
-
-from damaged_hdf5 import Damage, kept_beside, replaced, without
-
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode_set import EpisodeSet
+from tests.data.curating import Damage, check_faults, replaced, run, with_nan, without
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.agibot import EnerverseAcSourceConfig
 from worldline_core.data.sources.open import open_source
@@ -131,9 +126,8 @@ def test_clips_come_through_curation(tmp_path: Path, first_frame: bool) -> None:
     write_clip(tmp_path / "raw", first_frame=first_frame)
     write_clip(tmp_path / "raw", "296-655235-3", 30, joints=False, first_frame=first_frame)
     write_clip(tmp_path / "raw", "task_1/episode_4", 60, first_frame=first_frame)
-    counts = curate(CurateConfig.model_validate({"sources": [settings(tmp_path / "raw")]}), {}, tmp_path / "out")
-    assert (counts["found"], counts["kept"], counts["reasons"]) == (3, 3, {})
-    curated = EpisodeSet.open(tmp_path / "out")
+    counts, curated = run(tmp_path, settings(tmp_path / "raw"))
+    assert (counts["found"], counts["reasons"]) == (3, {})
     assert {row.episode_id: row.scene for row in curated.rows} == {
         "evac-296-655235-2": "evac-296",  # steps of one task, of which several may be of one recording
         "evac-296-655235-3": "evac-296",
@@ -156,35 +150,26 @@ def rewritten(name: str, change: Callable[[Any], Any]) -> Damage:
         path = folder / name
         if name.endswith(".npy"):
             np.save(path, change(np.load(path)))
-        elif name.endswith(".json"):
-            path.write_text(json.dumps(change(json.loads(path.read_text()))))
         else:
-            content = path.read_bytes()
-            path.write_bytes(change(content))
+            path.write_text(json.dumps(change(json.loads(path.read_text()))))
 
     return damage
 
 
-def dataset(key: str, change: Callable[[np.ndarray], Any] | None) -> Damage:
-    damage = without(key) if change is None else replaced(key, lambda values: change(values.astype(float)))
+def h5(damage: Damage) -> Damage:
     return lambda folder: damage(folder / "proprio_stats.h5")
 
 
-def first(value: float) -> Callable[[np.ndarray], np.ndarray]:
-    def change(values: np.ndarray) -> np.ndarray:
-        values[2] = value
-        return values
+def gone(name: str) -> Damage:
+    return lambda folder: (folder / name).unlink()
 
-    return change
+
+def cut_to(name: str, part: slice) -> Damage:
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[part])
 
 
 def link_out(name: str) -> Damage:
-    def damage(folder: Path) -> None:
-        outside = folder.parents[1] / f"outside_{name}"
-        (folder / name).rename(outside)
-        (folder / name).symlink_to(outside)
-
-    return damage
+    return lambda folder: (folder / name).symlink_to((folder / name).rename(folder.parents[1] / name))
 
 
 def video(length: int, fps: float) -> Damage:
@@ -192,49 +177,42 @@ def video(length: int, fps: float) -> Damage:
     return lambda folder: encode_video(folder / "head_color.mp4", frames, fps, preset="ultrafast")
 
 
-def cut_file(folder: Path) -> None:
-    content = (folder / "action.npy").read_bytes()
-    (folder / "action.npy").write_bytes(content[:-8])
+PROPRIO, TURN, POSES = "proprio_stats.h5", "state/end/orientation", "head_extrinsic_params_aligned.json"
+FAULTS: dict[Write, dict[str, tuple[Damage, str]]] = {
+    write_clip: {
+        "no proprioception": (gone(PROPRIO), "missing_file"),
+        "no video": (gone("head_color.mp4"), "missing_file"),
+        "no intrinsics": (gone("head_intrinsic_params.json"), "missing_file"),
+        "no end poses": (h5(without("state/end/position")), "missing_column"),
+        "no commands of the grippers": (h5(without("action/effector/position")), "missing_column"),
+        "NaN place": (h5(replaced("state/end/position", with_nan)), "nan_state"),
+        "turn without direction": (h5(replaced(TURN, np.zeros_like)), "nan_state"),
+        "NaN joint": (h5(replaced("state/joint/position", with_nan)), "nan_state"),
+        "hands": (h5(replaced("state/effector/position", lambda v: np.repeat(v, 6, axis=1))), "invalid_gripper"),
+        "a joint less": (h5(replaced("state/joint/position", lambda v: v[:, 1:])), "length_mismatch"),
+        "a command less": (h5(replaced("action/joint/position", lambda v: v[1:])), "length_mismatch"),
+        "a camera pose less": (rewritten(POSES, lambda poses: poses[1:]), "length_mismatch"),
+        "another rate": (video(LENGTH, 15.0), "wrong_fps"),
+        "a frame less": (video(LENGTH - 1, 30.0), "truncated_video"),
+        "a file elsewhere": (link_out(PROPRIO), "path_traversal"),
+    },
+    write_arrays: {
+        "no array of actions": (gone("action.npy"), "missing_file"),
+        "narrow array": (rewritten("action.npy", lambda v: v[:, :14]), "length_mismatch"),
+        "NaN in the array": (rewritten("action.npy", with_nan), "nan_state"),
+        "no rotation": (rewritten("extrinsics.npy", lambda v: 2 * v), "invalid_extrinsics"),
+        "singular K": (rewritten("intrinsics.npy", np.zeros_like), "singular_intrinsics"),
+        "no picture": (gone("frame.png"), "missing_file"),
+        "truncated picture": (cut_to("frame.png", slice(60)), "unreadable"),
+        "truncated array": (cut_to("action.npy", slice(-8)), "unreadable"),
+        "an array elsewhere": (link_out("action.npy"), "path_traversal"),
+    },
+}
 
 
-FAULTS: dict[str, tuple[Write, Damage, str]] = {
-    "no proprioception": (write_clip, lambda f: (f / "proprio_stats.h5").unlink(), "missing_file"),
-    "no video": (write_clip, lambda f: (f / "head_color.mp4").unlink(), "missing_file"),
-    "no intrinsics": (write_clip, lambda f: (f / "head_intrinsic_params.json").unlink(), "missing_file"),
-    "no end poses": (write_clip, dataset("state/end/position", None), "missing_column"),
-    "no commands of the grippers": (write_clip, dataset("action/effector/position", None), "missing_column"),
-    "NaN place": (write_clip, dataset("state/end/position", first(np.nan)), "nan_state"),
-    "turn without direction": (write_clip, dataset("state/end/orientation", first(0)), "nan_state"),
-    "NaN joint": (write_clip, dataset("state/joint/position", first(np.nan)), "nan_state"),
-    "hands": (write_clip, dataset("state/effector/position", lambda v: np.repeat(v, 6, axis=1)), "invalid_gripper"),
-    "a joint less": (write_clip, dataset("state/joint/position", lambda v: v[:, 1:]), "length_mismatch"),
-    "a command less": (write_clip, dataset("action/joint/position", lambda v: v[1:]), "length_mismatch"),
-    "a camera pose less": (
-        write_clip, rewritten("head_extrinsic_params_aligned.json", lambda poses: poses[1:]), "length_mismatch",
-    ),
-    "truncated video": (write_clip, rewritten("head_color.mp4", lambda c: c[: len(c) // 2]), "truncated_video"),
-    "truncated file": (write_clip, rewritten("proprio_stats.h5", lambda c: c[: len(c) // 2]), "unreadable"),
-    "another rate": (write_clip, video(LENGTH, 15.0), "wrong_fps"),
-    "a frame less": (write_clip, video(LENGTH - 1, 30.0), "truncated_video"),
-    "a file elsewhere": (write_clip, link_out("proprio_stats.h5"), "path_traversal"),
-    "no array of actions": (write_arrays, lambda f: (f / "action.npy").unlink(), "missing_file"),
-    "narrow array": (write_arrays, rewritten("action.npy", lambda v: v[:, :14]), "length_mismatch"),
-    "NaN in the array": (write_arrays, rewritten("action.npy", first(np.nan)), "nan_state"),
-    "no rotation": (write_arrays, rewritten("extrinsics.npy", lambda v: 2 * v), "invalid_extrinsics"),
-    "singular K": (write_arrays, rewritten("intrinsics.npy", lambda v: 0 * v), "singular_intrinsics"),
-    "no picture": (write_arrays, lambda f: (f / "frame.png").unlink(), "missing_file"),
-    "truncated picture": (write_arrays, rewritten("frame.png", lambda c: c[: len(c) // 2]), "unreadable"),
-    "truncated array": (write_arrays, cut_file, "unreadable"),
-    "an array elsewhere": (write_arrays, link_out("action.npy"), "path_traversal"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_has_its_reason_and_costs_no_other_clip(tmp_path: Path, fault: str) -> None:
-    write, damage, reason = FAULTS[fault]
-    damage(write(tmp_path / "raw", "9-9-9"))
-    write(tmp_path / "raw", "1-2-3", 40)  # a sound neighbour
-    assert kept_beside(settings(tmp_path / "raw"), tmp_path / "out", reason) == "evac-1-2-3"
+@pytest.mark.parametrize("write", FAULTS)
+def test_each_fault_has_its_reason_and_costs_no_other_clip(tmp_path: Path, write: Write) -> None:
+    check_faults(tmp_path / "raw", settings(tmp_path), lambda root, n: write(root, f"9-9-{n}", n), FAULTS[write])
 
 
 def test_a_single_picture_is_of_the_declared_head_camera(tmp_path: Path) -> None:

@@ -7,17 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
-h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
-
-from damaged_hdf5 import Damage, cut, kept_beside, replaced, with_nan, without
-
-from worldline_core.data.curation.curate import curate
+from tests.data.curating import Damage, check_faults, replaced, run, with_nan, without
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
 
 LENGTH, HEIGHT, WIDTH = 6, 48, 64
@@ -74,9 +70,8 @@ def settings(root: Path, **changes: Any) -> dict[str, Any]:
 def test_published_layout_comes_through_curation(tmp_path: Path) -> None:
     write_episode(tmp_path / "raw")
     write_episode(tmp_path / "raw", 1)
-    counts = curate(CurateConfig.model_validate({"sources": [settings(tmp_path / "raw")]}), {}, tmp_path / "out")
-    assert (counts["found"], counts["kept"], counts["splits"]) == (2, 2, {"test": 2})
-    curated = EpisodeSet.open(tmp_path / "out")
+    counts, curated = run(tmp_path, settings(tmp_path / "raw"))
+    assert (counts["found"], counts["splits"]) == (2, {"test": 2})
     row, episode = curated.rows[0], curated.episode(0)
     assert row.episode_id == "robotwin-beat_block_hammer-demo_clean-data-episode0"
     assert (row.num_frames, row.fps, row.stage2_ok) == (LENGTH, 10.0, True)
@@ -107,8 +102,6 @@ def zoomed(values: np.ndarray) -> np.ndarray:
 
 HEAD = "observation/head_camera"
 FAULTS: dict[str, tuple[Damage, str]] = {
-    "truncated": (cut, "unreadable"),
-    "no HDF5": (lambda path: path.write_bytes(b"nothing of the kind"), "unreadable"),
     "no end poses": (without("endpose"), "missing_column"),
     "no camera": (without(HEAD), "missing_view"),
     "no calibration": (without(f"{HEAD}/extrinsic_cv"), "missing_column"),
@@ -119,46 +112,29 @@ FAULTS: dict[str, tuple[Damage, str]] = {
     "pose never written": (replaced("endpose/right_endpose", np.zeros_like), "nan_state"),
     "camera matrices disagree": (replaced(f"{HEAD}/cam2world_gl", shifted), "invalid_extrinsics"),
     "extrinsics the other way round": (
-        replaced(f"{HEAD}/extrinsic_cv", lambda _: camera_pose(1)[:, :3]),
-        "invalid_extrinsics",
+        replaced(f"{HEAD}/extrinsic_cv", lambda _: camera_pose(1)[:, :3]), "invalid_extrinsics",
     ),
     "zoom": (replaced(f"{HEAD}/intrinsic_cv", zoomed), "singular_intrinsics"),
     "no image": (replaced(f"{HEAD}/rgb", lambda images: np.array([b"jpeg"] * LENGTH)), "unreadable"),
     "raw images": (replaced(f"{HEAD}/rgb", lambda _: np.zeros((LENGTH, HEIGHT, WIDTH, 3), np.uint8)), "unreadable"),
     "instructions of another form": (
-        lambda path: (path.parents[1] / "instructions" / f"{path.stem}.json").write_text("[]"),
-        "missing_column",
+        lambda path: (path.parents[1] / "instructions" / f"{path.stem}.json").write_text("[]"), "missing_column",
     ),
-}
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_quarantines_its_episode_alone(tmp_path: Path, fault: str) -> None:
-    damage, reason = FAULTS[fault]
-    damage(write_episode(tmp_path / "raw"))
-    write_episode(tmp_path / "raw", 1)
-    assert kept_beside(settings(tmp_path / "raw"), tmp_path / "out", reason).endswith("episode1")
+def test_a_fault_quarantines_its_episode_alone(tmp_path: Path) -> None:
+    check_faults(tmp_path / "raw", settings(tmp_path), write_episode, FAULTS)
 
 
 @pytest.mark.parametrize("split", ["train", "validation"])
-@pytest.mark.parametrize("kind", ["robotwin", "droid_annotation"])
-def test_evaluation_sources_are_refused_as_training_data(tmp_path: Path, kind: str, split: str) -> None:
-    source = {"kind": kind, "path": str(tmp_path), "split": split} | ({"fps": 10} if kind == "robotwin" else {})
-    with pytest.raises(ValidationError, match=f"evaluation only: split {split} is refused"):
-        CurateConfig.model_validate({"sources": [source]})
-
-
-@pytest.mark.parametrize("split", ["train", "validation"])
-def test_split_patterns_cannot_bring_them_into_training(tmp_path: Path, split: str) -> None:
+def test_evaluation_sources_are_refused_as_training_data(tmp_path: Path, split: str) -> None:
+    for source in (
+        settings(tmp_path, split=split),
+        {"kind": "droid_annotation", "path": str(tmp_path), "split": split},
+    ):
+        with pytest.raises(ValidationError, match=f"evaluation only: split {split} is refused"):
+            CurateConfig.model_validate({"sources": [source]})
     write_episode(tmp_path / "raw")
-    config = CurateConfig.model_validate({"sources": [settings(tmp_path / "raw")], "splits": {"robotwin-*": split}})
     with pytest.raises(ConfigError, match=r"(?s)evaluation only.*beat_block_hammer.*" + split):
-        curate(config, {}, tmp_path / "out")
-
-
-def test_nor_can_curating_a_curated_set_again(tmp_path: Path) -> None:
-    write_episode(tmp_path / "raw")
-    curate(CurateConfig.model_validate({"sources": [settings(tmp_path / "raw")]}), {}, tmp_path / "once")
-    again = {"sources": [{"kind": "episode_set", "path": str(tmp_path / "once")}], "splits": {"*": "train"}}
-    with pytest.raises(ConfigError, match="evaluation only"):
-        curate(CurateConfig.model_validate(again), {}, tmp_path / "twice")
+        run(tmp_path, settings(tmp_path / "raw"), splits={"robotwin-*": split})

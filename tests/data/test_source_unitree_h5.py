@@ -7,17 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
-h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
-
-from damaged_hdf5 import Damage, cut, kept_beside, replaced, with_nan, without
-
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode_set import EpisodeSet
+from tests.data.curating import Damage, check_faults, cut, replaced, run, with_nan, without
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.open import open_source
 from worldline_core.data.sources.unitree_h5 import UnitreeH5SourceConfig
@@ -48,10 +43,8 @@ def motors(robot: str = "g1_dex1", offset: float = 0.0) -> np.ndarray:
 
 def pictures(shade: int = 0) -> np.ndarray:
     """Reddish ramps that change from frame to frame."""
-    ramp = np.linspace(40, 160, WIDTH)[None, None, :] + 6 * np.arange(LENGTH)[:, None, None] + shade
-    return np.stack([np.broadcast_to(part, (LENGTH, HEIGHT, WIDTH)) for part in (ramp, ramp / 2, ramp / 4)], -1).astype(
-        np.uint8
-    )
+    ramp = np.linspace(40, 160, WIDTH)[None, None] + 6 * np.arange(LENGTH)[:, None, None] + np.zeros((1, HEIGHT, 1))
+    return ((ramp + shade)[..., None] * [1, 0.5, 0.25]).astype(np.uint8)
 
 
 def write_transitions(
@@ -84,12 +77,8 @@ def write_hdf5(root: Path, number: int = 0, shade: int = 0, robot: str = "g1_dex
         file["observations/qpos"], file["action"] = motors(robot), motors(robot, 0.02)
         file["observations/qvel"] = np.zeros((LENGTH, 16), np.float32)
         for camera in ("cam_left_high", "cam_right_wrist"):
-            file.create_dataset(
-                f"observations/images/{camera}",
-                data=pictures(shade)[..., ::-1],
-                chunks=(1, HEIGHT, WIDTH, 3),
-                compression="gzip",
-            )
+            chunked: Any = {"chunks": (1, HEIGHT, WIDTH, 3), "compression": "gzip"}
+            file.create_dataset(f"observations/images/{camera}", data=pictures(shade)[..., ::-1], **chunked)
         file["language_raw"] = "Pack the camera, then close the box."
     return path
 
@@ -137,16 +126,17 @@ def test_another_order_of_columns_is_named(tmp_path: Path, declared: str, record
 
 
 @pytest.mark.parametrize(
-    "readings", [{"closed": 0.0, "open": 0.2}, {"closed": 0.5, "open": 0.4}, {"closed": 20, "open": 0}]
+    ("track", "closed", "opened"),
+    [("gripper_state", 0.0, 0.2), ("gripper_command", 0.5, 0.4), ("gripper_command", 20, 0)],
 )
-def test_a_gripper_outside_of_its_range_in_most_frames_is_refused(tmp_path: Path, readings: dict[str, float]) -> None:
-    write_hdf5(tmp_path)
-    changes = {"gripper_command": readings} if readings["closed"] else {"gripper_state": readings}
-    if readings["closed"] == 20:  # in hundredths
-        edit = replaced("action", lambda values: np.hstack([values[:, :14], 100 * values[:, 14:]]))
-        edit(tmp_path / "episode_0.hdf5")
+def test_a_gripper_outside_of_its_range_in_most_frames_is_refused(
+    tmp_path: Path, track: str, closed: float, opened: float
+) -> None:
+    path = write_hdf5(tmp_path)
+    if closed == 20:  # in hundredths
+        replaced("action", lambda values: np.hstack([values[:, :14], 100 * values[:, 14:]]))(path)
     with pytest.raises(RejectedInputError, match="most frames") as caught:
-        load(tmp_path, **changes)
+        load(tmp_path, **{track: {"closed": closed, "open": opened}})
     assert caught.value.reason == "invalid_gripper"
 
 
@@ -177,10 +167,9 @@ def test_a_set_comes_through_curation(tmp_path: Path) -> None:
     for number in (2, 10):
         write_transitions(tmp_path / "raw", number, shade=7 * number)
     write_transitions(tmp_path / "raw", 0, shade=35, dataset="stack_box")
-    counts = curate(CurateConfig.model_validate({"sources": [settings(tmp_path / "raw")]}), {}, tmp_path / "out")
-    assert (counts["found"], counts["kept"], counts["reasons"]) == (3, 3, {})
-    rows = EpisodeSet.open(tmp_path / "out").rows
-    assert {row.episode_id: row.scene for row in rows} == {
+    counts, curated = run(tmp_path, settings(tmp_path / "raw"))
+    assert (counts["found"], counts["reasons"]) == (3, {})
+    assert {row.episode_id: row.scene for row in curated.rows} == {
         "unitree-pack_camera-2": "unitree-pack_camera",
         "unitree-pack_camera-10": "unitree-pack_camera",
         "unitree-stack_box-0": "unitree-stack_box",
@@ -188,18 +177,8 @@ def test_a_set_comes_through_curation(tmp_path: Path) -> None:
 
 
 def link_out(path: Path) -> None:
-    """The file lies outside of the source's folder."""
-    outside = next(parent for parent in path.parents if parent.name == "raw").parent / "outside"
-    path.rename(outside)
-    path.symlink_to(outside)
-
-
-def external(path: Path) -> None:
-    with h5py.File(path.parent / "outside.hdf", "w") as outside:
-        outside["secret"] = motors()
-    with h5py.File(path, "r+") as file:
-        del file["action"]
-        file["action"] = h5py.ExternalLink("outside.hdf", "secret")
+    outside = next(parent for parent in path.parents if parent.name == "raw").parent / path.name
+    path.symlink_to(path.rename(outside))
 
 
 def video_of(path: Path) -> Path:
@@ -216,50 +195,41 @@ def other_type(path: Path) -> None:
         file.attrs["action_type"] = "end effector pose"
 
 
-def table_without(path: Path) -> None:
+def not_in_the_table(path: Path) -> None:
     table = path.parents[2] / "pack_camera.csv"
-    table.write_text("\n".join(line for line in table.read_text().splitlines() if not line.startswith("9,")))
-
-
-def huge(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        del file["observations/images/cam_left_high"]
-        file.create_dataset(
-            "observations/images/cam_left_high", (LENGTH, 60_000, 60_000, 3), "u1", chunks=(1, 64, 64, 3)
-        )
+    rows = table.read_text().splitlines(keepends=True)
+    table.write_text("".join(row for row in rows if not row.startswith(f"{path.stem},")))
 
 
 IMAGES = "observations/images/cam_left_high"
-FAULTS: dict[str, tuple[Write, Damage, str]] = {
-    "no states": (write_transitions, without("observation.state"), "missing_column"),
-    "NaN state": (write_transitions, replaced("observation.state", with_nan), "nan_state"),
-    "hands": (write_transitions, replaced("action", lambda v: np.hstack([v, v])), "length_mismatch"),
-    "a command less": (write_transitions, replaced("action", lambda v: v[1:]), "length_mismatch"),
-    "poses for joints": (write_transitions, other_type, "unreadable"),
-    "truncated file": (write_transitions, cut, "unreadable"),
-    "a file elsewhere": (write_transitions, link_out, "path_traversal"),
-    "data of another file": (write_transitions, external, "path_traversal"),
-    "no video": (write_transitions, lambda path: video_of(path).unlink(), "missing_file"),
-    "a video elsewhere": (write_transitions, lambda path: link_out(video_of(path)), "path_traversal"),
-    "truncated video": (write_transitions, lambda path: cut(video_of(path)), "truncated_video"),
-    "a frame less": (write_transitions, other_video(LENGTH - 1, 30.0), "truncated_video"),
-    "another rate": (write_transitions, other_video(LENGTH, 15.0), "wrong_fps"),
-    "not in the table": (write_transitions, table_without, "missing_column"),
-    "no joints": (write_hdf5, without("observations/qpos"), "missing_column"),
-    "no camera": (write_hdf5, without(IMAGES), "missing_view"),
-    "an image less": (write_hdf5, replaced(IMAGES, lambda v: v[1:]), "length_mismatch"),
-    "grey images": (write_hdf5, replaced(IMAGES, lambda v: v[..., 0]), "unreadable"),
-    "images of floats": (write_hdf5, replaced(IMAGES, lambda v: v / 255), "unreadable"),
-    "images that were never written": (write_hdf5, huge, "unreadable"),
+FAULTS: dict[Write, dict[str, tuple[Damage, str]]] = {
+    write_transitions: {
+        "no states": (without("observation.state"), "missing_column"),
+        "NaN state": (replaced("observation.state", with_nan), "nan_state"),
+        "hands": (replaced("action", lambda v: np.hstack([v, v])), "length_mismatch"),
+        "a command less": (replaced("action", lambda v: v[1:]), "length_mismatch"),
+        "poses for joints": (other_type, "unreadable"),
+        "a file elsewhere": (link_out, "path_traversal"),
+        "no video": (lambda path: video_of(path).unlink(), "missing_file"),
+        "a video elsewhere": (lambda path: link_out(video_of(path)), "path_traversal"),
+        "truncated video": (lambda path: cut(video_of(path)), "truncated_video"),
+        "a frame less": (other_video(LENGTH - 1, 30.0), "truncated_video"),
+        "another rate": (other_video(LENGTH, 15.0), "wrong_fps"),
+        "not in the table": (not_in_the_table, "missing_column"),
+    },
+    write_hdf5: {
+        "no joints": (without("observations/qpos"), "missing_column"),
+        "no camera": (without(IMAGES), "missing_view"),
+        "an image less": (replaced(IMAGES, lambda v: v[1:]), "length_mismatch"),
+        "grey images": (replaced(IMAGES, lambda v: v[..., 0]), "unreadable"),
+        "images of floats": (replaced(IMAGES, lambda v: v / 255), "unreadable"),
+    },
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_has_its_reason_and_costs_no_other_recording(tmp_path: Path, fault: str) -> None:
-    write, damage, reason = FAULTS[fault]
-    write(tmp_path / "raw", 1, 60)  # a sound neighbour
-    damage(write(tmp_path / "raw", 9))
-    assert kept_beside(settings(tmp_path / "raw"), tmp_path / "out", reason).endswith("1")
+@pytest.mark.parametrize("write", FAULTS)
+def test_each_fault_has_its_reason_and_costs_no_other_recording(tmp_path: Path, write: Write) -> None:
+    check_faults(tmp_path / "raw", settings(tmp_path), write, FAULTS[write])
 
 
 def test_what_the_files_do_not_say_must_be_declared(tmp_path: Path) -> None:

@@ -40,13 +40,13 @@ def robotwin(root: Path, sample: Any) -> dict[str, Any]:
 
 
 def lerobot_v21(root: Path, sample: Any) -> dict[str, Any]:
-    writers("test_lerobot").v21_dataset(root, {0: 6, 1: 6, 2: 5})
+    writers("published_lerobot").write_robocoin(root, 3)
     return {
         "kind": "lerobot_v21",
         "embodiment": "none",
         "angle_unit": "rad",
-        "views": {"observation.images.cam": "head"},
-        "grippers": {"gripper": {"closed": 0, "open": 100}},
+        "views": {"observation.images.cam_high_rgb": "head"},
+        "grippers": {"left_gripper_open_scale": {"closed": 0, "open": 1}},
     }
 
 
