@@ -19,8 +19,7 @@ import cv2
 import numpy as np
 import pytest
 
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
+from tests.data.curating import run
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.file import _decoded  # pyright: ignore[reportPrivateUsage]
@@ -57,7 +56,7 @@ class Made:
     def picture(self) -> np.ndarray:
         return PATCHES.repeat(self.side, 0).repeat(self.side, 1)
 
-    def write(self, path: Path) -> Path:
+    def write(self, path: Path, count: int = FRAMES) -> Path:
         encoder, pixel_format, options = CODECS[self.codec]
         picture = self.picture()
         red, blue = LUMA[self.matrix]
@@ -74,7 +73,7 @@ class Made:
             context.thread_count = 1
             context.colorspace = TAGS[self.stated or self.matrix]
             context.color_range = 0 if self.stated == "unspecified" else 2 if self.full else 1
-            for number in range(FRAMES):
+            for number in range(count):
                 frame = av.VideoFrame.from_ndarray(yuv, format="yuv444p").reformat(format=pixel_format)
                 frame.colorspace, frame.color_range = context.colorspace, context.color_range
                 frame.pts, frame.time_base = number, Fraction(1, RATE)
@@ -103,47 +102,46 @@ def by_ffmpeg(path: Path, *options: str) -> np.ndarray | None:
     return np.frombuffer(raw, np.uint8).reshape(-1, *size, 3)
 
 
-def curated(folder: Path, out: Path, **changes: Any) -> EpisodeSet:
-    source = {"kind": "video_folder", "path": str(folder), "name": "web", "split": "train"}
-    curate(CurateConfig.model_validate({"sources": [source], **changes}), {}, out)
-    return EpisodeSet.open(out)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Made]:
+    """A video of every case, in one folder, each of another length: no two are duplicates."""
+    folder = tmp_path_factory.mktemp("made")
+    return {case.write(folder / f"{number:02d}.mp4", FRAMES + number): case for number, case in enumerate(CASES)}
 
 
-@pytest.mark.parametrize("made", CASES, ids=str)
-def test_pictures_have_the_colours_that_ffmpeg_shows(tmp_path: Path, made: Made) -> None:
-    path = made.write(tmp_path / "a.mp4")
-    clip = VideoClip.whole_file(path, FRAMES, RATE)
-    pictures = list(read_clip(clip))
-    found = np.stack([picture.rgb for picture in pictures])
-    assert off(found) <= TOLERANCE
+def test_pictures_have_the_colours_that_ffmpeg_shows(made: dict[Path, Made]) -> None:
     decoder = FrameDecoder()
-    assert np.array_equal(np.stack(list(decoder.frames(clip, range(FRAMES)))), found)  # what training reads
-    decoder.close()
-    shown = by_ffmpeg(path)
-    assert shown is None or np.abs(shown.astype(int) - found).max() <= TOLERANCE
-    # What filters look at: the same light, whatever the depth and the range.
-    red, blue = LUMA[made.matrix]
-    light = PATCHES @ (red, 1 - red - blue, blue)
-    luma = pictures[0].luma[made.side // 2 :: made.side, made.side // 2 :: made.side].astype(float)
-    assert np.abs((luma if pictures[0].full_range else (luma - 16) * 255 / 219) - light).max() <= TOLERANCE
-
-
-@pytest.mark.parametrize(
-    "made", [pytest.param(m, id=str(m), marks=[pytest.mark.slow] if m.matrix == "bt709" else []) for m in CASES]
-)
-def test_colours_stay_through_curation_and_export(tmp_path: Path, made: Made) -> None:
-    (tmp_path / "raw").mkdir()
-    made.write(tmp_path / "raw" / "a.mp4")
-    copied = curated(tmp_path / "raw", tmp_path / "copied")
-    resized = curated(tmp_path / "raw", tmp_path / "resized", image_size=(96, 120))
-    for number, episodes in enumerate((copied, resized)):
-        assert off(episodes.frames(0, "head")) <= TOLERANCE
-        path = Path(str(episodes.clip(0, "head").path))
+    for count, (path, case) in enumerate(made.items(), FRAMES):
+        clip = VideoClip.whole_file(path, count, RATE)
+        pictures = list(read_clip(clip))
+        found = np.stack([picture.rgb for picture in pictures])
+        assert off(found) <= TOLERANCE, case
+        assert np.array_equal(np.stack(list(decoder.frames(clip, range(count)))), found)  # what training reads
         shown = by_ffmpeg(path)
-        assert shown is None or off(shown) <= TOLERANCE
-        export(episodes.root, tmp_path / f"out{number}", formats=("lerobot",))
-        exported = EpisodeSet.open(tmp_path / f"out{number}")
-        assert off(exported.frames(0, "head")) <= TOLERANCE
+        assert shown is None or np.abs(shown.astype(int) - found).max() <= TOLERANCE, case
+        # What filters look at: the same light, whatever the depth and the range.
+        red, blue = LUMA[case.matrix]
+        light = PATCHES @ (red, 1 - red - blue, blue)
+        luma = pictures[0].luma[case.side // 2 :: case.side, case.side // 2 :: case.side].astype(float)
+        assert np.abs((luma if pictures[0].full_range else (luma - 16) * 255 / 219) - light).max() <= TOLERANCE, case
+    decoder.close()
+
+
+@pytest.mark.parametrize("image_size", [None, (96, 120)])
+def test_colours_stay_through_curation_and_export(
+    tmp_path: Path, made: dict[Path, Made], image_size: tuple[int, int] | None
+) -> None:
+    folder = next(iter(made)).parent
+    source = {"kind": "video_folder", "path": str(folder), "name": "web", "split": "train"}
+    counts, curated = run(tmp_path, source, image_size=image_size, near_duplicates=False)
+    assert counts["kept"] == len(CASES)
+    export(curated.root, tmp_path / "exported", formats=("lerobot",))
+    exported = EpisodeSet.open(tmp_path / "exported")
+    for number, case in enumerate(CASES):
+        for episodes in (curated, exported):
+            assert off(episodes.frames(number, "head")) <= TOLERANCE, case
+        shown = by_ffmpeg(Path(str(curated.clip(number, "head").path)))
+        assert shown is None or off(shown) <= TOLERANCE, case
 
 
 @pytest.mark.parametrize(("lines", "matrix"), [(240, "bt601"), (716, "bt601"), (720, "bt709"), (1080, "bt709")])
@@ -153,24 +151,21 @@ def test_a_matrix_that_is_not_stated_follows_from_the_number_of_lines(tmp_path: 
     assert off(next(read_clip(clip)).rgb) <= TOLERANCE
 
 
-@pytest.mark.parametrize("codec", ["h264", "hevc10"])
-@pytest.mark.parametrize("full", [False, True])
-@pytest.mark.parametrize("matrix", LUMA)
-def test_video_messages_have_their_colours(tmp_path: Path, codec: str, full: bool, matrix: str) -> None:
-    path = Made(codec, matrix, full).write(tmp_path / "a.mp4")
-    kind = {"h264": "h264", "hevc10": "h265"}[codec]
+def messages(path: Path, codec: str) -> Iterator[tuple[int, EncodedImage]]:
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        annex_b = av.bitstream.BitStreamFilterContext(f"{codec}_mp4toannexb", stream)
+        packets = [packet for source in container.demux(stream) for packet in annex_b.filter(source)]
+    for number, packet in enumerate(packets):
+        yield number, EncodedImage("", bytes(packet), codec.replace("hevc", "h265"))
 
-    def messages() -> Iterator[tuple[int, EncodedImage]]:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            annex_b = av.bitstream.BitStreamFilterContext(f"{kind.replace('h265', 'hevc')}_mp4toannexb", stream)
-            packets = [packet for source in container.demux(stream) for packet in annex_b.filter(source)]
-        for number, packet in enumerate(packets):
-            yield number, EncodedImage("", bytes(packet), kind)
 
-    found = [image for _, image in _decoded(messages(), bytes, "here")]
-    assert found
-    assert max(map(off, found)) <= TOLERANCE
+def test_video_messages_have_their_colours(made: dict[Path, Made]) -> None:
+    for path, case in made.items():
+        if case.codec != "av1":
+            found = [image for _, image in _decoded(messages(path, case.codec.removesuffix("10")), bytes, "here")]
+            assert found
+            assert max(map(off, found)) <= TOLERANCE, case
 
 
 def test_a_matrix_that_cannot_be_converted_is_named(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import json
 import shutil
 import struct
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,12 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from published_lerobot import FRAMES as LEROBOT_FRAMES
-from published_lerobot import HEIGHT, WIDTH, write_robocoin
 from pydantic import ValidationError
 
-from worldline_core.data.curation.curate import curate
+from tests.data.curating import preset, run
+from tests.data.published_lerobot import FRAMES as LEROBOT_FRAMES
+from tests.data.published_lerobot import HEIGHT, WIDTH, write_robocoin
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.plain_files import decode_image, image_size
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import FrameDecoder, VideoClip, read_clip, shown_size
@@ -81,78 +79,71 @@ def off(frames: np.ndarray, patches: np.ndarray) -> int:
     return int(np.abs(centres.astype(int) - patches).max())
 
 
-@pytest.mark.parametrize("orientation", MATRICES)
+def test_videos_are_turned_in_every_path(tmp_path: Path) -> None:
+    for orientation, matrix in MATRICES.items():
+        expected, path = as_shown(matrix), turned_video(tmp_path / "a.mp4", matrix)
+        if shutil.which("ffmpeg") is not None:
+            command = ["ffmpeg", "-v", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+            raw = subprocess.run(command, capture_output=True, check=True).stdout
+            assert off(np.frombuffer(raw, np.uint8).reshape(FRAMES, *large(expected).shape), expected) <= 3
+        clip = VideoClip.whole_file(path, FRAMES, RATE)
+        decoder = FrameDecoder()
+        trained = np.stack(list(decoder.frames(clip, range(FRAMES))))
+        decoder.close()
+        seen = list(read_clip(clip))
+        assert np.array_equal(np.stack([picture.rgb for picture in seen]), trained)
+        assert off(trained, expected) <= 3
+        assert seen[0].size == seen[0].luma.shape == trained.shape[1:3]
+        gray = cv2.cvtColor(trained[0], cv2.COLOR_RGB2GRAY)[16::32, 16::32]
+        assert np.abs((seen[0].luma[16::32, 16::32] - 16.0) * 255 / 219 - gray).max() <= 3
+        assert VideoFrames(clip).shape == (FRAMES, *large(expected).shape)
+        assert shown_size(path) == (*large(expected).shape[:2], orientation)
+
+
 @pytest.mark.parametrize("image_size", [None, (96, 96)])
-def test_videos_are_turned_in_every_path_and_stored_upright(
-    tmp_path: Path, orientation: int, image_size: tuple[int, int] | None
-) -> None:
-    expected = as_shown(MATRICES[orientation])
-    path = turned_video(tmp_path / "raw" / "a.mp4", MATRICES[orientation])
-    if shutil.which("ffmpeg") is not None:
-        command = ["ffmpeg", "-v", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-        raw = subprocess.run(command, capture_output=True, check=True).stdout
-        assert off(np.frombuffer(raw, np.uint8).reshape(FRAMES, *large(expected).shape), expected) <= 3
-    clip = VideoClip.whole_file(path, FRAMES, RATE)
-    decoder = FrameDecoder()
-    trained = np.stack(list(decoder.frames(clip, range(FRAMES))))
-    decoder.close()
-    seen = list(read_clip(clip))
-    assert np.array_equal(np.stack([picture.rgb for picture in seen]), trained)
-    assert off(trained, expected) <= 3
-    assert seen[0].size == seen[0].luma.shape == trained.shape[1:3]
-    gray = cv2.cvtColor(trained[0], cv2.COLOR_RGB2GRAY)[16::32, 16::32]
-    assert np.abs((seen[0].luma[16::32, 16::32] - 16.0) * 255 / 219 - gray).max() <= 3
-    assert VideoFrames(clip).shape == (FRAMES, *large(expected).shape)
-    assert shown_size(path) == (*large(expected).shape[:2], orientation)
-
+def test_videos_are_stored_upright(tmp_path: Path, image_size: tuple[int, int] | None) -> None:
+    for orientation, matrix in MATRICES.items():
+        turned_video(tmp_path / "raw" / f"{orientation}.mp4", matrix)
     source = {"kind": "video_folder", "path": str(tmp_path / "raw"), "name": "web", "split": "train"}
-    config = CurateConfig.model_validate({"sources": [source], "image_size": image_size})
-    counts = curate(config, {}, tmp_path / "out")
-    copied = int(orientation == 1 and image_size is None)
-    assert counts["videos"] == {"copied": copied, "encoded": 1 - copied}
-    curated = EpisodeSet.open(tmp_path / "out")
-    assert off(curated.frames(0, "head"), expected) <= 3
-    with av.open(str(curated.clip(0, "head").path)) as container:
-        assert next(container.decode(video=0)).side_data.get("DISPLAYMATRIX") is None
+    counts, curated = run(tmp_path, source, image_size=image_size, near_duplicates=False)
+    copied = int(image_size is None)  # the one that is upright
+    assert counts["videos"] == {"copied": copied, "encoded": len(MATRICES) - copied}
+    for number, matrix in enumerate(MATRICES.values()):
+        assert off(curated.frames(number, "head"), as_shown(matrix)) <= 3
+        with av.open(str(curated.clip(number, "head").path)) as container:
+            assert next(container.decode(video=0)).side_data.get("DISPLAYMATRIX") is None
 
 
-@pytest.mark.parametrize("angle_deg", [30.0, 45.0, 10.0])
-def test_a_video_that_is_shown_askew_is_refused(tmp_path: Path, angle_deg: float) -> None:
-    sine, cosine = np.sin(np.deg2rad(angle_deg)), np.cos(np.deg2rad(angle_deg))
-    path = turned_video(tmp_path / "a.mp4", (cosine, sine, -sine, cosine))
-    with pytest.raises(RejectedInputError, match="no whole quarter"):
-        _ = next(read_clip(VideoClip.whole_file(path, FRAMES, RATE))).rgb
+def test_a_video_that_is_shown_askew_is_refused(tmp_path: Path) -> None:
+    for angle_deg in (30.0, 45.0, 10.0):
+        sine, cosine = np.sin(np.deg2rad(angle_deg)), np.cos(np.deg2rad(angle_deg))
+        path = turned_video(tmp_path / "a.mp4", (cosine, sine, -sine, cosine))
+        with pytest.raises(RejectedInputError, match="no whole quarter"):
+            _ = next(read_clip(VideoClip.whole_file(path, FRAMES, RATE))).rgb
 
 
-@pytest.mark.parametrize("orientation", [3, 6, 2])
 @pytest.mark.parametrize("image_size", [None, (36, 64)])
-def test_a_camera_of_a_turned_video_is_refused_by_name(
-    tmp_path: Path, project_root: Path, orientation: int, image_size: tuple[int, int] | None
-) -> None:
-    import yaml
-
-    write_robocoin(tmp_path / "raw", episodes=2)
+def test_cameras_of_turned_videos_are_refused_by_name(tmp_path: Path, image_size: tuple[int, int] | None) -> None:
+    write_robocoin(tmp_path / "raw", episodes=4)
     K = [[60.0, 0.0, 63.5], [0.0, 62.0, 35.5], [0.0, 0.0, 1.0]]
     pose = np.eye(4).tolist()
     entry = {"width": WIDTH, "height": HEIGHT, "K": K, "maps": "camera_to_base", "axes": "opencv", "T": pose}
     (tmp_path / "raw/meta/calibration.json").write_text(json.dumps({"views": {"head": entry}}))
-    preset = yaml.safe_load((project_root / "configs/sources/robocoin.yaml").read_text())["curate"]["sources"][0]
-    (key,) = (key for key, view in preset["views"].items() if view == "head")
-    (video,) = (tmp_path / "raw").rglob(f"{key}/episode_000001.mp4")
-    set_matrix(video, MATRICES[orientation])
-    source = {**preset, "path": str(tmp_path / "raw"), "name": "coin", "collection": False}
-    declared = {**source, "calibration": "meta/calibration.json"}
-    config = CurateConfig.model_validate({"sources": [declared], "image_size": image_size, "near_duplicates": False})
-    counts = curate(config, {}, tmp_path / "out")
-    assert (counts["kept"], counts["reasons"]) == (1, {"missing_calibration": 1})
-    (row,) = EpisodeSet.open(tmp_path / "out").quarantine()
-    assert row.episode_id == "coin-000001"
-    assert f"orientation {orientation}" in row.detail
-    assert "write the pictures upright" in row.detail
-    # Without a camera it is turned like any other.
-    config = CurateConfig.model_validate({"sources": [source], "image_size": image_size, "near_duplicates": False})
-    assert curate(config, {}, tmp_path / "free")["kept"] == 2
-    assert EpisodeSet.open(tmp_path / "free").frames(1, "head").shape[0] == LEROBOT_FRAMES
+    source = preset("robocoin", tmp_path / "raw", collection=False)
+    (key,) = (key for key, view in source["views"].items() if view == "head")
+    for number, orientation in enumerate((3, 6, 2), 1):
+        (video,) = (tmp_path / "raw").rglob(f"{key}/episode_{number:06d}.mp4")
+        set_matrix(video, MATRICES[orientation])
+    options = {"image_size": image_size, "near_duplicates": False}
+    counts, curated = run(tmp_path, {**source, "calibration": "meta/calibration.json"}, **options)
+    assert (counts["kept"], counts["reasons"]) == (1, {"missing_calibration": 3})
+    for row, orientation in zip(curated.quarantine(), (3, 6, 2), strict=True):
+        assert f"orientation {orientation}" in row.detail
+        assert "write the pictures upright" in row.detail
+    # Without a camera they are turned like any other.
+    counts, free = run(tmp_path / "free", source, **options)
+    assert counts["kept"] == 4
+    assert free.frames(1, "head").shape[0] == LEROBOT_FRAMES
 
 
 def with_exif(orientation: int, kind: str) -> bytes:
@@ -218,35 +209,27 @@ def test_a_video_of_depth_is_no_video(tmp_path: Path, codec: str, pixel_format: 
         next(read_clip(VideoClip(path, 3, RATE)))
 
 
-SAYS_DEPTH: list[Callable[[dict[str, Any]], None]] = [
-    lambda feature: feature.update(info={"video.is_depth_map": True}),
-    lambda feature: feature.update(info={"is_depth_map": True}),
-    lambda feature: feature.update(video_info={"video.is_depth_map": True}),
-    lambda feature: feature.update(is_depth_map=True),
-]
-
-
-@pytest.mark.parametrize("say", SAYS_DEPTH)
-def test_a_depth_video_of_lerobot_is_refused_by_name(
-    tmp_path: Path, project_root: Path, say: Callable[[dict[str, Any]], None]
-) -> None:
-    import yaml
-
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"info": {"video.is_depth_map": True}},
+        {"info": {"is_depth_map": True}},
+        {"video_info": {"video.is_depth_map": True}},
+        {"is_depth_map": True},
+    ],
+)
+def test_a_depth_video_of_lerobot_is_refused_by_name(tmp_path: Path, said: dict[str, Any]) -> None:
     for name in ("one", "two"):
         write_robocoin(tmp_path / "raw" / name)
     path = tmp_path / "raw/two/meta/info.json"
-    preset = yaml.safe_load((project_root / "configs/sources/robocoin.yaml").read_text())["curate"]["sources"][0]
-    key = next(iter(preset["views"]))
+    source = preset("robocoin", tmp_path / "raw")
+    key = next(iter(source["views"]))
     info = json.loads(path.read_text())
-    say(info["features"][key])
+    info["features"][key].update(said)
     path.write_text(json.dumps(info))
-    source = {**preset, "path": str(tmp_path / "raw"), "name": "coin", "collection": True}
-    counts = curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "out")
-    assert counts["reasons"]["not_colour"] == 1
-    alone = {**source, "path": str(tmp_path / "raw/two"), "collection": False}
-    with pytest.raises(DataError, match="depth, not colour") as caught:
-        curate(CurateConfig.model_validate({"sources": [alone]}), {}, tmp_path / "alone")
-    assert key in str(caught.value)
+    assert run(tmp_path, source)[0]["reasons"]["not_colour"] == 1
+    with pytest.raises(DataError, match=f"(?s)depth, not colour.*{key}"):
+        run(tmp_path / "alone", {**source, "path": str(tmp_path / "raw/two"), "collection": False})
 
 
 @pytest.mark.parametrize(
@@ -265,14 +248,10 @@ def test_odd_sizes_with_yuv420p_are_one_error_before_work_begins(changes: dict[s
 
 
 def test_recordings_of_odd_sizes_with_yuv420p_end_the_run_once(tmp_path: Path) -> None:
+    (tmp_path / "raw").mkdir()
     for name in ("a", "b", "c"):
-        (tmp_path / "raw").mkdir(exist_ok=True)
-        encode_video(
-            tmp_path / "raw" / f"{name}.mp4", [np.full((63, 95, 3), 90, np.uint8)] * 3, RATE, pixel_format="yuv444p"
-        )
+        path = tmp_path / "raw" / f"{name}.mp4"
+        encode_video(path, [np.full((63, 95, 3), 90, np.uint8)] * 3, RATE, pixel_format="yuv444p")
     source = {"kind": "video_folder", "path": str(tmp_path / "raw"), "name": "web", "split": "train"}
-    values = {"sources": [source], "pixel_format": "yuv420p", "video_mode": "encode"}
-    with pytest.raises(ConfigError, match="cannot be encoded as yuv420p") as caught:
-        curate(CurateConfig.model_validate(values), {}, tmp_path / "out.partial")
-    assert ".partial" not in str(caught.value)
-    assert "63x95" in str(caught.value)
+    with pytest.raises(ConfigError, match=r"(?s)cannot be encoded as yuv420p.*63x95"):
+        run(tmp_path, source, pixel_format="yuv420p", video_mode="encode")

@@ -10,11 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_protobuf.decoder import DecoderFactory
 
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
+from tests.data.curating import run
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
@@ -48,13 +45,12 @@ def seen_through(lens: Distortion | None, camera: CameraTrack) -> tuple[np.ndarr
     """Rays' (x, y) of every pixel, by OpenCV's own inverse."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
     if lens is None:
         found = cv2.undistortPoints(pixels, camera.K, np.zeros(5))
     elif lens.model == "fisheye":
-        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
         found = cv2.fisheye.undistortPoints(pixels, camera.K, np.array(lens.coefficients), criteria=criteria)
     else:
-        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
         found = cv2.undistortPointsIter(pixels, camera.K, np.array(lens.coefficients), None, None, criteria)  # type: ignore[call-overload]
     x, y = found.reshape(camera.height, camera.width, 2).transpose(2, 0, 1)
     return x, y
@@ -70,13 +66,7 @@ def distorted_sample(make: Make, lens: Distortion | None) -> tuple:
     return replace(episode, cameras={**episode.cameras, "head": head}), frames, masks
 
 
-def write_mcap_of_lens(
-    path: Path,
-    episode: Episode,
-    frames: dict[str, np.ndarray],
-    lens: Distortion | dict[str, Any],
-    masks: dict[str, np.ndarray] | None = None,
-) -> None:
+def write_mcap_of_lens(path: Path, episode: Episode, *content: Any, lens: Distortion | dict[str, Any]) -> None:
     """A file whose head camera states a lens; this project's own recordings have none."""
     stated: Any = lens
     if isinstance(lens, Distortion):
@@ -86,14 +76,12 @@ def write_mcap_of_lens(
     of_pinhole = exported._calibration
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exported, "_calibration", lambda c: of_pinhole(c) | (stated if c.view == "head" else {}))
-        exported.write_episode_mcap(path, episode, frames, masks)
+        exported.write_episode_mcap(path, episode, *content)
 
 
 def curated_mcap(tmp_path: Path, **changes: Any) -> EpisodeSet:
     source = {"kind": "mcap", "path": str(tmp_path / "mcap")}
-    settings = {"sources": [source], "image_size": (60, 80), "video_crf": 0, **changes}
-    curate(CurateConfig.model_validate(settings), {}, tmp_path / "out")
-    return EpisodeSet.open(tmp_path / "out")
+    return run(tmp_path, source, **{"image_size": (60, 80), "video_crf": 0, **changes})[1]
 
 
 def off_from_scene(curated: EpisodeSet) -> float:
@@ -108,11 +96,7 @@ def test_a_distorted_mcap_is_curated_into_a_pinhole_recording(tmp_path: Path, sa
     lens = LENSES[model]
     episode, frames, masks = distorted_sample(sample, lens)
     path = tmp_path / "mcap" / "0.mcap"
-    write_mcap_of_lens(path, episode, frames, lens, masks)
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        (message,) = [message for *_, message in reader.iter_decoded_messages(["/head/calibration"])]
-    assert message.distortion_model == model
+    write_mcap_of_lens(path, episode, frames, masks, lens=lens)
     assert read_exported_episode(McapFile(path)).distortions == {"head": lens}
     curated = curated_mcap(tmp_path)
     read = curated.episode(0)
@@ -139,26 +123,17 @@ def test_undistortion_and_every_fit_agree_with_k(tmp_path: Path, sample: Make, f
     lens = LENSES["plumb_bob"]
     episode, frames, masks = distorted_sample(sample, lens)
     path = tmp_path / "mcap" / "0.mcap"
-    write_mcap_of_lens(path, episode, frames, lens, masks)
+    write_mcap_of_lens(path, episode, frames, masks, lens=lens)
     curated = curated_mcap(tmp_path, image_size=(64, 64), fit=fit)
     camera = curated.episode(0).cameras["head"]
     image = curated.frames(0, "head")[4].astype(float)
     expected = scene(*seen_through(None, camera))
     rows = slice(9, 55) if fit == "letterbox" else slice(0, 64)  # 64 x 48 between black bars
     assert np.abs(image[rows] - expected[rows]).mean() < 1.5
-    if fit == "letterbox":
-        assert image[:7].max() < 10
-        assert image[57:].max() < 10
-    pixels_are_square = camera.K[0, 0] / camera.K[1, 1]
-    stretched = 0.75 if fit == "stretch" else 1.0
-    recorded = curated_ratio(lens)
-    assert pixels_are_square == pytest.approx(recorded * stretched, rel=0.02)
-
-
-def curated_ratio(lens: Distortion) -> float:
-    """fx / fy of the undistorted camera by OpenCV."""
+    assert fit != "letterbox" or max(image[:7].max(), image[57:].max()) < 10
     whole, _ = cv2.getOptimalNewCameraMatrix(K, np.array(lens.coefficients), (WIDTH, HEIGHT), 0)
-    return float(whole[0, 0] / whole[1, 1])
+    ratio = whole[0, 0] / whole[1, 1] * (0.75 if fit == "stretch" else 1.0)
+    assert camera.K[0, 0] / camera.K[1, 1] == pytest.approx(ratio, rel=0.02)
 
 
 def test_unusable_lenses_are_quarantined_with_their_numbers(tmp_path: Path, sample: Make) -> None:
@@ -166,10 +141,10 @@ def test_unusable_lenses_are_quarantined_with_their_numbers(tmp_path: Path, samp
     folds = Distortion("radtan", (-0.9, 0.1, 0.0, 0.0))
     write_episode_mcap(tmp_path / "mcap" / "0.mcap", episode, frames)
     second = replace(episode, episode_id="folds", state=episode.state + 0.01)
-    write_mcap_of_lens(tmp_path / "mcap" / "1.mcap", second, frames, folds)
+    write_mcap_of_lens(tmp_path / "mcap" / "1.mcap", second, frames, lens=folds)
     third = replace(episode, episode_id="unknown", state=episode.state + 0.02)
     path = tmp_path / "mcap" / "2.mcap"
-    write_mcap_of_lens(path, third, frames, {"distortion_model": "double_sphere", "D": [0.1]})
+    write_mcap_of_lens(path, third, frames, lens={"distortion_model": "double_sphere", "D": [0.1]})
     curated = curated_mcap(tmp_path)
     assert [row.episode_id for row in curated.rows] == [episode.episode_id]
     rows = {row.episode_id: row for row in curated.quarantine()}

@@ -9,14 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import av
+import cv2
 import numpy as np
 import pytest
 
+from tests.data.conftest import make_sample
+from tests.data.curating import files_of, packets, run, write_video
 from tools.thumbnails import view_thumbnails
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, recorded_size, store_view
@@ -26,104 +25,94 @@ from worldline_core.data.video.thumbnails import ThumbnailMaker, shrunk
 from worldline_core.filters.filter import examine
 from worldline_core.filters.filter_config import FilterConfig
 
-Sample = tuple[Episode, dict[str, np.ndarray], dict[str, np.ndarray]]
-Make = Callable[..., Sample]
+Make = Callable[..., tuple]
 FRAMES = 40
 
 
-def write_video(path: Path, frames: np.ndarray, fps: int = 8) -> Path:
-    """As another program would: B-frames, its own key frames."""
-    with av.open(str(path), "w", format="mp4") as out:
-        stream = out.add_stream("libx264", rate=fps)
-        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
-        stream.options = {"crf": "20", "threads": "1"}
-        for image in frames:
-            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        out.mux(stream.encode(None))
-    return path
-
-
-def recordings(folder: Path, sample: Make, count: int = 3) -> Path:
-    """An EpisodeSet of such videos, each in a file of its own."""
+def recordings(folder: Path, count: int) -> dict[str, Any]:
+    """An EpisodeSet whose videos another program wrote, each in a file of its own."""
     with EpisodeSetWriter(folder / "raw") as writer:
         for number in range(count):
-            episode, frames, _ = sample(number, num_frames=FRAMES, height=128, width=192)
+            episode, frames, _ = make_sample(number, num_frames=FRAMES, height=128, width=192)
             views = {}
             for view, images in frames.items():
-                path = write_video(folder / f"{number}.{view}.mp4", images)
+                path = write_video(folder / f"{number}.{view}.mp4", images, options={"crf": "20"})
                 views[view] = RecordedView(lambda: iter(()), FRAMES, VideoClip.whole_file(path, FRAMES, 8.0))
             writer.add(episode, views)
-    return folder / "raw"
+    return {"kind": "episode_set", "path": str(folder / "raw")}
 
 
-def config(raw: Path, **changes: object) -> CurateConfig:
-    return CurateConfig.model_validate({"sources": [{"kind": "episode_set", "path": str(raw)}], **changes})
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The source of a single recording."""
+    return recordings(tmp_path_factory.mktemp("one"), 1)
 
 
-def packets(path: Path) -> list[bytes]:  # pyright: ignore[reportReturnType]
-    with av.open(str(path)) as container:
-        return [bytes(packet) for packet in container.demux(video=0) if packet.size]
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict[str, Any], EpisodeSet]:
+    """The source of two recordings, the counts of their curation, and the set."""
+    folder = tmp_path_factory.mktemp("two")
+    source = recordings(folder, 2)
+    return source, *run(folder, source)
 
 
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.relative_to(folder).parts[0] != "run"
-    }
+@pytest.fixture
+def curated(tmp_path: Path, copied: tuple[dict[str, Any], dict[str, Any], EpisodeSet]) -> EpisodeSet:
+    """A copy of that set, to be changed."""
+    return EpisodeSet.open(shutil.copytree(copied[2].root, tmp_path / "curated"))
 
 
-def test_curation_copies_the_packets_and_counts_them(tmp_path: Path, sample: Make) -> None:
-    raw = recordings(tmp_path, sample)
-    counts = curate(config(raw), {}, tmp_path / "out")
-    assert counts["kept"] == 3
-    assert counts["videos"] == {"copied": 9, "encoded": 0}
-    before, after = EpisodeSet.open(raw), EpisodeSet.open(tmp_path / "out")
+def cached_thumbnails(episodes: EpisodeSet) -> Path:
+    return next((episodes.root / "run/thumbnails").rglob("*head*/*/file-000.npz"))
+
+
+def test_curation_copies_the_packets_and_counts_them(
+    tmp_path: Path, copied: tuple[dict[str, Any], dict[str, Any], EpisodeSet]
+) -> None:
+    source, counts, after = copied
+    assert counts["videos"] == {"copied": 6, "encoded": 0}
+    before = EpisodeSet.open(source["path"])
     for i, row in enumerate(after.rows):
         for view in row.views:
-            assert packets(after.clip(i, view).path) == packets(tmp_path / f"{i}.{view}.mp4")  # type: ignore[arg-type]
+            written = Path(source["path"]).parent / f"{i}.{view}.mp4"
+            assert packets(after.clip(i, view).path) == packets(written)  # type: ignore[arg-type]
             assert np.array_equal(after.frames(i, view), before.frames(i, view))
             assert np.array_equal(after.frames(i, view, [7, 33, 2]), before.frames(i, view)[[7, 33, 2]])
-    info = json.loads((tmp_path / "out" / "datasets" / "ur5e_pair" / "meta" / "info.json").read_text())
+    info = json.loads((after.root / "datasets/ur5e_pair/meta/info.json").read_text())
     feature = info["features"]["observation.images.head"]["info"]
     assert (feature["video.codec"], feature["video.pix_fmt"]) == ("h264", "yuv420p")
-    again = curate(config(raw), {}, tmp_path / "again")
+    again, set_again = run(tmp_path, source)
     assert again == counts
-    assert files_of(tmp_path / "again") == files_of(tmp_path / "out")
+    assert files_of(set_again.root) == files_of(after.root)
 
 
 @pytest.mark.parametrize(
     "changes", [{"video_mode": "encode"}, {"image_size": [64, 96]}, {"fps": 4}, {"stride": 2}], ids=str
 )
-def test_what_changes_the_picture_or_asks_for_it_is_encoded(tmp_path: Path, sample: Make, changes: dict) -> None:
-    raw = recordings(tmp_path, sample, 1)
-    counts = curate(config(raw, video_crf=2, **changes), {}, tmp_path / "out")
+def test_what_changes_the_picture_or_asks_for_it_is_encoded(
+    tmp_path: Path, one: dict[str, Any], changes: dict[str, Any]
+) -> None:
+    counts, after = run(tmp_path, one, video_crf=2, **changes)
     assert counts["videos"] == {"copied": 0, "encoded": 3}
-    before, after = EpisodeSet.open(raw), EpisodeSet.open(tmp_path / "out")
     step = 2 if "fps" in changes or "stride" in changes else 1
-    expected = before.frames(0, "head")[::step]
     shown = after.frames(0, "head")
     assert len(shown) == after.rows[0].num_frames == FRAMES // step
     if "image_size" not in changes:
-        assert np.abs(shown.astype(int) - expected).mean() < 3
-    assert not list((tmp_path / "out" / "run").rglob("*.npz"))
+        assert np.abs(shown.astype(int) - EpisodeSet.open(one["path"]).frames(0, "head")[::step]).mean() < 3
+    assert not list((after.root / "run").rglob("*.npz"))
 
 
-def test_an_image_size_that_is_the_recordings_own_changes_nothing(tmp_path: Path, sample: Make) -> None:
-    raw = recordings(tmp_path, sample, 1)
-    assert curate(config(raw, image_size=[128, 192], fps=8), {}, tmp_path / "out")["videos"]["copied"] == 3
+def test_an_image_size_that_is_the_recordings_own_changes_nothing(tmp_path: Path, one: dict[str, Any]) -> None:
+    assert run(tmp_path, one, image_size=[128, 192], fps=8)[0]["videos"]["copied"] == 3
 
 
-def test_verdicts_do_not_depend_on_the_cached_thumbnails(tmp_path: Path, sample: Make) -> None:
-    curate(config(recordings(tmp_path, sample)), {}, tmp_path / "out")
-    left = sorted((tmp_path / "out" / "run" / "thumbnails").rglob("*.npz"))
-    assert len(left) == 9
-    curated = EpisodeSet.open(tmp_path / "out")
+def test_verdicts_do_not_depend_on_the_cached_thumbnails(curated: EpisodeSet) -> None:
+    assert len(list((curated.root / "run/thumbnails").rglob("*.npz"))) == 6
     cached = {view: curated.thumbnails(1, view) for view in curated.rows[1].views}
-    settings = FilterConfig()
-    verdicts = [examine(settings, curated, i) for i in range(len(curated))]
-    shutil.rmtree(tmp_path / "out" / "run")
-    assert [examine(settings, EpisodeSet.open(tmp_path / "out"), i) for i in range(len(curated))] == verdicts
+    verdicts = [examine(FilterConfig(), curated, i) for i in range(len(curated))]
+    shutil.rmtree(curated.root / "run")
+    again = EpisodeSet.open(curated.root)
+    assert [examine(FilterConfig(), again, i) for i in range(len(curated))] == verdicts
     assert all(verdict.findings for verdict in verdicts)
     for view, thumbnails in cached.items():
         made = curated.thumbnails(1, view)
@@ -131,35 +120,24 @@ def test_verdicts_do_not_depend_on_the_cached_thumbnails(tmp_path: Path, sample:
         assert np.array_equal(made.sharpness, thumbnails.sharpness)
 
 
-def test_cached_thumbnails_of_another_video_are_not_used(tmp_path: Path, sample: Make) -> None:
-    curate(config(recordings(tmp_path, sample)), {}, tmp_path / "out")
-    curated = EpisodeSet.open(tmp_path / "out")
-    own, other = curated.thumbnails(0, "head"), curated.thumbnails(1, "head")
-    assert not np.array_equal(own.gray, other.gray)
-    path = curated.clip(0, "head").path
-    shutil.copy(curated.clip(1, "head").path, path)  # type: ignore[arg-type]
-    assert np.array_equal(curated.thumbnails(0, "head").gray, other.gray)
-    cache = next((tmp_path / "out" / "run" / "thumbnails").rglob("*head*/*/file-000.npz"))
+def test_cached_thumbnails_of_another_video_and_damaged_ones_are_not_used(curated: EpisodeSet) -> None:
+    true, other = curated.thumbnails(0, "head"), curated.thumbnails(1, "head")
+    assert not np.array_equal(true.gray, other.gray)
+    cache, video = cached_thumbnails(curated), curated.clip(0, "head").path
     content = cache.read_bytes()
-    cache.write_bytes(content[:200])
-    assert np.array_equal(curated.thumbnails(0, "head").gray, other.gray)
-
-
-def test_a_flipped_byte_in_cached_thumbnails_changes_nothing(tmp_path: Path, sample: Make) -> None:
-    curate(config(recordings(tmp_path, sample, 1)), {}, tmp_path / "out")
-    curated = EpisodeSet.open(tmp_path / "out")
-    cache = next((tmp_path / "out" / "run" / "thumbnails").rglob("*head*/*/file-000.npz"))
-    content, true = cache.read_bytes(), curated.thumbnails(0, "head")
-    for position in range(0, len(content), len(content) // 40):
-        cache.write_bytes(content[:position] + bytes([content[position] ^ 16]) + content[position + 1 :])
+    flipped = range(0, len(content), len(content) // 40)
+    damaged = [content[:n] + bytes([content[n] ^ 16]) + content[n + 1 :] for n in flipped]
+    for each in [*damaged, content[:200]]:
+        cache.write_bytes(each)
         found = curated.thumbnails(0, "head")
         assert np.array_equal(found.gray, true.gray)
         assert np.array_equal(found.sharpness, true.sharpness)
+    cache.write_bytes(content)
+    shutil.copy(curated.clip(1, "head").path, video)  # type: ignore[arg-type]
+    assert np.array_equal(curated.thumbnails(0, "head").gray, other.gray)
 
 
-def test_thumbnails_of_a_segment_are_those_of_the_whole_cut(tmp_path: Path, sample: Make) -> None:
-    curate(config(recordings(tmp_path, sample, 1)), {}, tmp_path / "out")
-    curated = EpisodeSet.open(tmp_path / "out")
+def test_thumbnails_of_a_segment_are_those_of_the_whole_cut(curated: EpisodeSet) -> None:
     whole = curated.thumbnails(0, "head")
     curated.rows[0] = replace(curated.rows[0], start=5, stop=25, num_frames=20, video_frames=20)
     part = curated.thumbnails(0, "head")
@@ -169,14 +147,11 @@ def test_thumbnails_of_a_segment_are_those_of_the_whole_cut(tmp_path: Path, samp
 
 def test_thumbnails_are_luma_at_full_range_and_area_averages() -> None:
     rng = np.random.default_rng(0)
-    images = rng.integers(0, 255, (9, 96, 128, 3), dtype=np.uint8)
-    images = np.stack([np.kron(image[::8, ::8], np.ones((8, 8, 1), np.uint8)) for image in images])
+    images = rng.integers(0, 255, (9, 12, 16, 3), dtype=np.uint8).repeat(8, axis=1).repeat(8, axis=2)
     found = view_thumbnails(images, fps=8.0)
     assert found.gray.shape == (9, 72, 96)
-    weights = np.array([0.299, 0.587, 0.114])
-    luma = images.astype(np.float64) @ weights
+    luma = images @ np.array([0.299, 0.587, 0.114])
     assert np.abs(found.gray.mean(axis=(1, 2)) - luma.mean(axis=(1, 2))).max() < 1.0
-    assert np.array_equal(found.sharpness[::2], found.sharpness[np.arange(0, 9, 2)])
     assert found.sharpness[0] == found.sharpness[1] != found.sharpness[2]  # measured every 0.25 s, two frames at 8 Hz
     limited = ThumbnailMaker(8.0)
     limited.add(np.full((72, 96), 16, np.uint8), full_range=False)
@@ -195,9 +170,7 @@ def test_thumbnails_of_any_size_keep_brightness_and_place(height: int, width: in
     assert abs(float(small.mean()) - float(luma.mean())) < 2
 
 
-def test_sharpness_falls_with_blur_and_is_that_of_the_definition(tmp_path: Path) -> None:
-    import cv2
-
+def test_sharpness_falls_with_blur_and_is_that_of_the_definition() -> None:
     rng = np.random.default_rng(3)
     sharp = rng.integers(0, 255, (120, 160, 3), dtype=np.uint8)
     blurred = cv2.GaussianBlur(sharp, (0, 0), 2)
@@ -208,34 +181,29 @@ def test_sharpness_falls_with_blur_and_is_that_of_the_definition(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_an_enlarged_picture_is_as_sharp_as_its_recording(tmp_path: Path, sample: Make) -> None:
-    raw = recordings(tmp_path, sample, 1)
-    recorded = EpisodeSet.open(raw).thumbnails(0, "head").sharpness
-    assert "recorded_size" not in EpisodeSet.open(raw).rows[0].conventions
+def test_an_enlarged_picture_is_as_sharp_as_its_recording(tmp_path: Path, one: dict[str, Any]) -> None:
+    raw = EpisodeSet.open(one["path"])
+    recorded = raw.thumbnails(0, "head").sharpness
+    assert "recorded_size" not in raw.rows[0].conventions
     head = {"views": ["head"], "video_preset": "ultrafast"}
-    curate(config(raw, image_size=[300, 384], **head), {}, tmp_path / "large")
-    large = EpisodeSet.open(tmp_path / "large")
+    _, large = run(tmp_path, one, image_size=[300, 384], **head)
     assert json.loads(large.rows[0].conventions)["recorded_size.head"] == "128x192"
     assert large.thumbnails(0, "head").sharpness == pytest.approx(recorded, rel=0.25)
-
     # Curated again: copied, enlarged further, cut at the sides, reduced below the recording.
-    for changes, noted in (
+    for number, (changes, noted) in enumerate((
         ({}, "128x192"),
         ({"image_size": [450, 384]}, "128x192"),
         ({"image_size": [300, 192], "fit": "crop"}, "128x96"),
         ({"image_size": [64, 384]}, "64x192"),
         ({"image_size": [64, 96]}, None),
-    ):
-        out = tmp_path / "-".join(map(str, [*changes.values(), noted]))
-        curate(config(tmp_path / "large", **head, **changes), {}, out)
-        again = EpisodeSet.open(out)
+    )):  # fmt: skip
+        _, again = run(tmp_path / str(number), {"kind": "episode_set", "path": str(large.root)}, **head, **changes)
         assert json.loads(again.rows[0].conventions).get("recorded_size.head") == noted
+        sharpness = again.thumbnails(0, "head").sharpness
         if noted == "128x192":
-            assert again.thumbnails(0, "head").sharpness == pytest.approx(recorded, rel=0.3)
-        shutil.rmtree(out / "run", ignore_errors=True)
-        assert np.array_equal(
-            EpisodeSet.open(out).thumbnails(0, "head").sharpness, again.thumbnails(0, "head").sharpness
-        )
+            assert sharpness == pytest.approx(recorded, rel=0.3)
+        shutil.rmtree(again.root / "run", ignore_errors=True)
+        assert np.array_equal(EpisodeSet.open(again.root).thumbnails(0, "head").sharpness, sharpness)
 
 
 @pytest.mark.parametrize("noted", ["large", "0x9", "48", "-1x5"])
@@ -299,11 +267,8 @@ def test_a_source_without_clips_gives_its_images_one_by_one(sample: Make) -> Non
 
 
 def test_read_clip_says_the_range_of_its_luma(tmp_path: Path) -> None:
-    with av.open(str(tmp_path / "full.mp4"), "w") as out:
-        stream: Any = out.add_stream("mjpeg", rate=8)
-        stream.height, stream.width, stream.pix_fmt = 64, 96, "yuvj420p"
-        out.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 96, 3), 255, np.uint8), format="rgb24")))
-        out.mux(stream.encode(None))
-    picture = next(read_clip(VideoClip.whole_file(tmp_path / "full.mp4", 1, 8.0)))
+    white = np.full((1, 64, 96, 3), 255, np.uint8)
+    path = write_video(tmp_path / "full.mp4", white, codec="mjpeg", pixel_format="yuvj420p")
+    picture = next(read_clip(VideoClip.whole_file(path, 1, 8.0)))
     assert picture.full_range
     assert picture.luma.min() >= 253
