@@ -43,8 +43,9 @@ def lerobot(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactor
         subprocess.run([uv, "build", "-q", "--wheel", "-o", built, f"packaging/{name}"], cwd=project_root, check=True)
     installing = (uv, "pip", "install", "-q", "--no-deps", "--python", sys.executable, "--target", site)
     subprocess.run([*installing, *sorted(built.glob("*.whl"))], check=True)
+    path = os.pathsep.join([str(project_root), str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
     settings = {
-        "PYTHONPATH": os.pathsep.join([str(project_root), str(site), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "PYTHONPATH": path,
         "HF_HUB_OFFLINE": "1",
         "HF_HOME": str(tmp_path_factory.mktemp("hf")),
         "OMP_NUM_THREADS": "1",
@@ -67,7 +68,7 @@ def policy(lerobot: Callable[..., str], project_root: Path, tmp_path_factory: py
     if importlib.util.find_spec("accelerate") is None:
         pytest.skip("lerobot-train needs accelerate (the group dev has it)")
     folder = tmp_path_factory.mktemp("act")
-    recordings = project_root / "artifacts" / "shipped" / "recordings" / "datasets" / "ur5e_silver"
+    recordings = project_root / "artifacts/shipped/recordings/datasets/ur5e_silver"
     lerobot(
         folder, "lerobot_train", "--dataset.repo_id=local/ur5e_silver", f"--dataset.root={recordings}", *POLICY,
         "--steps=20", "--batch_size=4", "--num_workers=0", "--save_freq=20", "--log_freq=10", "--output_dir=out",
@@ -102,7 +103,7 @@ def test_lerobot_eval_runs_a_policy_inside_the_simulator(
 
 @pytest.mark.slow
 def test_lerobot_eval_runs_the_same_policy_in_mujoco(
-    lerobot: Callable[..., str], policy: Path, project_root: Path, tmp_path: Path
+    lerobot: Callable[..., str], policy: Path, starts: RecordedStarts, tmp_path: Path
 ) -> None:
     pytest.importorskip("mujoco")
     lerobot(
@@ -114,44 +115,10 @@ def test_lerobot_eval_runs_the_same_policy_in_mujoco(
     assert report["per_task"][0]["metrics"]["successes"] == [False, False]
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    recordings = project_root / "artifacts" / "shipped" / "recordings"
-    starts = RecordedStarts(recordings, embodiment="ur5e_silver", splits=["test"], view_sets=[VIEWS], fps=8)
     for number in range(2):
         written: Any = LeRobotDataset("eval", root=next((tmp_path / "out" / "recordings").rglob(f"env_{number}")))
         assert (written.num_episodes, written.num_frames) == (1, 3)
         np.testing.assert_allclose(written[0]["observation.state"], starts[number + 1].state, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_a_trained_policy_is_compared_in_both_worlds(policy: Path, project_root: Path, tmp_path: Path) -> None:
-    pytest.importorskip("mujoco")
-    recordings = project_root / "artifacts" / "shipped" / "recordings"
-    command = [
-        sys.executable,
-        "benchmarks/policies_inside.py",
-        "--recordings",
-        str(recordings),
-        "--embodiment",
-        "ur5e_silver",
-    ]
-    command += [
-        "--output",
-        str(tmp_path),
-        "--starts",
-        "2",
-        "--batch",
-        "2",
-        "--policies",
-        str(policy.parents[1] / "000020/pretrained_model"),
-    ]
-    subprocess.run(
-        command, cwd=project_root, env={**os.environ, "PYTHONPATH": str(project_root)}, check=True, timeout=400
-    )
-    attempts = [json.loads(line) for line in (tmp_path / "attempts.jsonl").read_text().splitlines()]
-    assert [(one["policy"], one["learned"], one["mujoco"], one["simulator"]) for one in attempts] == [
-        ("act_000020", True, False, False)
-    ] * 2
-    assert len({one["start"] for one in attempts}) == 2
 
 
 RECORDED = (
@@ -201,37 +168,35 @@ def check_recorded(project_root: Path, root: Path, views: tuple[str, ...], *, lo
     return driven
 
 
+def check_replayed(project_root: Path, starts: RecordedStarts, root: Path) -> None:
+    for number, commands in enumerate(check_recorded(project_root, root, VIEWS, lossless=True)):
+        np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
+
+
+REPLAY = (
+    "--robot.type=worldline", "--teleop.type=worldline_replay", "--dataset.repo_id=local/simulated", "--dataset.video=false",
+    *RECORDED,
+)  # fmt: skip
+
+
 @pytest.mark.slow
 def test_lerobot_record_writes_what_recorded_commands_lead_to(
-    lerobot: Callable[..., str], project_root: Path, tmp_path: Path
+    lerobot: Callable[..., str], project_root: Path, starts: RecordedStarts, tmp_path: Path
 ) -> None:
-    said = lerobot(
-        tmp_path, "lerobot_record", "--robot.type=worldline", "--teleop.type=worldline_replay",
-        "--dataset.repo_id=local/simulated", "--dataset.video=false", *RECORDED,
-    )  # fmt: skip
-    assert "Commands come at" not in said
-    recordings = project_root / "artifacts" / "shipped" / "recordings"
-    starts = RecordedStarts(recordings, embodiment="ur5e_silver", splits=["test"], view_sets=[VIEWS], fps=8)
-    for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", VIEWS, lossless=True)):
-        np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
+    assert "Commands come at" not in lerobot(tmp_path, "lerobot_record", *REPLAY)
+    check_replayed(project_root, starts, tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_lerobot_record_goes_on_with_a_dataset(lerobot: Callable[..., str], project_root: Path, tmp_path: Path) -> None:
+def test_lerobot_record_goes_on_with_a_dataset(
+    lerobot: Callable[..., str], project_root: Path, starts: RecordedStarts, tmp_path: Path
+) -> None:
     """Another command records the second episode; it begins at the second start."""
     pytest.importorskip("deepdiff", reason="--resume compares features with deepdiff, of LeRobot's core_scripts")
-    one = [option.replace("num_episodes=2", "num_episodes=1") for option in RECORDED]
-    asked = (
-        "--robot.type=worldline", "--robot.dataset_root=out", "--teleop.type=worldline_replay",
-        "--dataset.repo_id=local/simulated", "--dataset.video=false", *one,
-    )  # fmt: skip
+    asked = [option.replace("num_episodes=2", "num_episodes=1") for option in (*REPLAY, "--robot.dataset_root=out")]
     lerobot(tmp_path, "lerobot_record", *asked)
     lerobot(tmp_path, "lerobot_record", *asked, "--resume=true")
-    starts = RecordedStarts(
-        project_root / "artifacts" / "shipped" / "recordings", embodiment="ur5e_silver", splits=["test"], view_sets=[VIEWS], fps=8
-    )  # fmt: skip
-    for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", VIEWS, lossless=True)):
-        np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
+    check_replayed(project_root, starts, tmp_path / "out")
     assert len(list((tmp_path / "out" / "meta" / "cameras").iterdir())) == 2
 
 

@@ -37,17 +37,6 @@ def plugin(project_root: Path) -> Iterator[ModuleType]:
         yield importlib.import_module("lerobot_robot_worldline")
 
 
-@pytest.fixture(scope="module")
-def world(project_root: Path) -> WorldLine:
-    return WorldLine.from_pretrained(project_root / "artifacts" / "shipped" / "models" / "causal")
-
-
-@pytest.fixture(scope="module")
-def starts(project_root: Path) -> RecordedStarts:
-    recordings = project_root / "artifacts" / "shipped" / "recordings"
-    return RecordedStarts(recordings, embodiment=ROBOT, splits=("test",), view_sets=[VIEWS], fps=8.0)
-
-
 @pytest.fixture
 def robot(plugin: ModuleType, world: WorldLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     monkeypatch.setattr(plugin.robot.WorldLine, "from_pretrained", lambda *_, **__: world)
@@ -70,17 +59,25 @@ def begun(world: WorldLine, starts: RecordedStarts, seed: int) -> Simulation:
     return world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=seed)
 
 
+@pytest.fixture
+def announcements() -> Iterator[None]:
+    """Messages of every level reach the robot, as LeRobot's commands let them."""
+    root = logging.getLogger()
+    level = root.level
+    root.setLevel(logging.NOTSET)
+    yield
+    root.setLevel(level)
+
+
 def test_a_robot_is_driven_as_a_simulation(robot: Any, replay: Any, world: WorldLine, starts: RecordedStarts) -> None:
     assert robot.action_features == replay.action_features
     assert list(robot.action_features)[:2] == ["left_shoulder_pan_joint.pos", "left_shoulder_lift_joint.pos"]
-    assert robot.observation_features == {
-        **dict.fromkeys(robot.action_features, float),
-        **dict.fromkeys(VIEWS, (64, 96, 3)),
-    }
+    pictures = dict.fromkeys(VIEWS, (64, 96, 3))
+    assert robot.observation_features == {**dict.fromkeys(robot.action_features, float), **pictures}
     robot.connect()
     simulation = begun(world, starts, 0)
     before, block = simulation.pictures[0]["head"], starts.commands(0)[:16]
-    pictures = simulation.step(block)[0]["head"]
+    after = simulation.step(block)[0]["head"][-1]
     for number, command in enumerate(block):
         observation = robot.get_observation()
         assert list(observation) == list(robot.observation_features)
@@ -92,7 +89,7 @@ def test_a_robot_is_driven_as_a_simulation(robot: Any, replay: Any, world: World
         np.testing.assert_array_equal(list(sent.values()), simulation.commands[0, number])
         state = [robot.get_observation()[name] for name in robot.action_features]
         np.testing.assert_array_equal(state, simulation.states[0, number])
-    assert np.array_equal(robot.get_observation()["head"], pictures[-1])
+    assert np.array_equal(robot.get_observation()["head"], after)
 
 
 def test_a_robot_is_connected_or_not(robot: Any) -> None:
@@ -109,8 +106,6 @@ def test_a_robot_is_connected_or_not(robot: Any) -> None:
     robot.disconnect()
     assert not robot.is_connected
     assert len(logging.getLogger().handlers) == handlers - 1
-    robot.connect()
-    assert robot.get_observation()["head"].shape == (64, 96, 3)
 
 
 def test_pictures_are_predicted_when_they_are_looked_at(robot: Any, replay: Any) -> None:
@@ -156,64 +151,53 @@ def test_actions_of_other_robots_are_refused(robot: Any, replay: Any) -> None:
     assert robot.get_observation()["left_elbow_joint.pos"] == sent["left_elbow_joint.pos"]
 
 
+@pytest.mark.usefixtures("announcements")
 def test_episodes_begin_where_lerobot_announces_them(
     robot: Any, replay: Any, world: WorldLine, starts: RecordedStarts
 ) -> None:
-    root = logging.getLogger()
-    level = root.level
-    root.setLevel(logging.NOTSET)  # as LeRobot's commands do
-    try:
-        robot.connect()
-        assert starts.commands(0)[0].tolist() != starts.commands(1)[0].tolist()
-        for episode in (0, 1, 1, 0):
-            simulation = begun(world, starts, episode)
-            logging.info("Recording episode %d", episode)
-            observation = robot.get_observation()
-            assert np.array_equal(observation["head"], simulation.pictures[0]["head"])
-            assert observation["left_elbow_joint.pos"] == simulation.state[0, 2]
-            assert list(replay.get_action().values()) == starts.commands(episode)[0].tolist()
-            robot.send_action(replay.get_action())
-            logging.info("Reset the environment")
-            assert robot._running.age == 1
-        # After its last command a recording stays there.
-        last = [replay.get_action() for _ in range(len(starts.commands(0)))][-1]
-        assert list(last.values()) == starts.commands(0)[-1].tolist()
-    finally:
-        root.setLevel(level)
+    robot.connect()
+    assert starts.commands(0)[0].tolist() != starts.commands(1)[0].tolist()
+    for episode in (0, 1, 1, 0):
+        simulation = begun(world, starts, episode)
+        logging.info("Recording episode %d", episode)
+        observation = robot.get_observation()
+        assert np.array_equal(observation["head"], simulation.pictures[0]["head"])
+        assert observation["left_elbow_joint.pos"] == simulation.state[0, 2]
+        assert list(replay.get_action().values()) == starts.commands(episode)[0].tolist()
+        robot.send_action(replay.get_action())
+        logging.info("Reset the environment")
+        assert robot._running.age == 1
+    # After its last command a recording stays there.
+    last = [replay.get_action() for _ in range(len(starts.commands(0)))][-1]
+    assert list(last.values()) == starts.commands(0)[-1].tolist()
 
 
+@pytest.mark.usefixtures("announcements")
 def test_cameras_of_an_episode_are_written_into_its_dataset(
     robot: Any, replay: Any, starts: RecordedStarts, tmp_path: Path
 ) -> None:
-    root = logging.getLogger()
-    level = root.level
-    root.setLevel(logging.NOTSET)
-    robot.config.dataset_root = str(tmp_path / "recorded")
-    try:
-        robot.connect()
-        for episode, frames in ((0, 5), (1, 3)):
-            logging.info("Recording episode %d", episode)
-            for _ in range(frames):
+    recorded = tmp_path / "recorded"
+    robot.config.dataset_root = str(recorded)
+    robot.connect()
+    for episode in (0, 1):
+        logging.info("Recording episode %d", episode)
+        for _ in range(3):
+            robot.get_observation()
+            robot.send_action(replay.get_action())
+        logging.info("Reset the environment" if episode == 0 else "Stop recording")
+        if episode == 0:
+            with pytest.raises(DataError, match=r"(?s)No dataset.*folder of --dataset.root"):
                 robot.get_observation()
-                robot.send_action(replay.get_action())
-            logging.info("Reset the environment" if episode == 0 else "Stop recording")
-            if episode == 0:
-                with pytest.raises(DataError, match=r"(?s)No dataset.*folder of --dataset.root"):
-                    robot.get_observation()
-                (tmp_path / "recorded" / "meta").mkdir(parents=True)
-                (tmp_path / "recorded" / "meta" / "info.json").write_text("{}")
-        robot.disconnect()
-    finally:
-        root.setLevel(level)
-    camera = read_calibration(tmp_path / "recorded" / "meta" / "cameras" / "000001.json").views["head"]
+            (recorded / "meta").mkdir(parents=True)
+            (recorded / "meta" / "info.json").write_text("{}")
+    robot.disconnect()
+    camera = read_calibration(recorded / "meta" / "cameras" / "000001.json").views["head"]
     np.testing.assert_allclose(camera.T, starts[1].cameras["head"].T_base_camera[None], atol=1e-6)
     np.testing.assert_array_equal(camera.K, starts[1].cameras["head"].K)
-    source = read_yaml(tmp_path / "recorded" / "curate.yaml")["curate"]["sources"][0]
+    source = read_yaml(recorded / "curate.yaml")["curate"]["sources"][0]
     assert source["grippers"]["left_gripper.pos"] == {"closed": 0.0, "open": 1.0}
-    assert (source["angle_unit"], source["views"]) == (
-        "rad",
-        {f"observation.images.{view}": view for view in VIEWS},
-    )
+    assert source["angle_unit"] == "rad"
+    assert source["views"] == {f"observation.images.{view}": view for view in VIEWS}
 
 
 @pytest.mark.parametrize(("interval", "warned"), [(1 / 30, True), (1 / 8, False)])
@@ -235,9 +219,8 @@ def test_units_and_names_are_those_of_leader_arms(plugin: ModuleType) -> None:
     """LeRobot's SO-101 leader sends these names, degrees, and a gripper of 0 to 100."""
     kinematics = ArmKinematics(load_embodiment("so101"))
     leader = plugin.device.Columns(kinematics, use_degrees=True)
-    assert leader.names == [
-        f"{name}.pos" for name in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
-    ]
+    joints = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+    assert leader.names == [f"{name}.pos" for name in joints]
     row = np.array([0.1, -0.2, 0.3, 0.4, -0.5, 0.25])
     sent = leader.named(row)
     np.testing.assert_allclose(list(sent.values()), [*np.degrees(row[:5]), 25.0])
@@ -246,9 +229,7 @@ def test_units_and_names_are_those_of_leader_arms(plugin: ModuleType) -> None:
 
 
 def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: RecordedStarts, tmp_path: Path) -> None:
-    start, folder = starts[1], tmp_path / "observed"
-    folder.mkdir()
-    entries: dict[str, Any] = {}
+    start, folder, entries = starts[1], tmp_path, {}
     for view, camera in start.cameras.items():
         Image.fromarray(start.images[view]).save(folder / f"{view}.png")
         height, width = start.images[view].shape[:2]
@@ -265,18 +246,11 @@ def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: 
     for command in starts.commands(1)[:16]:
         robot.send_action(robot._columns.named(command))
     assert np.array_equal(robot.get_observation()["head"], simulation.step(starts.commands(1)[:16])[0]["head"][-1])
-
-    def read() -> None:
-        read_start(folder, load_embodiment(ROBOT), VIEWS)
-
-    (folder / "left_wrist.png").rename(folder / "gone.png")
-    with pytest.raises(DataError, match=r"(?s)Not a picture to start from.*left_wrist.png"):
-        read()
-    (folder / "gone.png").rename(folder / "left_wrist.png")
-    (folder / "calibration.yaml").write_text(yaml.safe_dump({"views": {"head": entries["head"]}}))
-    with pytest.raises(DataError, match=r"(?s)pinhole camera of each view.*view left_wrist.*got: nothing"):
-        read()
-    (folder / "calibration.yaml").write_text(yaml.safe_dump({"views": entries}))
-    (folder / "state.yaml").write_text(yaml.safe_dump(state | {names[0]: "zero"}))
-    with pytest.raises(DataError, match=r"(?s)Not the robot's state.*left/shoulder_pan_joint"):
-        read()
+    for name, content, said in (
+        ("state.yaml", state | {names[0]: "zero"}, r"(?s)Not the robot's state.*left/shoulder_pan_joint"),
+        ("calibration.yaml", {"views": {"head": entries["head"]}}, r"(?s)each view.*view left_wrist.*got: nothing"),
+        ("left_wrist.png", None, r"(?s)Not a picture to start from.*left_wrist.png"),
+    ):
+        (folder / name).write_text(yaml.safe_dump(content))
+        with pytest.raises(DataError, match=said):
+            read_start(folder, load_embodiment(ROBOT), VIEWS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import warnings
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -28,9 +27,13 @@ from worldline_core.rollout.simulation import Session
 FORM: dict[str, Any] = {"embodiment": "ur5e_silver", "flat_observation": True, "normalised_actions": True}
 
 
-@pytest.fixture(scope="module")
-def world(project_root: Path) -> WorldLine:
-    return WorldLine.from_pretrained(project_root / "artifacts" / "shipped" / "models" / "causal")
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many environments each call of the model stepped."""
+    counts: list[int] = []
+    original = Session.step
+    monkeypatch.setattr(Session, "step", lambda one, maps: counts.append(len(maps)) or original(one, maps))
+    return counts
 
 
 @pytest.mark.parametrize("name", [ENVIRONMENT, MUJOCO_ENVIRONMENT])
@@ -47,13 +50,10 @@ def test_its_checker_finds_nothing(world: WorldLine, name: str, reward: str, req
     environment.close()
 
 
-def test_a_batch_is_its_own_vector_of_single_environments(world: WorldLine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_is_its_own_vector_of_single_environments(world: WorldLine, calls: list[int]) -> None:
     """To the end of two episodes: observations, rewards, terminal observations, time limits; but one call of the model for all."""
     options: dict[str, Any] = {"model": world, "episode_frames": 6, "observe_every": 4, "reward": "soft"}
     options["success"] = lambda video: "drawer" in video.instruction
-    calls: list[int] = []
-    original = Session.step
-    monkeypatch.setattr(Session, "step", lambda one, maps: calls.append(len(maps)) or original(one, maps))
     ours = WorldLineVecEnv(2, **FORM, **options)
     theirs = DummyVecEnv([lambda: WorldLineEnv(**FORM, **options)] * 2)
     assert (ours.observation_space, ours.action_space) == (theirs.observation_space, theirs.action_space)
@@ -73,12 +73,12 @@ def test_a_batch_is_its_own_vector_of_single_environments(world: WorldLine, monk
     assert all(ours.observation_space.contains(info["terminal_observation"]) for info in ends)
     # Of an episode at steps 4 and 6: of ours both clips at once, of theirs one by one.
     assert (calls.count(2), calls.count(1)) == (4, 8)
-    ours.set_options({"start": world_start(ours), "frame": 5})
-    theirs.set_options({"start": world_start(ours), "frame": 5})
+    start = ours.envs.starts.rows[2].episode_id
     for one in (ours, theirs):
+        one.set_options({"start": start, "frame": 5})
         one.seed(7)
     assert data_equivalence(ours.reset(), dict(theirs.reset()))
-    assert ours.reset_infos[1]["episode_id"] == world_start(ours)
+    assert ours.reset_infos[1]["episode_id"] == start
     assert ours.get_attr("task")[0] == ours.env_method("task", indices=[0])[0]
     assert ours.render().shape == (2 * 64, 3 * 96, 3)
     with pytest.raises(AttributeError, match="nothing"):
@@ -86,17 +86,10 @@ def test_a_batch_is_its_own_vector_of_single_environments(world: WorldLine, monk
     ours.close()
 
 
-def world_start(env: WorldLineVecEnv) -> str:
-    return env.envs.starts.rows[2].episode_id
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["PPO", "SAC"])
-def test_training_runs_over_a_batch(world: WorldLine, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_training_runs_over_a_batch(world: WorldLine, calls: list[int], kind: str) -> None:
     """With one call of the model for all environments at each step with new pictures; equal seeds give equal weights."""
-    calls: list[int] = []
-    original = Session.step
-    monkeypatch.setattr(Session, "step", lambda one, maps: calls.append(len(maps)) or original(one, maps))
 
     def trained() -> Any:
         env = VecMonitor(WorldLineVecEnv(

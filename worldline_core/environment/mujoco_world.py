@@ -109,9 +109,10 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             self.starts.at(start, frame)  # refuses what is not there before an episode begins
         self._recorder = EpisodeRecorder(self.starts.embodiment)
         self._data = self._recorder.new_data()
-        self._recipe = _recipe(folder)
-        # Drawing a start again tries every policy that recorded it.
-        self._drawn = lru_cache(maxsize=1024)(lambda name: self._recipe(self._recorder, self.starts.row(name)))
+        recorder, starts, recipe = self._recorder, self.starts, _recipe(folder)
+        # Drawing a start again tries every policy that recorded it. Without `self`: in a reference cycle the renderers
+        # would be freed by the garbage collector, on any thread.
+        self._drawn = lru_cache(maxsize=1024)(lambda name: recipe(recorder, starts.row(name)))
         self.task = self.task_description = ""
         self._left = 0  # steps of the running episode
 
