@@ -63,112 +63,58 @@ def write_lerobot(
     robot: str | None = "so101_follower",
 ) -> Path:
     """A dataset of these vectors (feature -> names, values by episode) and cameras (key -> frames by episode)."""
+    picture = {"dtype": "video", "shape": [HEIGHT, WIDTH, 3], "names": ["height", "width", "channels"]}
     features: dict[str, Any] = {
-        name: {"dtype": "float32", "shape": [values[0].shape[1]], "names": names}
-        for name, (names, values) in vectors.items()
-    }
-    features |= {
-        key: {"dtype": "video", "shape": [HEIGHT, WIDTH, 3], "names": ["height", "width", "channels"]}
-        for key in cameras
-    }
-    features |= {"task_index": {"dtype": "int64", "shape": [1], "names": None}}
+        **{name: {"dtype": "float32", "shape": [v[0].shape[1]], "names": names} for name, (names, v) in vectors.items()},
+        **dict.fromkeys(cameras, picture), "task_index": {"dtype": "int64", "shape": [1], "names": None},
+    }  # fmt: skip
     lengths = [len(values) for values in next(iter(vectors.values()))[1]]
-    info: dict[str, Any] = {
-        "codebase_version": version,
-        "robot_type": robot,
-        "fps": fps,
-        "features": features,
-        "chunks_size": 1000,
-    }
-    (root / "meta").mkdir(parents=True)
+    starts = [sum(lengths[:index]) for index in range(len(lengths))]
     tables = []
-    start = 0
-    for index, length in enumerate(lengths):
+    for index, (start, length) in enumerate(zip(starts, lengths, strict=True)):
         table: dict[str, Any] = {name: list(values[index].astype(np.float32)) for name, (_, values) in vectors.items()}
         table |= {
             "timestamp": (np.arange(length) / fps).astype(np.float32), "frame_index": np.arange(length),
             "episode_index": [index] * length, "index": start + np.arange(length), "task_index": [0] * length,
         }  # fmt: skip
         tables.append(pa.table(table))
-        start += length
+    rows = [{"episode_index": i, "tasks": ["Pick the cube up."], "length": length} for i, length in enumerate(lengths)]
+    (root / "meta/episodes/chunk-000").mkdir(parents=True)
+    (root / "data/chunk-000").mkdir(parents=True)
     if version == "v3.0":
-        _write_v3(root, info, tables, lengths, cameras, fps)
+        data = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+        video = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+        pq.write_table(pa.concat_tables(tables), root / "data/chunk-000/file-000.parquet")
+        for row, start in zip(rows, starts, strict=True):
+            end = start + row["length"]
+            row |= {"data/chunk_index": 0, "data/file_index": 0, "dataset_from_index": start, "dataset_to_index": end}
+            for key in (f"videos/{camera}" for camera in cameras):
+                row |= {f"{key}/chunk_index": 0, f"{key}/file_index": 0}
+                row |= {f"{key}/from_timestamp": start / fps, f"{key}/to_timestamp": end / fps}
+        pq.write_table(pa.Table.from_pylist(rows), root / "meta/episodes/chunk-000/file-000.parquet")
+        pq.write_table(pa.table({"task_index": [0], "task": ["Pick the cube up."]}), root / "meta/tasks.parquet")
+        for key, episodes in cameras.items():
+            write_video(root / f"videos/{key}/chunk-000/file-000.mp4", np.concatenate(episodes), fps)
     else:
-        _write_v2(root, info, tables, lengths, cameras, fps)
-    (root / "meta/info.json").write_text(json.dumps(info))
+        data = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+        video = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+        (root / "meta/episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        (root / "meta/tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": "Pick the cube up."}) + "\n")
+        for index, table in enumerate(tables):
+            pq.write_table(table, root / f"data/chunk-000/episode_{index:06d}.parquet")
+            for key, episodes in cameras.items():
+                write_video(root / f"videos/chunk-000/{key}/episode_{index:06d}.mp4", episodes[index], fps)
+    (root / "meta/info.json").write_text(json.dumps({
+        "codebase_version": version, "robot_type": robot, "fps": fps, "features": features, "chunks_size": 1000,
+        "data_path": data, "video_path": video,
+    }))  # fmt: skip
     return root
 
 
-def _write_v3(
-    root: Path,
-    info: dict[str, Any],
-    tables: list[pa.Table],
-    lengths: list[int],
-    cameras: Mapping[str, Sequence[np.ndarray]],
-    fps: int,
-) -> None:
-    info |= {
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-    }
-    for folder in ("data/chunk-000", "meta/episodes/chunk-000"):
-        (root / folder).mkdir(parents=True)
-    pq.write_table(pa.concat_tables(tables), root / "data/chunk-000/file-000.parquet")
-    rows = []
-    start = 0
-    for index, length in enumerate(lengths):
-        row: dict[str, Any] = {
-            "episode_index": index,
-            "tasks": ["pick"],
-            "length": length,
-            "data/chunk_index": 0,
-            "data/file_index": 0,
-        }
-        row |= {"dataset_from_index": start, "dataset_to_index": start + length}
-        for key in cameras:
-            row |= {f"videos/{key}/chunk_index": 0, f"videos/{key}/file_index": 0}
-            row |= {f"videos/{key}/from_timestamp": start / fps, f"videos/{key}/to_timestamp": (start + length) / fps}
-        rows.append(row)
-        start += length
-    pq.write_table(pa.Table.from_pylist(rows), root / "meta/episodes/chunk-000/file-000.parquet")
-    pq.write_table(pa.table({"task_index": [0], "task": ["Pick the cube up."]}), root / "meta/tasks.parquet")
-    for key, episodes in cameras.items():
-        write_video(root / f"videos/{key}/chunk-000/file-000.mp4", np.concatenate(episodes), fps)
-
-
-def _write_v2(
-    root: Path,
-    info: dict[str, Any],
-    tables: list[pa.Table],
-    lengths: list[int],
-    cameras: Mapping[str, Sequence[np.ndarray]],
-    fps: int,
-) -> None:
-    info |= {
-        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
-    }
-    rows = [{"episode_index": i, "tasks": ["Pick the cube up."], "length": length} for i, length in enumerate(lengths)]
-    (root / "meta/episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    (root / "meta/tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": "Pick the cube up."}) + "\n")
-    for index, table in enumerate(tables):
-        path = root / f"data/chunk-000/episode_{index:06d}.parquet"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(table, path)
-        for key, episodes in cameras.items():
-            write_video(root / f"videos/chunk-000/{key}/episode_{index:06d}.mp4", episodes[index], fps)
-
-
-def so101_states(episodes: int = 4, frames: int = 60, *, degrees: bool = True) -> list[np.ndarray]:
+def so101_states(episodes: int = 4, frames: int = 60) -> list[np.ndarray]:
     """Joints in degrees, in whole ticks of the motors, and a gripper of 0 .. 100 that closes on something."""
-    states = []
-    for seed in range(episodes):
-        joints = motion(5, frames, seed, size=50.0)
-        state = np.concatenate(
-            [np.round(joints / TICK) * TICK if degrees else joints, gripper(frames)[:, None]], axis=1
-        )
-        states.append(state)
-    return states
+    joints = (np.round(motion(5, frames, seed, size=50.0) / TICK) * TICK for seed in range(episodes))
+    return [np.column_stack([each, gripper(frames)]) for each in joints]
 
 
 def gripper(frames: int, low: float = 2.0, high: float = 80.0) -> np.ndarray:
@@ -193,23 +139,15 @@ def write_so101(
 def write_aloha(root: Path, **options: Any) -> Path:
     """Two ViperX of ALOHA: radians, grippers 0 .. 1, three cameras at 50 Hz."""
     names = [f"{side}_{name}" for side in ("left", "right") for name in (*ALOHA, "gripper")]
-    states = []
-    for seed in range(4):
-        joints, frames = motion(12, 80, seed), 80
-        ends = gripper(frames, 0.05, 0.95)[:, None]
-        states.append(np.concatenate([joints[:, :6], ends, joints[:, 6:], ends], axis=1))
-    kinds = {
-        "observation.images.cam_high": "still",
-        "observation.images.cam_left_wrist": "wrist",
-        "observation.images.cam_right_wrist": "wrist",
-    }
+    ends = gripper(80, 0.05, 0.95)
+    joints = [motion(12, 80, seed) for seed in range(4)]
+    states = [np.column_stack([each[:, :6], ends, each[:, 6:], ends]) for each in joints]
     videos = {
-        key: [
-            pictures(state[:, 7:13] if "right" in key else state[:, :6], kind, seed)
-            for seed, state in enumerate(states)
-        ]
-        for key, kind in kinds.items()
-    }
+        f"observation.images.cam_{name}": [pictures(each[:, part], kind, seed) for seed, each in enumerate(joints)]
+        for name, part, kind in (
+            ("high", slice(6), "still"), ("left_wrist", slice(6), "wrist"), ("right_wrist", slice(6, 12), "wrist"),
+        )
+    }  # fmt: skip
     vectors = {
         "observation.state": ({"motors": names}, states),
         "action": ({"motors": names}, [s + 0.01 for s in states]),
