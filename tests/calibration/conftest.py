@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from benchmarks import calibration as benchmark
 from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.sources.agibot import AgibotGesimSource, AgibotGesimSourceConfig
+from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 COUNT, HEIGHT, WIDTH, FPS = 24, 60, 80, 10.0
 
@@ -26,13 +32,9 @@ def looking_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 def episode() -> Episode:
     """A tool that swings and turns over a table; the wrist camera sits behind it and looks along its z."""
     time = np.linspace(0, 2 * np.pi, COUNT)
-    tools = np.tile(np.eye(4), (COUNT, 1, 1, 1))
-    for n, t in enumerate(time):
-        pitch, yaw = np.pi + 0.3 * np.sin(t), 0.6 * np.cos(1.3 * t)
-        about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
-        about_z = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-        tools[n, 0, :3, :3] = about_z @ about_x
-        tools[n, 0, :3, 3] = (0.5 + 0.1 * np.cos(t), 0.15 * np.sin(t), 0.2 + 0.05 * np.sin(2 * t))
+    places = np.stack([0.5 + 0.1 * np.cos(time), 0.15 * np.sin(time), 0.2 + 0.05 * np.sin(2 * time)], 1)
+    turns = np.stack([np.pi + 0.3 * np.sin(time), 0 * time, 0.6 * np.cos(1.3 * time)], 1)
+    tools = pose_from_euler_fixed_xyz(places, turns)[:, None]
     mount = np.eye(4)
     mount[:3, 3] = (0.0, -0.05, -0.15)
     K = np.array([[70.0, 0, 39.5], [0, 70.0, 29.5], [0, 0, 1]])
@@ -66,3 +68,17 @@ def healthy() -> list:
     for item in benchmark.healthy(benchmark.RECORDINGS, {"test", "ood_test"}, 4):
         found.setdefault(item.joints.embodiment, item)
     return list(found.values())
+
+
+@pytest.fixture(scope="session")
+def agibot(shared_data: Path) -> Callable[[str], list[tuple[Episode, dict[str, np.ndarray]]]]:
+    """Episodes of an AgiBot layout with their pictures."""
+
+    @cache
+    def read(layout: str) -> list[tuple[Episode, dict[str, np.ndarray]]]:
+        root = shared_data / layout
+        source = AgibotGesimSource(AgibotGesimSourceConfig(path=root, fps=30), root)
+        loaded = [source.load(name) for name in source.episode_ids()]
+        return [(item.episode, {view: item.frames(view) for view in item.views}) for item in loaded]
+
+    return read

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,9 +23,6 @@ from worldline_core.calibration.camera_errors import (
     significant,
 )
 from worldline_core.calibration.check_report import (
-    CalibrationCheck,
-    EpisodeCheck,
-    conclusion_lines,
     diagnosis_picture,
     verdict_text,
 )
@@ -116,50 +112,40 @@ def test_what_was_put_into_a_wrist_view_is_found(kind: str, sizes: tuple[float, 
 
 def test_five_degrees_are_a_warning_of_the_filter(healthy: list) -> None:
     item = healthy[4]
-    recorded, bad = (
-        spoiled(item.joints, "head", "rotation", 0.0, 5.0, 0.0),
-        np.zeros(item.joints.num_frames, dtype=bool),
-    )
-    turned = quickly(item, recorded)
+    recorded = spoiled(item.joints, "head", "rotation", 0.0, 5.0, 0.0)
+    turned, bad = quickly(item, recorded), np.zeros(item.joints.num_frames, dtype=bool)
     assert (turned.verdict, [error.view for error in turned.off]) == ("off", ["head"])
     assert "rotation" in turned.off[0].named
-    assert verdict_text(turned).startswith("off: head ")
     size = estimated(turned, "head", "rotation")
     assert np.linalg.norm(size.estimate - (0, -5, 0)) < size.half_interval
-    found = detect_mistake(recorded, item.gray, bad, FilterDoctorConfig())
-    assert found.passed  # an estimate bars nothing
+    found, clean = (detect_mistake(each, item.gray, bad, FilterDoctorConfig()) for each in (recorded, item.joints))
+    assert found.passed and clean.passed  # an estimate bars nothing
     assert str(found.numbers["off"]).startswith("head ")
-    clean = detect_mistake(item.joints, item.gray, bad, FilterDoctorConfig())
-    assert clean.passed
     assert 0 < float(str(clean.numbers["head rotation unseen up to"])) < 40
     json.dumps(found.numbers, allow_nan=False)
     frames = {view: np.repeat(images[..., None], 3, axis=-1) for view, images in item.gray.items()}
-    beside = diagnosis_picture(turned, recorded, frames, item.kinematics)
-    alone = diagnosis_picture(replace(turned, verdict="consistent"), recorded, frames, item.kinematics)
+    beside, alone = (
+        diagnosis_picture(replace(turned, verdict=verdict), recorded, frames, item.kinematics)
+        for verdict in ("off", "consistent")
+    )
     assert beside.shape != alone.shape  # on its right the camera is where the estimate puts it
 
 
 @pytest.mark.slow
-def test_sources_are_judged_together(healthy: list, tmp_path: Path) -> None:
+def test_sources_are_judged_together(healthy: list) -> None:
     clean = [quickly(item, item.joints) for item in healthy]
     assert np.mean([d.verdict == "consistent" for d in clean]) >= 0.95
     found = diagnose_source("source", clean)
     assert found.verdict == "consistent"
     assert estimated(found, "head", "in the picture").bound < 8
-    findings = tuple(EpisodeCheck(d.episode_id, "source", d) for d in clean)
-    said = "\n".join(conclusion_lines(CalibrationCheck(findings, (found,), tmp_path)))
-    assert "together: consistent within " in said
-    assert "head within: rotation " in said
     for sizes in ((3.0, 0.0, 0.0), (0.0, -3.0, 0.0), (0.0, 0.0, 10.0)):
         wrong = [quickly(item, spoiled(item.joints, "head", "rotation", *sizes)) for item in healthy]
         turned = diagnose_source("source", wrong)
         assert (turned.verdict, {error.view for error in turned.off}) == ("off", {"head"})
         rotation = estimated(turned, "head", "rotation")
         assert np.linalg.norm(rotation.estimate + sizes) < rotation.half_interval
-    random, others = np.random.default_rng(0), []
-    for item in healthy:
-        sizes = random.normal(size=3) * 15
-        others.append(quickly(item, spoiled(item.joints, "head", "rotation", *sizes)))
+    random = np.random.default_rng(0)
+    others = [quickly(i, spoiled(i.joints, "head", "rotation", *random.normal(size=3) * 15)) for i in healthy]
     assert diagnose_source("source", others).verdict in ("mixed", "unexplained")
 
 
@@ -217,9 +203,7 @@ def test_without_pictures_no_bound_is_claimed(healthy: list) -> None:
     item = healthy[0]
     diagnosis = diagnose(item.poses, {}, item.kinematics, quick=True)
     assert diagnosis.camera_errors == ()
-    assert verdict_text(
-        diagnosis
-    ) == "consistent by its poses, but no picture says within what; not judged: " + ", ".join(item.poses.cameras)
+    assert verdict_text(diagnosis).endswith("not judged: " + ", ".join(item.poses.cameras))
 
 
 def test_exchanged_wrist_videos_are_found(healthy: list) -> None:
@@ -231,5 +215,3 @@ def test_exchanged_wrist_videos_are_found(healthy: list) -> None:
     assert sum(d.best.mistake == "wrist_videos" for d in found) >= 3
     together = diagnose_source("source", found)
     assert (together.verdict, together.best.other) == ("explained", ("wrist_videos", "exchanged"))
-    named = next(d for d in found if d.best.mistake == "wrist_videos")
-    assert any("exchange the two where the source is written" in note for note in named.notes)

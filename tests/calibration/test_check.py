@@ -6,6 +6,7 @@ import errno
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +19,10 @@ from worldline_core.calibration import check as check_module
 from worldline_core.calibration import check_report
 from worldline_core.calibration.check import ListedEpisode, check_calibration, repairing_lines
 from worldline_core.calibration.check_report import (
-    MIN_WIDTH,
     CalibrationCheck,
     EpisodeCheck,
     as_json,
     diagnosis_picture,
-    differing_moments,
     page,
     recorded_tracks,
     table_text,
@@ -35,8 +34,8 @@ from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
 
-CLEAN, INVERTED = "ur5e_silver-test-s1-00000", "ur5e_silver-train-s1-00002"
-"""Shipped recordings; the second has inverted extrinsics (injected_defects.json)."""
+INVERTED = "ur5e_silver-train-s1-00002"
+"""A shipped recording with inverted extrinsics (injected_defects.json)."""
 HOSTILE = "<script>alert('x')</script>"
 Images = dict[str, np.ndarray]
 
@@ -46,23 +45,16 @@ def listed(episode: Episode, images: Images, name: str = "synthetic/0") -> Liste
     return ListedEpisode(name, "synthetic", lambda: LoadedEpisode(named, tuple(images), lambda view: images[view]))
 
 
-def explained(conventions: RecordedConventions) -> Explanation:
-    return Explanation(conventions, -1.0, {})
-
-
 def diagnosis_of(conventions: RecordedConventions) -> Diagnosis:
     none = Explanation(RecordedConventions(), -80.0, {"hand_eye right_wrist": -80.0})
     if not conventions.departures:
         return Diagnosis(episode_id="synthetic/0", verdict="too_little_evidence", best=none, ranked=(none,))
-    best = explained(conventions)
+    best = Explanation(conventions, -1.0, {})
     return Diagnosis(episode_id="synthetic/0", verdict="explained", best=best, ranked=(best, none))
 
 
-# --- the check
-
-
 def test_two_mistakes_need_a_line_each_and_declared_ones_must_go_first(episode: Episode, images: Images) -> None:
-    explanation = explained(RecordedConventions(tool_offset_z_m=0.05, gripper="inverted"))
+    explanation = Explanation(RecordedConventions(tool_offset_z_m=0.05, gripper="inverted"), -1.0, {})
     assert explanation.mistake == "tool_offset_z_m+gripper"
     assert repairing_lines(listed(episode, images), explanation) == (
         "curate.sources[].conventions.tool_offset_z_m: 0.05",
@@ -70,8 +62,8 @@ def test_two_mistakes_need_a_line_each_and_declared_ones_must_go_first(episode: 
     )
     declared = replace(listed(episode, images), declared=RecordedConventions(camera_lag_frames=1))
     (line,) = repairing_lines(declared, explanation)
-    assert line.startswith("remove curate.sources[].conventions and check again")
-    assert repairing_lines(declared, explained(RecordedConventions())) == ()
+    assert line.startswith("remove curate.sources[].conventions")
+    assert repairing_lines(declared, replace(explanation, conventions=RecordedConventions())) == ()
 
 
 def test_an_episode_that_ends_in_a_bug_does_not_cost_the_others_their_reports(
@@ -87,12 +79,12 @@ def test_an_episode_that_ends_in_a_bug_does_not_cost_the_others_their_reports(
     check = check_calibration([listed(episode, images, name) for name in names], tmp_path)
     assert [episode.episode_id for episode in check.episodes] == names
     assert [episode.reason for episode in check.episodes] == [None, "crashed", None]
-    assert "ValueError: At least one stride is negative (" in table_text(check)
     assert not check.consistent  # the command's exit status
     stored = json.loads((tmp_path / "diagnoses.json").read_text())["episodes"]
-    assert [entry["picture"] is not None for entry in stored] == [True, False, True]
-    assert all((tmp_path / entry["picture"]).is_file() for entry in stored if entry["picture"])
-    assert "At least one stride is negative" in (tmp_path / "index.html").read_text()
+    pictures = [entry["picture"] and (tmp_path / entry["picture"]).is_file() for entry in stored]
+    assert pictures == [True, None, True]
+    for shown in (table_text(check), (tmp_path / "index.html").read_text()):
+        assert "At least one stride is negative" in shown
 
 
 def test_a_full_disk_ends_the_check(
@@ -120,23 +112,18 @@ def test_a_bad_episode_is_listed_and_the_rest_goes_on(episode: Episode, images: 
     check = check_calibration(given, tmp_path)
     reasons = ["truncated_video", "length_mismatch", "nan_state", None, None]
     assert [episode.reason for episode in check.episodes] == reasons
-    assert "without kinematics of no_such_robot" in check.episodes[3].notes[0]
-    assert "other arms than the recording" in check.episodes[4].notes[0]
+    assert "no_such_robot" in check.episodes[3].notes[0]
+    assert "ur5e_pair" in check.episodes[4].notes[0]
     assert not check.consistent
-    text = table_text(check)
-    assert "truncated_video: The file ends early; expected 24; got 12" in text
-    assert "3 unreadable" in text
+    assert "truncated_video: The file ends early; expected 24; got 12" in table_text(check)
     stored = json.loads((tmp_path / "diagnoses.json").read_text())
     assert [entry["reason"] for entry in stored["episodes"]] == reasons
-
-
-# --- the report
 
 
 def made_up() -> CalibrationCheck:
     """Three verdicts, with names that would break a page that does not escape them."""
     none = Explanation(RecordedConventions(), -80.0, {"hand_eye right_wrist": np.nan})
-    best = explained(RecordedConventions(camera_axes="opengl"))
+    best = Explanation(RecordedConventions(camera_axes="opengl"), -1.0, {})
     broken = Diagnosis(episode_id="b", verdict="explained", best=best, ranked=(best, none), notes=("a note",))
     fine = Diagnosis(episode_id="a", verdict="consistent", best=none, ranked=(none,))
     summed = SourceDiagnosis(
@@ -144,43 +131,25 @@ def made_up() -> CalibrationCheck:
         votes={"camera_axes": 1, "consistent": 1}, notes=("of the set",), config_lines=("line three",),
     )  # fmt: skip
     episodes = (
-        EpisodeCheck(f"a {HOSTILE}", "s", fine, picture="pictures/a.jpg", notes=("without kinematics of x: set Y",)),
+        EpisodeCheck(f"a {HOSTILE}", "s", fine, picture="pictures/a.jpg", notes=("set Y",)),
         EpisodeCheck("b", "s", broken, config_lines=("line one", "line two")),
         EpisodeCheck("c", "s", None, "missing_file", f"why {HOSTILE}\n" + 40 * "   where: /x "),
     )
     return CalibrationCheck(episodes, (summed,), Path("out"))
 
 
-def test_the_table_shows_verdicts_scores_and_reasons() -> None:
-    text = table_text(made_up())
-    row = next(line for line in text.splitlines() if line.startswith("b "))
-    for shown in ("explained", "camera_axes", "-1.0", "-80.0"):
-        assert shown in row
-    assert "3 episodes: 1 explained, 1 unreadable, 1 consistent" in text
-    assert "source s, 2 episodes together: explained by camera_axes (score -1.0, as recorded -80.0)" in text
-    assert "single episodes say: camera axes 1, consistent 1" in text
-    assert "    line three" in text
-    assert "  b:\n    line one\n    line two" in text
-    assert text.count("note: without kinematics of x: set Y") == 1
-    gone = next(line for line in text.splitlines() if line.startswith("c "))
-    assert "missing_file: why" in gone
-    assert gone.endswith(" ...")
-    assert len(gone) < 250
-
-
 def test_the_page_escapes_what_it_shows_and_json_holds_only_its_own_numbers() -> None:
     html = page(made_up())
     assert HOSTILE not in html
     assert html.count("&lt;script&gt;") >= 3
-    assert 'src="pictures/a.jpg"' in html
     assert html.index('id="b"') < html.index('id="a ')  # the worst first
+    text = table_text(made_up())
+    assert {"    line one", "    line two", "    line three"} <= set(text.splitlines())
+    assert max(map(len, text.splitlines())) < 250
     content = json.loads(json.dumps(as_json(made_up()), allow_nan=False))
     assert content["episodes"][1]["ranked"][0]["reading"] == "camera_axes: opengl"
     assert content["episodes"][1]["ranked"][1]["evidence"] == {"hand_eye right_wrist": None}
     assert content["sources"][0]["config_lines"] == ["line three"]
-
-
-# --- the pictures
 
 
 def by_hand(episode: Episode, view: str, n: int) -> np.ndarray:
@@ -192,7 +161,7 @@ def by_hand(episode: Episode, view: str, n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("lag", [0, 3])
 def test_tools_are_drawn_where_the_recorded_camera_puts_them(episode: Episode, lag: int) -> None:
-    # The wrist camera's own poses are used, not those that follow from kinematics and a mount.
+    """The wrist camera's own poses are used, not those that follow from kinematics and a mount."""
     recorded = corrupt(episode, RecordedConventions(camera_lag_frames=lag))
     for view in ("head", "right_wrist"):
         tracks = recorded_tracks(recorded, view, None)
@@ -204,39 +173,7 @@ def test_tools_are_drawn_where_the_recorded_camera_puts_them(episode: Episode, l
     assert np.allclose(moved.T_base_tool[:, :, :3, 3], expected, atol=1e-6)
 
 
-def test_moments_are_those_at_which_the_readings_differ(episode: Episode) -> None:
-    tracks = recorded_tracks(episode, "head", None)
-    other = replace(tracks, uv=tracks.uv.copy(), valid=tracks.valid.copy())
-    other.uv[[4, 13, 20], 0, 0] += 9.0
-    other.uv[[2, 10, 22], 0, 0] += 2.0
-    assert differing_moments(tracks, other, 0, 24, 3) == [4, 13, 20]
-    # Frame n of the first is frame n - 2 of the second.
-    shifted = replace(other, uv=other.uv[2:], valid=other.valid[2:], capsules=other.capsules[2:], depth=other.depth[2:])
-    assert differing_moments(tracks, shifted, 2, 24, 3) == [4, 13, 20]
-    # A tool that leaves the picture counts for more than one that moves in it.
-    other.valid[6, 0, 0] = False
-    assert differing_moments(tracks, other, 0, 24, 3)[0] == 6
-    # Only frames with images can be shown.
-    assert differing_moments(tracks, other, 0, 2, 3) == [0, 1]
-
-
-def test_an_explained_episode_is_shown_twice(episode: Episode, images: Images) -> None:
-    conventions = RecordedConventions(extrinsics="base_to_camera")
-    grey = {view: np.full_like(clip, 90) for view, clip in images.items()}
-    wrong = corrupt(episode, conventions)
-    picture = diagnosis_picture(diagnosis_of(conventions), wrong, grey, None, moments=2, tile_height=120)
-    half = picture.shape[1] // 2
-    assert picture.shape[1] >= 2 * MIN_WIDTH
-    left, right = picture[90:-30, :half], picture[90:-30, half : 2 * half]
-    # The same frames with other overlays: much is equal, the repaired side has the drawing.
-    changed = (left != right).any(axis=-1)
-    assert 0.005 < changed.mean() < 0.6
-    blue = lambda part: (np.abs(part.astype(int) - (40, 150, 255)).max(axis=-1) < 30).sum()  # noqa: E731
-    assert blue(left) == 0
-    assert blue(right) > 15
-
-
-@pytest.mark.parametrize("lags", [(0, 4), (0, -3), (-2, 2), (3, 0)])
+@pytest.mark.parametrize("lags", [(0, -3), (-2, 2), (3, 0)])
 def test_the_repaired_side_draws_each_image_with_its_own_tools(
     episode: Episode, lags: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,52 +209,38 @@ def test_what_cannot_be_drawn_says_why(episode: Episode, images: Images) -> None
         diagnosis_picture(plain, joints, images, None)
 
 
-# --- the command, on shipped recordings
-
-
 def run(*arguments: str) -> int:
     with pytest.raises(SystemExit) as ended:
         main(["calibrate", "check", *arguments])
     return int(ended.value.code or 0)
 
 
+def configured(folder: Path, **source: Any) -> str:
+    (folder / "mine.yaml").write_text(yaml.safe_dump({"curate": {"sources": [source]}}))
+    return str(folder / "mine.yaml")
+
+
 def test_a_mistake_is_found_and_the_printed_line_repairs_it(
     project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = {"kind": "episode_set", "path": str(project_root / "artifacts/shipped/recordings"), "include": [INVERTED]}
-    config = tmp_path / "mine.yaml"
-    config.write_text(yaml.safe_dump({"curate": {"sources": [source]}}))
-    assert run(str(config), "--output", str(tmp_path / "wrong")) == 1
+    assert run(configured(tmp_path, **source), "--output", str(tmp_path / "wrong")) == 1
     printed = capsys.readouterr().out
-    line = "curate.sources[0].conventions.extrinsics: base_to_camera"
-    assert line in printed
+    assert "curate.sources[0].conventions.extrinsics: base_to_camera" in printed
     assert f"{INVERTED} explained" in " ".join(printed.split())
     assert (tmp_path / "wrong" / "pictures" / f"{INVERTED}.jpg").stat().st_size > 20_000
-    key, value = line.removeprefix("curate.sources[0].conventions.").split(": ")
-    config.write_text(yaml.safe_dump({"curate": {"sources": [source | {"conventions": {key: value}}]}}))
-    assert run(str(config), "--output", str(tmp_path / "right"), "--json") == 0
+    repaired = configured(tmp_path, **source, conventions={"extrinsics": "base_to_camera"})
+    assert run(repaired, "--output", str(tmp_path / "right"), "--json") == 0
     content = json.loads(capsys.readouterr().out)
-    assert content["consistent"] is True
-    assert content["episodes"][0]["verdict"] == "consistent"
-
-
-def test_a_clean_set_is_consistent(project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = project_root / "artifacts/shipped/recordings"
-    assert run("--artifact", str(folder), "--episode", CLEAN, "--output", str(tmp_path)) == 0
-    assert "1 episodes: 1 consistent" in capsys.readouterr().out
-    assert CLEAN in (tmp_path / "index.html").read_text()
+    assert (content["consistent"], content["episodes"][0]["verdict"]) == (True, "consistent")
 
 
 def test_agibot_samples(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = tmp_path / "agibot.yaml"
-    source = {"kind": "agibot_gesim", "path": str(shared_data / "agibot_gesim"), "fps": 30}
-    config.write_text(yaml.safe_dump({"curate": {"sources": [source]}}))
-    assert run(str(config), "--output", str(tmp_path / "out")) == 1
+    config = configured(tmp_path, kind="agibot_gesim", path=str(shared_data / "agibot_gesim"), fps=30)
+    assert run(config, "--output", str(tmp_path / "out")) == 1
     printed = capsys.readouterr().out
-    assert (
-        "consistent by its poses, but no picture says within what; not judged: head, left_wrist, right_wrist" in printed
-    )
-    assert "camera_lag_frames: 2 would fit the poses better; without pictures this is not judged" in printed
+    assert "not judged: head, left_wrist, right_wrist" in printed
+    assert "camera_lag_frames: 2 would fit the poses better" in printed
     assert "curate.sources" not in printed
 
 
@@ -333,14 +256,9 @@ def test_agibot_samples(shared_data: Path, tmp_path: Path, capsys: pytest.Captur
     ],
 )
 def test_wrong_usage_ends_with_status_2(
-    arguments: list[str],
-    message: str,
-    project_root: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], message: str, project_root: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:
+) -> None:  # fmt: skip
     monkeypatch.chdir(project_root)
     assert run(*arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert "Traceback" not in error
+    assert message in capsys.readouterr().err

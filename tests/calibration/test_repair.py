@@ -23,7 +23,7 @@ from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 
-IDS = ("xarm7_white-test-s1-00001",)
+NAME = "xarm7_white-test-s1-00001"
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +32,15 @@ def shipped(project_root: Path) -> EpisodeSet:
 
 
 def written(folder: Path, shipped: EpisodeSet, conventions: RecordedConventions) -> None:
+    """A set of one shipped recording that these conventions spoil."""
+    position = shipped.position(NAME)
+    healthy = shipped.episode(position)
+    frames = {
+        view: shipped.frames(position, view)[corrupted_image_frames(healthy.num_frames, conventions, view)]
+        for view in shipped.rows[position].views
+    }
     with EpisodeSetWriter(folder, video_crf=6, pixel_format="yuv444p") as writer:
-        for name in IDS:
-            position = shipped.position(name)
-            healthy = shipped.episode(position)
-            frames = {
-                view: shipped.frames(position, view)[corrupted_image_frames(healthy.num_frames, conventions, view)]
-                for view in shipped.rows[position].views
-            }
-            writer.add(corrupt(healthy, conventions), frames)
+        writer.add(corrupt(healthy, conventions), frames)
 
 
 @pytest.mark.slow
@@ -74,17 +74,15 @@ def test_curate_with_the_printed_line(tmp_path: Path, shipped: EpisodeSet, mista
     counts = curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "curated")
     assert counts["kept"] == 1
     curated = EpisodeSet.open(tmp_path / "curated")
-    lag = conventions.image_lag_frames
-    for i, name in enumerate(IDS):
-        repaired, healthy = curated.episode(i), shipped.episode(shipped.position(name))
-        kept = slice(lag, healthy.num_frames - lag)
-        assert np.allclose(repaired.state, healthy.state[kept], atol=1e-6)
-        for view, camera in healthy.cameras.items():
-            wanted = camera.T_base_camera[kept] if camera.moving else camera.T_base_camera
-            assert np.allclose(repaired.cameras[view].T_base_camera, wanted, atol=1e-9)
-            shown = shipped.frames(shipped.position(name), view)[kept].astype(float)
-            assert np.abs(curated.frames(i, view) - shown).mean() < 4.0
-        assert repaired.conventions[f"declared_{next(iter(mistake))}"] == str(next(iter(mistake.values())))
+    lag, position = conventions.image_lag_frames, shipped.position(NAME)
+    repaired, healthy = curated.episode(0), shipped.episode(position)
+    kept = slice(lag, healthy.num_frames - lag)
+    assert np.allclose(repaired.state, healthy.state[kept], atol=1e-6)
+    for view, camera in healthy.cameras.items():
+        wanted = camera.T_base_camera[kept] if camera.moving else camera.T_base_camera
+        assert np.allclose(repaired.cameras[view].T_base_camera, wanted, atol=1e-9)
+        assert np.abs(curated.frames(0, view) - shipped.frames(position, view)[kept].astype(float)).mean() < 4.0
+    assert repaired.conventions[f"declared_{next(iter(mistake))}"] == str(next(iter(mistake.values())))
     passed = filter_episodes(FilterConfig(), {"episodes": tmp_path / "curated"}, tmp_path / "passed")
     assert passed["stage2_ok"] == passed["found"] == 1
 
