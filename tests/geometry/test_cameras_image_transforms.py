@@ -57,21 +57,14 @@ def test_a_resize_maps_pixel_borders_to_pixel_borders(height, width, u, v):
 @steady
 @given(sides, sides)
 def test_letterbox_shows_all_and_centre_crop_fills(height, width):
-    corners = np.array([[-0.5, -0.5], [639.5, 479.5]])
-    boxed = ImageTransform.of(SIZE).letterbox((height, width))
-    (left, top), (right, bottom) = boxed.pixels(corners)
-    assert boxed.image_size == (height, width)
-    assert min(left, top) >= -0.5 - 1e-9
-    assert right <= width - 0.5 + 1e-9
-    assert bottom <= height - 0.5 + 1e-9
-    assert abs((left + 0.5) - (width - 0.5 - right)) <= 1 + 1e-9  # evenly, up to an odd pixel
-    assert abs((top + 0.5) - (height - 0.5 - bottom)) <= 1 + 1e-9
-    filled = ImageTransform.of(SIZE).centre_crop((height, width))
-    (left, top), (right, bottom) = filled.pixels(corners)
-    assert filled.image_size == (height, width)
-    assert max(left, top) <= -0.5 + 1e-9
-    assert right >= width - 0.5 - 1e-9
-    assert bottom >= height - 0.5 - 1e-9
+    corners, border = np.array([[-0.5, -0.5], [639.5, 479.5]]), np.array([width, height])
+    for kind, sign in (("letterbox", 1), ("centre_crop", -1)):
+        transform = getattr(ImageTransform.of(SIZE), kind)((height, width))
+        assert transform.image_size == (height, width)
+        low, high = transform.pixels(corners) + 0.5
+        assert (sign * low >= -1e-9).all()
+        assert (sign * (border - high) >= -1e-9).all()
+        assert kind == "centre_crop" or (np.abs(low - (border - high)) <= 1 + 1e-9).all()  # up to an odd pixel
 
 
 @pytest.mark.parametrize(
@@ -79,13 +72,11 @@ def test_letterbox_shows_all_and_centre_crop_fills(height, width):
     [
         ImageTransform.of(SIZE).resize((96, 160)),
         ImageTransform.of(SIZE).resize((960, 1100)),
-        ImageTransform.of(SIZE).crop(101, 57, (333, 400)),
-        ImageTransform.of(SIZE).pad(7, 0, 13, 4),
-        ImageTransform.of(SIZE).letterbox((256, 256)),
+        ImageTransform.of(SIZE).pad(7, 0, 13, 4).crop(101, 57, (333, 400)),
         ImageTransform.of(SIZE).letterbox((100, 300)).crop(3, 60, (90, 180)).resize((45, 91)),
         ImageTransform.of(SIZE).centre_crop((240, 240)),
     ],
-    ids=["shrink", "enlarge", "crop", "pad", "letterbox", "chain", "centre_crop"],
+    ids=["shrink", "enlarge", "pad", "letterbox", "centre_crop"],
 )
 def test_a_drawn_blob_is_found_where_the_transformed_camera_projects_it(transform):
     spot = np.array([211.3, 253.8])
@@ -94,13 +85,12 @@ def test_a_drawn_blob_is_found_where_the_transformed_camera_projects_it(transfor
     picture = np.repeat((255 * blob).round().astype(np.uint8)[..., None], 3, axis=2)
     result = transform.frames(picture[None])[0, ..., 0].astype(float)
     assert result.shape == transform.image_size
-    rows, columns = np.mgrid[0 : result.shape[0], 0 : result.shape[1]]
+    rows, columns = np.indices(result.shape)
     found = np.array([(columns * result).sum(), (rows * result).sum()]) / result.sum()
     ray = np.linalg.inv(K) @ [*spot, 1.0]
     expected = project_points(1.7 * ray[None], transform.intrinsics(K), np.eye(4)[None])[0][0]
     np.testing.assert_allclose(found, expected, atol=0.03)
-    mask = transform.masks((blob > 0.3)[None])[0]
-    centre = np.argwhere(mask).mean(axis=0)[::-1]
+    centre = np.argwhere(transform.masks((blob > 0.3)[None])[0]).mean(axis=0)[::-1]
     np.testing.assert_allclose(centre, expected, atol=0.3)
 
 
@@ -108,9 +98,7 @@ def test_frames_are_those_of_opencv_and_padding_is_empty():
     frames = np.random.default_rng(0).integers(0, 255, (2, *SIZE, 3), dtype=np.uint8)
     boxed = ImageTransform.of(SIZE).letterbox((100, 160)).frames(frames)
     inner = cv2.resize(frames[1], (133, 100), interpolation=cv2.INTER_AREA)
-    assert np.array_equal(boxed[1, :, 13:146], inner)
-    assert not boxed[:, :, :13].any()
-    assert not boxed[:, :, 146:].any()
+    assert np.array_equal(boxed[1], cv2.copyMakeBorder(inner, 0, 0, 13, 14, cv2.BORDER_CONSTANT))
     assert ImageTransform.of(SIZE).resize(SIZE).frames(frames) is frames
 
 
@@ -124,11 +112,12 @@ def test_a_camera_track_follows_the_same_transform():
 
 
 def test_a_window_outside_of_the_image_and_other_sizes_are_refused():
-    with pytest.raises(ConfigError, match=r"Crop leaves the image[\s\S]*row 400"):
-        ImageTransform.of(SIZE).crop(400, 0, (100, 100))
-    with pytest.raises(ConfigError, match="Padding is negative"):
-        ImageTransform.of(SIZE).pad(-1, 0, 0, 0)
-    with pytest.raises(ConfigError, match="no pixels"):
-        ImageTransform.of((0, 640))
-    with pytest.raises(DataError, match=r"another size[\s\S]*\(480, 640\)[\s\S]*\(48, 64\)"):
-        ImageTransform.of(SIZE).resize((10, 10)).frames(np.zeros((1, 48, 64, 3), np.uint8))
+    whole = ImageTransform.of(SIZE)
+    for change, error, said in (
+        (lambda: whole.crop(400, 0, (100, 100)), ConfigError, "row 400"),
+        (lambda: whole.pad(-1, 0, 0, 0), ConfigError, "negative"),
+        (lambda: ImageTransform.of((0, 640)), ConfigError, "no pixels"),
+        (lambda: whole.resize((9, 9)).frames(np.zeros((1, 48, 64, 3), np.uint8)), DataError, r"\(480, 640\)[\s\S]*\(48, 64\)"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=said):
+            change()

@@ -10,12 +10,9 @@ from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.embodiment import embodiment_names, load_embodiment, read_description
 
 ARM = {
-    "name": "right",
-    "joints": ["pan", "lift"],
-    "limits": [[-1.0, 1.0], [-2.0, 2.0]],
-    "end_effector_link": "hand",
+    "name": "right", "joints": ["pan", "lift"], "limits": [[-1.0, 1.0], [-2.0, 2.0]], "end_effector_link": "hand",
     "gripper": {"closed": 0.0, "open": 0.04},
-}
+}  # fmt: skip
 BODY = {"name": "toy", "description": {"format": "mjcf", "file": "toy.xml"}, "base_link": "world", "arms": [ARM]}
 
 
@@ -30,15 +27,13 @@ def test_every_shipped_file_is_valid_and_orders_its_state(name):
     embodiment = load_embodiment(name)
     assert embodiment.name == name
     assert len(embodiment.state_names) == embodiment.state_size
-    columns = sorted(
-        [c for arm in embodiment.arms for c in range(*embodiment.joint_columns(arm).indices(10**6))]
-        + [embodiment.gripper_column(arm) for arm in embodiment.arms]
-    )
-    assert columns == list(range(embodiment.state_size))
+    columns = list(range(embodiment.state_size))
+    joints = [c for arm in embodiment.arms for c in columns[embodiment.joint_columns(arm)]]
+    assert sorted(joints + [embodiment.gripper_column(arm) for arm in embodiment.arms]) == columns
 
 
 def test_unknown_name_lists_the_known_ones():
-    with pytest.raises(ConfigError, match=r"Unknown embodiment[\s\S]*agibot_g1[\s\S]*did you mean 'agibot_g1'"):
+    with pytest.raises(ConfigError, match=r"agibot_g1[\s\S]*did you mean 'agibot_g1'"):
         load_embodiment("agibot_g2")
 
 
@@ -86,7 +81,7 @@ def test_description_is_here_or_the_file_says_how_to_get_it(name, monkeypatch):
     if embodiment.description_path.is_file():
         assert read_description(embodiment)
     else:
-        with pytest.raises(UnavailableError, match=r"next step: take .* from github.com"):
+        with pytest.raises(UnavailableError, match=r"take .* from github.com"):
             read_description(embodiment)
 
 
@@ -101,18 +96,11 @@ def test_states_of_another_length_or_no_numbers_are_named(tmp_path):
 
 
 def test_limits_are_checked_joint_by_joint_and_never_for_the_gripper(tmp_path):
+    toy = load_embodiment(write(tmp_path))
     state = np.array([[0.0, 0.0, 9.0], [1.5, 0.0, 0.0], [0.0, -2.01, 0.0]])
-    outside = load_embodiment(write(tmp_path)).outside_limits(state)
-    assert outside.tolist() == [[False] * 3, [True, False, False], [False] * 3]
+    assert toy.outside_limits(state).tolist() == [[False] * 3, [True, False, False], [False] * 3]
+    with pytest.raises(DataError, match=r"episode 3.*frame 1, pan[\s\S]*-1 to 1[\s\S]*1\.5; 1 of 3 frames"):
+        toy.check_limits(state, "episode 3")
+    toy.check_limits(state[:1], "episode 3")
     free = {**ARM, "limits": [[float("-inf"), float("inf")], [-2.0, 2.0]]}
     assert not load_embodiment(write(tmp_path, arms=[free])).outside_limits(state).any()
-
-
-def test_position_beyond_a_limit_is_named_with_its_limits(tmp_path):
-    embodiment = load_embodiment(write(tmp_path))
-    state = np.array([[0.0, 0.0, 0.0], [1.5, -2.1, 0.0], [1.2, 0.0, 0.0]])
-    with pytest.raises(
-        DataError, match=r"beyond its limit[\s\S]*episode 3.*frame 1, pan[\s\S]*-1 to 1[\s\S]*1\.5; 2 of 3 frames"
-    ):
-        embodiment.check_limits(state, "episode 3")
-    embodiment.check_limits(state[:1], "episode 3")

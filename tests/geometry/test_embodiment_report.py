@@ -14,12 +14,9 @@ from worldline_core.geometry import kinematic_tree
 from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
 from worldline_core.geometry.embodiment_report import check_embodiment
 
-has_mujoco = pytest.mark.skipif(
-    importlib.util.find_spec("mujoco") is None, reason="the independent kinematics are MuJoCo's"
-)
+pytest.importorskip("mujoco", reason="the independent kinematics are MuJoCo's")
 
 
-@has_mujoco
 @pytest.mark.parametrize("name", embodiment_names())
 def test_kinematics_equal_mujoco_at_a_thousand_random_positions(name):
     embodiment = load_embodiment(name)
@@ -37,7 +34,6 @@ def test_kinematics_equal_mujoco_at_a_thousand_random_positions(name):
     assert not [note for note in check["notes"] if "limits" in note]
 
 
-@has_mujoco
 def test_agibot_equals_mujoco(shared_data):
     urdf = shared_data / "agibot_g1_urdf" / "G1_omnipicker_calibrated.urdf"
     if not urdf.is_file():
@@ -59,7 +55,6 @@ def break_the_reader(monkeypatch: pytest.MonkeyPatch, metres: float) -> None:
     monkeypatch.setattr(kinematic_tree, "read_mjcf", wrong)
 
 
-@has_mujoco
 @pytest.mark.parametrize(("metres", "passed"), [(2e-5, False), (5e-6, True)])
 def test_a_wrong_pose_is_found(monkeypatch, metres, passed):
     break_the_reader(monkeypatch, metres)
@@ -69,50 +64,38 @@ def test_a_wrong_pose_is_found(monkeypatch, metres, passed):
     assert flange["position_m"] == pytest.approx(metres, rel=1e-6)
 
 
-@has_mujoco
 def test_other_limits_than_the_description_has_are_noted(tmp_path):
     source = load_embodiment("franka_panda").description_path
     text = (source.parent / "franka_panda.yaml").read_text().replace("[-1.7628, 1.7628]", "[-1.7628, 2.0]")
     (tmp_path / "franka_panda.yaml").write_text(text)
     (tmp_path / "franka_panda.xml").write_text(source.read_text())
-    notes = check_embodiment(load_embodiment(tmp_path / "franka_panda.yaml"), samples=2)["notes"]
-    assert notes == ["panda_joint2: limits -1.7628 to 2, the description has -1.7628 to 1.7628"]
+    (note,) = check_embodiment(load_embodiment(tmp_path / "franka_panda.yaml"), samples=2)["notes"]
+    assert note.startswith("panda_joint2: limits -1.7628 to 2,")
 
 
-def test_without_mujoco_it_says_what_to_install(monkeypatch):
+def test_a_check_needs_mujoco_and_samples(monkeypatch):
+    with pytest.raises(ConfigError, match="--samples of at least 1"):
+        check_embodiment(load_embodiment("so101"), samples=0)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UnavailableError, match=r"MuJoCo[\s\S]*uv sync --extra sim"):
+    with pytest.raises(UnavailableError, match=r"MuJoCo[\s\S]*--extra sim"):
         check_embodiment(load_embodiment("so101"), samples=2)
 
 
-def test_no_samples_prove_nothing():
-    with pytest.raises(ConfigError, match="--samples of at least 1"):
-        check_embodiment(load_embodiment("so101"), samples=0)
-
-
-def test_list_names_every_embodiment(capsys, monkeypatch):
-    for name in list(os.environ):
-        if name.startswith("WORLDLINE_DESCRIPTION_"):
-            monkeypatch.delenv(name)
+def test_list_names_every_embodiment_and_how_to_get_its_description(capsys, monkeypatch):
+    for name in [name for name in os.environ if name.startswith("WORLDLINE_DESCRIPTION_")]:
+        monkeypatch.delenv(name)
     main(["embodiment", "list"])
     text = capsys.readouterr().out
     assert [line.split()[0] for line in text.split("\n\n")[0].splitlines()[1:]] == embodiment_names()
-    assert re.search(r"galaxea_r1 .*not here +no", text)
     assert "set WORLDLINE_DESCRIPTION_GALAXEA_R1=" in text
+    with pytest.raises(SystemExit, match="1"):
+        main(["embodiment", "check", "galaxea_r1"])
+    assert "github.com/userguide-galaxea/URDF" in capsys.readouterr().err
 
 
-@has_mujoco
 def test_check_command_ends_with_status_one_on_a_wrong_pose(capsys, monkeypatch):
     main(["embodiment", "check", "franka_panda", "--samples", "5"])
-    assert "passed: the limit is 1e-05 m" in capsys.readouterr().out
     break_the_reader(monkeypatch, 1e-3)
     with pytest.raises(SystemExit, match="1"):
         main(["embodiment", "check", "franka_panda", "--samples", "5"])
     assert re.search(r"panda_link8 .*FAILED", capsys.readouterr().out)
-
-
-def test_check_command_says_how_to_get_a_description(capsys, monkeypatch):
-    monkeypatch.delenv("WORLDLINE_DESCRIPTION_GALAXEA_R1", raising=False)
-    with pytest.raises(SystemExit, match="1"):
-        main(["embodiment", "check", "galaxea_r1"])
-    assert "github.com/userguide-galaxea/URDF" in capsys.readouterr().err

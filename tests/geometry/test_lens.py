@@ -46,9 +46,7 @@ def small(limit: float) -> st.SearchStrategy[float]:
 
 lenses = st.one_of(
     st.tuples(small(0.3), small(0.1), small(0.01), small(0.01), small(0.05)).map(lambda c: Distortion("radtan", c)),
-    st.tuples(
-        *[small(0.2), small(0.1), small(0.01), small(0.01), small(0.05), small(0.2), small(0.1), small(0.05)]
-    ).map(lambda c: Distortion("radtan", c)),
+    st.tuples(*map(small, (0.2, 0.1, 0.01, 0.01, 0.05, 0.2, 0.1, 0.05))).map(lambda c: Distortion("radtan", c)),
     st.tuples(small(0.1), small(0.05), small(0.02), small(0.01)).map(lambda c: Distortion("fisheye", c)),
 )
 plane = st.tuples(small(0.9), small(0.9))
@@ -91,15 +89,11 @@ def test_maps_are_those_of_opencv_and_stay_inside_of_the_recorded_image(lens):
         np.testing.assert_allclose(lens_maps.K, whole, atol=1.0)  # OpenCV looks at 9x9 points of the border
     np.testing.assert_allclose(lens_maps.map_u, u, atol=1e-3)
     np.testing.assert_allclose(lens_maps.map_v, v, atol=1e-3)
-    assert lens_maps.map_u.min() > -1e-3
-    assert lens_maps.map_v.min() > -1e-3
-    assert lens_maps.map_u.max() < 639 + 1e-3
-    assert lens_maps.map_v.max() < 479 + 1e-3
     # As large as it can be: each side of the rectangle comes within a pixel of the recorded image's border.
-    assert lens_maps.map_u[:, 0].min() < 1
-    assert lens_maps.map_u[:, -1].max() > 638
-    assert lens_maps.map_v[0].min() < 1
-    assert lens_maps.map_v[-1].max() > 478
+    assert -1e-3 < lens_maps.map_u.min() <= lens_maps.map_u[:, 0].min() < 1
+    assert -1e-3 < lens_maps.map_v.min() <= lens_maps.map_v[0].min() < 1
+    assert 638 < lens_maps.map_u[:, -1].max() <= lens_maps.map_u.max() < 639 + 1e-3
+    assert 478 < lens_maps.map_v[-1].max() <= lens_maps.map_v.max() < 479 + 1e-3
 
 
 def test_a_skewed_camera_matrix_is_kept_in_mind():
@@ -147,21 +141,14 @@ def test_a_lens_that_folds_back_inside_of_the_image_is_refused(lens):
     assert undistortion(lens, telephoto, SIZE).K[0, 0] > 3000
 
 
-def test_tangential_terms_that_fold_are_refused_where_they_do():
-    lens = Distortion("radtan", (0.0, 0.0, 0.9, 0.9))
-    with pytest.raises(CalibrationError, match="no single ray"):
-        undistortion(lens, K, SIZE)
-
-
-@pytest.mark.parametrize("count", [0, 1, 3, 6, 12])
-def test_wrong_numbers_of_coefficients_are_refused(count):
-    with pytest.raises(CalibrationError, match=rf"radtan lens are incomplete[\s\S]*got: {count}"):
-        Distortion("radtan", (0.1,) * count)
-    with pytest.raises(CalibrationError, match="fisheye lens are incomplete"):
-        Distortion("fisheye", (0.1,) * (count + 5))
-
-
-def test_coefficients_that_are_no_numbers_are_refused():
+def test_what_describes_no_lens_is_refused():
+    with pytest.raises(CalibrationError, match="no single ray"):  # tangential terms that fold
+        undistortion(Distortion("radtan", (0.0, 0.0, 0.9, 0.9)), K, SIZE)
+    for count in (0, 1, 3, 6, 12):
+        with pytest.raises(CalibrationError, match=rf"radtan lens are incomplete[\s\S]*got: {count}"):
+            Distortion("radtan", (0.1,) * count)
+        with pytest.raises(CalibrationError, match="fisheye lens are incomplete"):
+            Distortion("fisheye", (0.1,) * (count + 5))
     with pytest.raises(CalibrationError, match="not finite"):
         Distortion("radtan", (0.1, math.nan, 0.0, 0.0))
     with pytest.raises(CalibrationError, match="Unknown distortion model"):

@@ -68,53 +68,40 @@ def test_reader_equals_mujoco():
             np.testing.assert_allclose(poses[name][n, :3, :3], data.body(name).xmat.reshape(3, 3), atol=1e-12)
 
 
-def robot(body: str) -> str:
-    return f"<robot name='r'><link name='a'/><link name='b'/>{body}</robot>"
-
-
-JOINT = "<joint name='{}' type='{}'><parent link='{}'/><child link='{}'/>{}</joint>"
+def joint(kind: str = "fixed", parent: str = "a", child: str = "b", inside: str = "", name: str = "j") -> str:
+    return f"<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/>{inside}</joint>"
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("body", "message"),
     [
-        ("<mujoco/>", r"Not a URDF file[\s\S]*<mujoco>"),
-        ("<robot", "not XML"),
-        (
-            robot(JOINT.format("j", "fixed", "a", "c", "")),
-            r"A joint's child is no link[\s\S]*joint j[\s\S]*one of a, b",
-        ),
-        (robot(JOINT.format("j", "fixed", "c", "b", "")), r"A joint's parent is no link[\s\S]*one of a, b"),
-        (robot("<joint name='j' type='fixed'/>"), "A joint's parent is no link"),
-        (robot(""), r"one root link[\s\S]*\['a', 'b'\]"),
-        (robot("<link name='a'/>"), "named twice"),
-        (robot(JOINT.format("j", "fixed", "a", "b", "") + JOINT.format("k", "fixed", "a", "b", "")), "two parents"),
-        (
-            robot(
-                "<link name='c'/>" + JOINT.format("j", "fixed", "a", "b", "") + JOINT.format("k", "fixed", "b", "a", "")
-            ),
-            "circle",
-        ),
-        (robot(JOINT.format("j", "floating", "a", "b", "")), r"Joint is not supported[\s\S]*joint j[\s\S]*floating"),
-        (robot(JOINT.format("j", "revolute", "a", "b", "<axis xyz='0 0 0'/>")), "direction of length zero"),
-        (robot(JOINT.format("j", "revolute", "a", "b", "<axis xyz='1e200 0 1e200'/>")), "length inf"),
-        (robot(JOINT.format("j", "prismatic", "a", "b", "<axis xyz='0 1e-200 0'/>")), "length 0"),
-        (
-            robot(JOINT.format("j", "revolute", "a", "b", "<origin xyz='0 0'/>")),
-            r"joint j, origin[\s\S]*3 finite numbers",
-        ),
-        (robot(JOINT.format("j", "revolute", "a", "b", "<origin xyz='0 0 nan'/>")), "3 finite numbers"),
-        (robot(JOINT.format("j", "revolute", "a", "b", "<origin rpy='a b c'/>")), "Not numbers"),
-        (
-            robot(JOINT.format("j", "fixed", "a", "b", "<origin quat_xyzw='1 0 0 0'/>")),
-            r"joint j, origin[\s\S]*quat_xyzw",
-        ),
-        (robot(JOINT.format("j", "fixed", "a", "b", "<origin quat='1 0 0 0'/>")), r"joint j, origin[\s\S]*rpy"),
-        (robot(JOINT.format("j", "fixed", "a", "b", "<origin xyz='0 0 ${L}'/>")), r"xacro[\s\S]*\$\{L\}"),
-        (robot(JOINT.format("$(arg n)", "fixed", "a", "b", "")), r"xacro[\s\S]*\$\(arg n\)"),
-        (robot("<xacro:arm prefix='left'/>"), r"xacro[\s\S]*<arm"),
+        (joint(child="c"), r"child is no link[\s\S]*joint j[\s\S]*one of a, b"),
+        (joint(parent="c"), r"parent is no link[\s\S]*one of a, b"),
+        ("<joint name='j' type='fixed'/>", "parent is no link"),
+        ("", r"one root link[\s\S]*\['a', 'b'\]"),
+        ("<link name='a'/>", "named twice"),
+        (joint() + joint(name="k"), "two parents"),
+        ("<link name='c'/>" + joint() + joint(parent="b", child="a", name="k"), "circle"),
+        (joint("floating"), r"joint j[\s\S]*floating"),
+        (joint("revolute", inside="<axis xyz='0 0 0'/>"), "length zero"),
+        (joint("revolute", inside="<axis xyz='1e200 0 1e200'/>"), "length inf"),
+        (joint("prismatic", inside="<axis xyz='0 1e-200 0'/>"), "length 0"),
+        (joint("revolute", inside="<origin xyz='0 0'/>"), r"joint j, origin[\s\S]*3 finite numbers"),
+        (joint("revolute", inside="<origin xyz='0 0 nan'/>"), "3 finite numbers"),
+        (joint("revolute", inside="<origin rpy='a b c'/>"), "Not numbers"),
+        (joint(inside="<origin quat_xyzw='1 0 0 0'/>"), r"joint j, origin[\s\S]*quat_xyzw"),
+        (joint(inside="<origin quat='1 0 0 0'/>"), r"joint j, origin[\s\S]*rpy"),
+        (joint(inside="<origin xyz='0 0 ${L}'/>"), r"xacro[\s\S]*\$\{L\}"),
+        (joint(name="$(arg n)"), r"xacro[\s\S]*\$\(arg n\)"),
+        ("<xacro:arm prefix='left'/>", r"xacro[\s\S]*<arm"),
     ],
 )
-def test_what_cannot_be_is_refused(text, message):
+def test_what_cannot_be_is_refused(body, message):
+    with pytest.raises(DataError, match=message):
+        read_urdf(f"<robot name='r'><link name='a'/><link name='b'/>{body}</robot>", "r.urdf")
+
+
+@pytest.mark.parametrize(("text", "message"), [("<mujoco/>", r"Not a URDF[\s\S]*<mujoco>"), ("<robot", "not XML")])
+def test_what_is_no_urdf_is_refused(text, message):
     with pytest.raises(DataError, match=message):
         read_urdf(text, "r.urdf")
