@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +24,6 @@ def test_unseen_looks_lie_outside_of_the_training_range() -> None:
         (low, high), (other_low, other_high) = getattr(WIDE, name), getattr(UNSEEN, name)
         assert other_high < low or other_low > high, name
     assert not set(WIDE.textures) & set(UNSEEN.textures)
-    for saturation, value in UNSEEN.table:
-        (trained_saturation, trained_value) = WIDE.table[0]
-        assert saturation[0] > trained_saturation[1] or value[0] > trained_value[1] or value[1] < trained_value[0]
     assert UNSEEN.head.elevation_deg[1] < WIDE.head.elevation_deg[0]
     assert UNSEEN.head.distance[0] > WIDE.head.distance[1]
 
@@ -40,9 +36,6 @@ def test_a_look_is_a_function_of_its_name(name: str) -> None:
     assert len({look.table for look in looks}) == 20
     low, high = RANGES[name].size
     assert all(low <= look.size <= high for look in looks)
-    for field in fields(looks[0]):
-        values = np.ravel([v for v in (getattr(look, field.name) for look in looks) if isinstance(v, float | tuple)])
-        assert np.isfinite(values.astype(float)).all()
 
 
 def test_training_and_test_scenes_are_apart() -> None:
@@ -84,8 +77,7 @@ def test_the_size_of_a_miss_decides(recorder: EpisodeRecorder, family: str, kind
         layout = sample_layout(recorder.scene.robot, family, random, look_of("wide_8001"))
         policy = ScriptedPolicy(miss=Miss.model_validate({"kind": kind, "size": size}))
         motion = recorder.move(layout, random, 33, policy)
-        assert motion is not None
-        assert motion.outcome == outcome, (size, motion.failure)
+        assert motion is not None and motion.outcome == outcome, size
 
 
 def test_misses_are_drawn_evenly_and_apart_from_everything_else() -> None:
@@ -102,22 +94,13 @@ def test_misses_are_drawn_evenly_and_apart_from_everything_else() -> None:
 
 @pytest.mark.slow
 def test_shifts_are_named_in_the_index(rendering: None, tmp_path: Path) -> None:
-    groups = [
-        {"embodiment": "xarm7_white", "look": "unseen", "held_out_camera": True},
-        {"embodiment": "panda_ivory", "look": "wide"},
-        {"embodiment": "viperx_pearl", "look": "wide"},
-        {"embodiment": "viperx_graphite", "held_out_camera": True},
-    ]
-    config = RecordConfig.model_validate(
-        {"groups": [{**group, "split": "ood_test", "count": 1} for group in groups], "num_frames": 17, "misses": 1.0}
-    )
-    record(config, tmp_path)
+    groups = {
+        "xarm7_white": {"look": "unseen", "held_out_camera": True}, "panda_ivory": {"look": "wide"},
+        "viperx_pearl": {"look": "wide"}, "viperx_graphite": {"held_out_camera": True},
+    }  # fmt: skip
+    planned = [{"embodiment": name, **group, "split": "ood_test", "count": 1} for name, group in groups.items()]
+    record(RecordConfig.model_validate({"groups": planned, "num_frames": 17, "misses": 1.0}), tmp_path)
     episodes = EpisodeSet.open(tmp_path)
     shifts = {row.embodiment: episodes.episode(i).conventions.get("shift") for i, row in enumerate(episodes.rows)}
-    assert shifts == {
-        "xarm7_white": "look+camera",
-        "panda_ivory": "body",
-        "viperx_pearl": None,
-        "viperx_graphite": None,
-    }
+    assert shifts == {**dict.fromkeys(groups), "xarm7_white": "look+camera", "panda_ivory": "body"}
     assert (tmp_path / "misses.json").read_text().count('"size"') == 4

@@ -63,12 +63,10 @@ def test_mistakes_set_the_share_of_wrong_plans(recorder):
     layout = sample_layout(recorder.scene.robot, "press", np.random.default_rng(0), SCENES["scene_12"])
 
     def aims(mistakes):
-        plans = [
-            plan_waypoints(recorder.scene.robot, layout, np.random.default_rng(n), 4.0, mistakes=mistakes)[layout.arm]
-            for n in range(60)
-        ]
+        randoms = map(np.random.default_rng, range(60))
+        plans = (plan_waypoints(recorder.scene.robot, layout, random, 4.0, mistakes=mistakes) for random in randoms)
         # A right plan goes down onto the button within some millimetres.
-        down = [plan[2].position for plan in plans]
+        down = [plan[layout.arm][2].position for plan in plans]
         return np.mean([np.hypot(x - layout.target.x, y - layout.target.y) < 0.03 and z < 0.05 for x, y, z in down])
 
     assert aims(0.0) == 1.0
@@ -81,12 +79,9 @@ def test_variety_is_drawn_within_its_limits_and_changes_nothing_else():
     config = load_config(RecordConfig, path=path)
     jobs = plan_jobs(config)
     policies = [job.policy for job in jobs]
-    assert None not in policies
-    assert {policy.mistakes for policy in policies} == {None}  # pyright: ignore[reportOptionalMemberAccess]
-    noise, delay, gripper = (
-        np.array([getattr(policy, name) for policy in policies])
-        for name in ("noise_m", "delay_frames", "gripper_delay_frames")
-    )
+    assert all(policies)
+    drawn = ([policy.noise_m, policy.delay_frames, policy.gripper_delay_frames] for policy in policies if policy)
+    noise, delay, gripper = np.array(list(drawn)).T
     assert (noise == 0).mean() == pytest.approx(0.5, abs=0.1)
     assert 0.04 < noise.max() <= 0.05
     assert set(delay) == set(range(17))

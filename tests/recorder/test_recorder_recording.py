@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import torch
 
 mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
+from worldline_core.geometry.tensor_transforms import is_rigid
 from worldline_core.recorder.attempts import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.looks import SCENES
@@ -26,8 +30,10 @@ JOB = Job("one", "viperx_graphite", "train", "place", (1, 2, 3))
 
 
 @pytest.fixture(scope="module")
-def recorder(rendering: None) -> EpisodeRecorder:
-    return EpisodeRecorder("viperx_graphite")
+def recorder(rendering: None) -> Iterator[EpisodeRecorder]:
+    made = EpisodeRecorder("viperx_graphite")
+    yield made
+    made.close()
 
 
 @pytest.fixture(scope="module")
@@ -53,20 +59,16 @@ def test_an_episode_is_a_function_of_its_entropy(recorder: EpisodeRecorder, reco
 
 def test_cameras_are_exact(recorder: EpisodeRecorder) -> None:
     """A block's corners, projected with K and T_base_camera, enclose exactly the block's pixels."""
-    layouts = (
-        sample_layout(recorder.scene.robot, "lift", np.random.default_rng(seed), SCENES["scene_12"])
-        for seed in range(20)
-    )
+    randoms = map(np.random.default_rng, range(20))
+    layouts = (sample_layout(recorder.scene.robot, "lift", random, SCENES["scene_12"]) for random in randoms)
     layout = next(layout for layout in layouts if layout.target.kind == "block" and not layout.others)
     motion = recorder.move(layout, np.random.default_rng(4), 17)
     still = ExecutedMotion(motion.state[:1], motion.action[:1], motion.qpos[:1], motion.outcome)
     # With the arms moved out of the way below the floor, nothing hides the block.
     for arm in recorder.scene.arms:
         still.qpos[0, arm.qpos[1]] = np.pi
-    filmed = recorder.film(
-        layout, still, episode_id="e", scene_id="scene_05", split="train", jitter=np.random.default_rng(0)
-    )
-    model = recorder.scene.model
+    jitter, model = np.random.default_rng(0), recorder.scene.model
+    filmed = recorder.film(layout, still, episode_id="e", scene_id="scene_05", split="train", jitter=jitter)
     address = int(model.joint("block_0").qposadr[0])
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, still.qpos[0, address + 3 : address + 7])
@@ -91,18 +93,13 @@ def test_the_wrist_camera_moves_with_the_arm_and_the_head_stands(recording: Reco
     assert not cameras["head"].moving
     assert all(cameras[view].moving for view in ("left_wrist", "right_wrist"))
     for camera in cameras.values():
-        rotation = camera.T_base_camera[:, :3, :3]
-        np.testing.assert_allclose(
-            rotation @ rotation.transpose(0, 2, 1), np.eye(3)[None].repeat(len(rotation), 0), atol=1e-9
-        )
-        np.testing.assert_allclose(np.linalg.det(rotation), 1.0, atol=1e-9)
+        assert bool(is_rigid(torch.from_numpy(camera.T_base_camera)).all())
 
 
 def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, tmp_path: Path) -> None:
     groups = (RecordGroup(embodiment="xarm7_single", count=2, families=("lift", "close")),)
-    config = RecordConfig(
-        groups=groups, seed=5, num_frames=17, workers=1, defects={"xarm7_single": {"frozen_camera": 1}}
-    )
+    defects: Any = {"xarm7_single": {"frozen_camera": 1}}
+    config = RecordConfig(groups=groups, seed=5, num_frames=17, workers=1, defects=defects)
     counts = record(config, tmp_path / "whole")
     assert counts["episodes"] == 2
     # What a kill leaves behind: one finished episode, given in another order.
@@ -113,13 +110,8 @@ def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, 
     (tmp_path / "whole" / DEFECTS_FILE).unlink()
     assert record(config, tmp_path / "whole") == counts
     assert digests(tmp_path / "whole") == digests(tmp_path / "resumed")
-    with pytest.raises(
-        DataError, match=r"(?s)other episodes than the configuration plans.*2 of them missing, 2 others"
-    ):
+    with pytest.raises(DataError, match=r"(?s)other episodes than.*2 of them missing, 2 others"):
         record(config.model_copy(update={"seed": 6}), tmp_path / "whole")
-    rows = EpisodeSet.open(tmp_path / "whole").rows
-    assert [row.embodiment for row in rows] == ["xarm7_single", "xarm7_single"]
-    assert rows[0].scene in {f"scene_{n:02d}" for n in range(12)}
 
 
 @pytest.mark.slow
@@ -144,16 +136,14 @@ def test_bank_outcomes_are_sealed(recorder: EpisodeRecorder, tmp_path: Path) -> 
 def test_defects_spoil_what_they_say(name: str, recording: Recording) -> None:
     spoiled = DEFECTS[name](recording, np.random.default_rng(0))
     episode, healthy = spoiled.episode, recording.episode
+    T_base_camera = episode.cameras["head"].T_base_camera
     changed = {
-        "static_lead_in": np.ptp(episode.state[:16], axis=0).max() == 0
-        and episode.num_frames == healthy.num_frames + 16,
+        "static_lead_in": np.ptp(episode.state[:16], axis=0).max() == 0 < episode.num_frames - healthy.num_frames,
         "reset_segment": np.abs(np.diff(episode.state, axis=0)).max() > np.abs(np.diff(healthy.state, axis=0)).max(),
         "frozen_camera": np.ptp(spoiled.frames["head"][4:].astype(int), axis=0).max() == 0,
         "corrupted_frames": sum(frame.max() == 0 for frame in spoiled.frames["head"]) == 4,
         "lagged_state": np.array_equal(episode.state[4:], healthy.state[:-4]),
-        "inverted_extrinsics": np.allclose(
-            episode.cameras["head"].T_base_camera @ healthy.cameras["head"].T_base_camera, np.eye(4), atol=1e-9
-        ),
+        "inverted_extrinsics": np.allclose(T_base_camera @ healthy.cameras["head"].T_base_camera, np.eye(4), atol=1e-9),
         "intrinsics_of_other_size": episode.cameras["head"].K[0, 0] > 3 * healthy.cameras["head"].K[0, 0],
     }
     assert changed[name]

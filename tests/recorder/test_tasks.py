@@ -1,31 +1,28 @@
-"""Tasks, their outcomes and where cameras stand; pictures only in the last test."""
+"""Tasks and contact tasks: their outcomes, who succeeds at them, and physics that repeats itself."""
 
 from __future__ import annotations
 
+import json
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from pydantic import ValidationError
 
 mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
 
 from worldline_core.errors import DataError
-from worldline_core.recorder.attempts import BankSpec, RecordBanksConfig
+from worldline_core.recorder import scene
+from worldline_core.recorder.attempts import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
 from worldline_core.recorder.bodies import BODIES
-from worldline_core.recorder.looks import SCENES
+from worldline_core.recorder.controllers import ScriptedPolicy
+from worldline_core.recorder.looks import SCENES, look_of
 from worldline_core.recorder.outcomes import LIFTED, outcome
 from worldline_core.recorder.record import RecordGroup
-from worldline_core.recorder.scene import (
-    BUTTON_TRAVEL,
-    DRAWER_TRAVEL,
-    KINDS,
-    TASKS,
-    Layout,
-    apply_layout,
-    sample_layout,
-)
-from worldline_core.recorder.simulate import EpisodeRecorder
+from worldline_core.recorder.scene import CONTACT, TASKS, Layout, apply_layout, sample_layout
+from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, draw_layout
 
 
 @pytest.fixture(scope="module")
@@ -82,32 +79,27 @@ def test_outcomes_are_read_from_the_things(recorder: EpisodeRecorder) -> None:
     random = np.random.default_rng(0)
     layouts = {task: layout_of(recorder, task, random) for task in TASKS}
     lift, place, close, press, carry = (layouts[task] for task in TASKS)
-
     qpos = still(recorder, lift)
     assert judged(recorder, lift, qpos) == ("failure", "missed")
     qpos[4:, joint_of(recorder, f"{lift.target.kind}_0") + 2] += LIFTED + 0.01
     assert judged(recorder, lift, qpos) == ("success", "")
-
     qpos = still(recorder, place)
     assert judged(recorder, place, qpos) == ("failure", "missed")
     address = joint_of(recorder, f"{place.target.kind}_0")
     qpos[-1, address : address + 2] = place.goal.xy
     assert judged(recorder, place, qpos) == ("success", "")
-
     qpos = still(recorder, close)
     assert judged(recorder, close, qpos) == ("failure", "missed")
-    qpos[-1, joint_of(recorder, "drawer_0")] = 0.5 * DRAWER_TRAVEL
+    qpos[-1, joint_of(recorder, "drawer_0")] = 0.5 * scene.DRAWER_TRAVEL
     assert judged(recorder, close, qpos) == ("failure", "incomplete")
-    qpos[-1, joint_of(recorder, "drawer_0")] = 0.1 * DRAWER_TRAVEL
+    qpos[-1, joint_of(recorder, "drawer_0")] = 0.1 * scene.DRAWER_TRAVEL
     assert judged(recorder, close, qpos) == ("success", "")
-
     qpos = still(recorder, press)
     assert judged(recorder, press, qpos) == ("failure", "missed")
-    qpos[-1, joint_of(recorder, "button_1")] = BUTTON_TRAVEL
+    qpos[-1, joint_of(recorder, "button_1")] = scene.BUTTON_TRAVEL
     assert judged(recorder, press, qpos) == ("failure", "wrong place")
-    qpos[-1, joint_of(recorder, "button_0")] = BUTTON_TRAVEL
+    qpos[-1, joint_of(recorder, "button_0")] = scene.BUTTON_TRAVEL
     assert judged(recorder, press, qpos) == ("success", "")
-
     qpos = still(recorder, carry)
     assert judged(recorder, carry, qpos) == ("failure", "missed")
     address = joint_of(recorder, "tray_0")
@@ -125,7 +117,7 @@ def test_layouts_name_what_is_there_and_keep_things_apart(recorder: EpisodeRecor
         layout = layout_of(recorder, TASKS[number % 5], random)
         names = [name for name, _ in layout.named()]
         assert len(set(names)) == len(names)
-        assert max(Counter(name.split("_")[0] for name in names).values()) <= max(KINDS.values())
+        assert max(Counter(name.split("_")[0] for name in names).values()) <= max(scene.KINDS.values())
         assert f"{layout.target.colour} {layout.target.kind}" in layout.instruction
         things = [thing for _, thing in layout.named()]
         assert len({thing.colour for thing in things}) == len(things)
@@ -152,3 +144,50 @@ def test_what_nobody_can_record_is_refused() -> None:
         RecordGroup(embodiment="xarm7_single", count=1)
     with pytest.raises(DataError, match="Unknown body"):
         EpisodeRecorder("so101")
+
+
+PLAIN = look_of("scene_12")
+
+
+@pytest.fixture(scope="module", params=["viperx_pearl", "ur5e_silver", "xarm7_white"])
+def contact(request: pytest.FixtureRequest) -> EpisodeRecorder:
+    return EpisodeRecorder(request.param, contact=True)
+
+
+def moved(contact: EpisodeRecorder, family: str, seed: int, policy: ScriptedPolicy | None) -> ExecutedMotion:
+    random = np.random.default_rng((seed, 9))
+    return contact.move(draw_layout(contact.scene.robot, family, random, PLAIN), random, 33, policy)  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("family", CONTACT)
+def test_who_looks_succeeds_and_who_does_not_fails_at_times(contact: EpisodeRecorder, family: str) -> None:
+    good = [moved(contact, family, seed, ScriptedPolicy()) for seed in range(3)]
+    assert [(motion.outcome, motion.failure) for motion in good] == [("success", "")] * 3
+    if contact.scene.robot.name != "ur5e_silver":
+        return
+    # Who does not fails at times; and physics repeats itself.
+    careless = [moved(contact, family, seed, None) for seed in range(12)]
+    assert {motion.outcome for motion in careless} == {"success", "failure"}
+    assert all((motion.outcome == "failure") == bool(motion.failure) for motion in careless)
+    again = moved(contact, family, 5, None)
+    assert (again.outcome, again.facts) == (careless[5].outcome, careless[5].facts)
+    assert again.facts and np.isfinite(list(again.facts.values())).all()
+
+
+def test_tasks_and_scenes_fit() -> None:
+    single = EpisodeRecorder("xarm7_single")
+    layout = draw_layout(single.scene.robot, "grip", np.random.default_rng(0), PLAIN)
+    with pytest.raises(DataError, match="scene lacks the task's things"):
+        single.move(layout, np.random.default_rng(0), 33)
+    with pytest.raises(ValidationError, match="level needs two arms; xarm7_single has one"):
+        RecordGroup(embodiment="xarm7_single", count=1, families=("level",))
+
+
+@pytest.mark.slow
+def test_facts_are_sealed_with_the_outcomes(rendering: None, tmp_path: Path) -> None:
+    spec = BankSpec(name="bank", embodiment="ur5e_silver", family="topple", scene="unseen_0003", layout=1)
+    record_banks(RecordBanksConfig(banks=(spec,), candidates=4, num_frames=29, masks=False), tmp_path)
+    rows = pq.read_table(tmp_path / SEALED_FILE).to_pylist()
+    for row in rows:
+        facts = json.loads(row["facts"])
+        assert (row["outcome"] == "success") == (facts["lean"] < 0.35 and facts["height"] > 0.07)
