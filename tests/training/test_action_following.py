@@ -43,9 +43,11 @@ class Recorded:
         return batch.latents
 
 
-def make_probe(world: Any, tokenizer: Path, predictor: Recorded, *, tracks: bool, **config: Any) -> ActionFollowing:
+def make_probe(
+    world: Any, tokenizer: Path, predictor: Recorded, *, tracks: bool, held_out: int | None = None, **config: Any
+) -> ActionFollowing:
     episodes = EpisodeSet.open(world.episodes)
-    source = FrameSource(episodes, tokenizer, FrameInput.model_validate(FRAMES))
+    source = FrameSource(episodes, tokenizer, FrameInput.model_validate(FRAMES | {"start_step": 1}))
     loader = ClipLoader(
         source,
         views=VIEWS,
@@ -56,7 +58,7 @@ def make_probe(world: Any, tokenizer: Path, predictor: Recorded, *, tracks: bool
         ActionFollowingConfig(clips=8, **config),
         predictor,
         loader if tracks else without_places(loader),
-        source.rows,
+        source.rows[:held_out],
         episodes,
         tokenizer,
         view_sets=[VIEWS],
@@ -104,6 +106,11 @@ def test_a_model_that_follows_is_told_from_one_that_does_not(world: Any, tokeniz
     assert following["tool_error_px_shuffled"] > 2 and following["shuffled_gap_low_px"] > 1
     assert ignoring["tool_error_px"] == ignoring["tool_error_px_copy"] == ignoring["tool_error_px_shuffled"] > 2
     assert ignoring["hand_psnr"] < ignoring["frame_psnr"]
+
+
+def test_one_held_out_episode_is_enough(world: Any, tokenizer: Path):
+    found = make_probe(world, tokenizer, Recorded(follows=True), tracks=True, held_out=1).measure(1)
+    assert found["clips"] > 4 and found["tool_error_px"] < found["tool_error_px_copy"]
 
 
 def test_a_model_that_ignores_its_controls_is_stopped_from_the_given_step_on(world: Any, tokenizer: Path):

@@ -45,7 +45,7 @@ LEAST_CHANGE = 12.0
 """Blurred change of a picture that is motion [grey levels]."""
 LEAST_CLIPS = 4
 STARTS = 4
-"""Clips of an episode that are looked at."""
+"""Clips of an episode that are looked at; more where few episodes are held out."""
 
 
 class Predictor(Protocol):
@@ -124,11 +124,12 @@ class ActionFollowing:
     def _places(self, rows: Sequence[ClipRow], views: tuple[str, ...], frames: int) -> list[Place]:
         """Up to ``clips`` clips in which a tool moves, of as many episodes as possible."""
         step, wanted = self.loader.source.start_step, self.config.clips
-        by_turn: list[list[Place]] = [[] for _ in range(STARTS)]
+        turns = max(STARTS, math.ceil(2 * wanted / max(1, len(rows))))
+        by_turn: list[list[Place]] = [[] for _ in range(turns)]
         for number in np.random.default_rng(SEED).permutation(len(rows)) if views else ():
             row = rows[number]
             last = (row.num_frames - frames) // step
-            starts = sorted({int(share) for share in np.linspace(0, last, STARTS)}) if last >= 0 else []
+            starts = sorted({int(share) for share in np.linspace(0, last, turns)}) if last >= 0 else []
             clips = [Clip(row.episode_id, start * step, frames, 1) for start in starts]
             places = [Place(clip, self._moved(clip, views[0])) for clip in clips]
             moved = [place for place in places if np.isfinite(place.points).any()]
