@@ -109,6 +109,15 @@ def test_this_run_s_own_model_stands_beside_the_copy(tmp_path: Path) -> None:
     )  # fmt: skip  # two digits show no difference
 
 
+def test_the_tool_error_heads_the_page_of_a_robot_that_no_segmenter_knows(tmp_path: Path) -> None:
+    context = context_of(tmp_path, iou=1.5, copy=3.8, over_copy=(-2.7, -1.8), over_shuffled=(-1.3, -1.1))
+    summary = tmp_path / "evaluate_video" / "summary.json"
+    summary.write_text(summary.read_text().replace("robot_iou@head", "end_effector_error_px@head"))
+    assert headline_of(context) == "The shipped simulator follows the controls."
+    figure = video_figures(head_view(context))[0]
+    assert (figure.verdict, figure.comparison) == ("better", "better than copying the first frame: 3.80\u202fpx")
+
+
 def test_a_perfect_score_of_few_cases_is_no_certainty(tmp_path: Path) -> None:
     """A bootstrap of five equal values has no spread: 100 % of five banks was shown without any doubt."""
     certain = {"mean": 1.0, "low": 1.0, "high": 1.0, "count": 5}

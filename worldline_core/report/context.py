@@ -16,6 +16,7 @@ from pydantic import Field
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.evaluation.metric_registry import METRICS, Metric
 from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.pages.page import render, render_macro
 from worldline_core.pictures import Picture, jpeg_bytes
@@ -47,8 +48,9 @@ SPLIT_LABELS = {
     "bank": "candidate banks",
 }
 """Labels of the splits, in the report's order."""
-IOU_METRICS = ("robot_iou_exact", "robot_iou")
-"""Most trustworthy first: against the recording's exact masks, against the segmenter's own masks of the truth."""
+HEADLINES = ("robot_iou_exact", "robot_iou", "end_effector_error_px")
+"""Metrics that head the report, the most trustworthy first: IoU with the recording's exact masks, with the segmenter's own masks of
+the truth; and for robots that no segmenter knows the distance of the predicted tools from the true ones."""
 
 
 class ReportConfig(StrictModel):
@@ -168,9 +170,9 @@ class VideoScores:
         """The segmenters used, each with its own accuracy on true frames."""
         return list({found["name"]: found for s in self.summaries for found in s.get("segmenters", [])}.values())
 
-    def iou_metric(self, group: str, method: str) -> str | None:
-        """The most trustworthy IoU that a method has."""
-        return next((metric for metric in IOU_METRICS if self.value(group, method, f"{metric}@head")), None)
+    def headline(self, group: str, method: str) -> Metric | None:
+        """The first of HEADLINES that was measured of a method in the head view."""
+        return next((METRICS[name] for name in HEADLINES if self.value(group, method, f"{name}@head")), None)
 
     def per_episode(self, method: str, metric: str, view: str, split: str) -> dict[str, float]:
         """Mean of a metric over seeds, by episode."""

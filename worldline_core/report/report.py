@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
+from worldline_core.evaluation.metric_registry import Metric
 from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.pages.page import NARROW_SPACE, number, percent, render, words
 from worldline_core.progress import with_progress
@@ -80,6 +81,7 @@ class Figure:
         bounds: 95 % interval of the difference to the reference; the verdict is its sign.
         where: the model and the recordings.
         shares: shown in per cent.
+        lower_is_better: than the reference; `bounds` are positive where the figure is better all the same.
     """
 
     what: str
@@ -90,11 +92,16 @@ class Figure:
     bounds: tuple[float, float] | None
     where: str
     shares: bool = False
+    lower_is_better: bool = False
+    unit: str = ""
 
     def shown(self, value: float) -> str:
         """A value of this figure: one digit more where two of them look equal."""
         mean, reference = self.measured["mean"], self.reference
-        return percent(value) if self.shares else number(value, 2 if number(mean) != number(reference) else 3)
+        if self.shares:
+            return percent(value)
+        shown = number(value, 2 if number(mean) != number(reference) else 3)
+        return f"{shown}{NARROW_SPACE}{self.unit}" if self.unit else shown
 
     @property
     def rests_on(self) -> str:
@@ -110,50 +117,55 @@ class Figure:
 
     @property
     def comparison(self) -> str:
-        mean = self.measured["mean"]
-        order = "better than" if mean > self.reference else "worse than" if mean < self.reference else "as"
+        gain = (self.measured["mean"] - self.reference) * (-1 if self.lower_is_better else 1)
+        order = "better than" if gain > 0 else "worse than" if gain < 0 else "as"
         doubt = ", within chance" if self.verdict == "unclear" else ""
         return f"{order} {self.beside}: {self.shown(self.reference)}{doubt}"
 
 
 class HeadView(NamedTuple):
-    """The head-view robot IoU on the first group of held-out recordings, with the main method."""
+    """The headline of the head view on the first group of held-out recordings, with the main method."""
 
     scores: VideoScores
     group: str
     primary: Method
-    metric: str
+    metric: Metric
 
     def method(self, kind: str, *groups: str) -> Method | None:
         """The first method of a kind with weights of one of some groups."""
         return next((m for m in self.scores.methods(self.group) if m.kind == kind and m.group in groups), None)
 
     def difference(self, second: Method | None, first: Method | None = None) -> tuple[float, float] | None:
-        """Interval of the paired difference of two methods (default: the main one and `second`)."""
+        """Interval of how much better a method (default: the main one) is than `second`, in paired recordings."""
         names = (first or self.primary).name, "" if second is None else second.name
-        found = self.scores.difference(self.group, *names, self.metric)
-        return None if found is None else (found["low"], found["high"])
+        found = self.scores.difference(self.group, *names, f"{self.metric.name}@head")
+        if found is None:
+            return None
+        return (-found["high"], -found["low"]) if self.metric.lower_is_better else (found["low"], found["high"])
 
     def figure(self, method: Method | None, what: str) -> Figure | None:
-        """A method's IoU beside that of copying the first frame."""
+        """A method's value beside that of copying the first frame."""
         copy = self.method("copy", "baseline")
         mean, reference = (
-            None if m is None else self.scores.value(self.group, m.name, self.metric) for m in (method, copy)
+            None if m is None else self.scores.value(self.group, m.name, f"{self.metric.name}@head")
+            for m in (method, copy)
         )
         if method is None or mean is None or reference is None:
             return None
         where = f"{method.long_label}; {SPLIT_LABELS[self.group]}, head view"
-        bounds = self.difference(copy, method)
-        return Figure(what, mean, "recordings", "copying the first frame", reference["mean"], bounds, where)
+        return Figure(
+            what, mean, "recordings", "copying the first frame", reference["mean"], self.difference(copy, method), where,
+            lower_is_better=self.metric.lower_is_better, unit=self.metric.unit,
+        )  # fmt: skip
 
 
 def head_view(context: ReportContext) -> HeadView | None:
-    """The scores that head the page; None where no robot IoU was measured."""
+    """The scores that head the page; None where neither robot IoU nor tool error was measured."""
     scores = context.video_scores
     group = scores.groups[0] if scores.groups else ""
     primary = scores.primary(group)
-    metric = primary and scores.iou_metric(group, primary.name)
-    return HeadView(scores, group, primary, f"{metric}@head") if primary and metric else None
+    metric = primary and scores.headline(group, primary.name)
+    return HeadView(scores, group, primary, metric) if primary and metric else None
 
 
 def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
@@ -178,7 +190,11 @@ def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
 
 def video_figures(view: HeadView) -> tuple[Figure | None, Figure | None]:
     """The main method, and this run's own method of the same kind, beside a copy of the first frame."""
-    main = view.figure(view.primary, "overlap of the predicted robot with the recorded one (IoU)")
+    iou, tools = (
+        "overlap of the predicted robot with the recorded one (IoU)",
+        "distance of the predicted tools from the recorded ones",
+    )
+    main = view.figure(view.primary, tools if view.metric.name == "end_effector_error_px" else iou)
     own = view.method(view.primary.kind, "run")
     if own is None or own.name == view.primary.name:
         return main, None

@@ -92,26 +92,26 @@ def metric_tables(scores: VideoScores, group: str, view: str) -> list[Table]:
 
 
 def quality_charts(scores: VideoScores, group: str) -> list[Markup]:
-    """Robot IoU and SSIM of the head view: the main method beside every other, and the drift of predictions along time."""
+    """The headline and SSIM of the head view: the main method beside every other, and the drift of predictions along time."""
     primary = scores.primary(group)
     if primary is None:
         return []
     differences, drifts = list[Markup](), list[Markup]()
-    for metric in (scores.iou_metric(group, primary.name), "ssim"):
-        label = METRICS[metric].title if metric else ""
+    for metric in filter(None, (scores.headline(group, primary.name), METRICS["ssim"])):
         dots, series = list[Dot](), list[Series]()
         for m in scores.methods(group):
-            if found := scores.difference(group, primary.name, m.name, f"{metric}@head"):
+            if found := scores.difference(group, primary.name, m.name, f"{metric.name}@head"):
                 dots.append(Dot(m.long_label, found["mean"], found["low"], found["high"], m.colour))
-            if rows := scores.along_time(group, m.name, f"{metric}"):
+            if rows := scores.along_time(group, m.name, metric.name):
                 series.append(Series(m.long_label, *zip(*rows, strict=True), colour=m.colour, dashed=m.group == "run"))
         if dots:
-            title = f"{primary.long_label} minus each other: {label}"
-            value_label = f"paired difference, 95 % interval; right of zero, {primary.label} is better"
+            title = f"{primary.long_label} minus each other: {metric.title}"
+            side = "left" if metric.lower_is_better else "right"
+            value_label = f"paired difference, 95 % interval; {side} of zero, {primary.label} is better"
             differences.append(interval_chart(dots, title=title, value_label=value_label, zero_line=True, signed=True))
         if series:
-            title = f"{label} along the prediction"
-            drifts.append(line_chart(series, title=title, x_label="frame (0 is given)", y_label=label))
+            title = f"{metric.title} along the prediction"
+            drifts.append(line_chart(series, title=title, x_label="frame (0 is given)", y_label=metric.title))
     return differences + drifts
 
 

@@ -51,9 +51,9 @@ class ChosenEpisode(NamedTuple):
     score: float | None = None
 
 
-def best_median_worst(values: Mapping[str, float]) -> list[tuple[str, str, float]]:
-    """(label, episode, value) of the median, best and worst of a score where higher is better; ties by name."""
-    ranked = sorted(values.items(), key=lambda item: (item[1], item[0]))
+def best_median_worst(values: Mapping[str, float], *, lower_is_better: bool = False) -> list[tuple[str, str, float]]:
+    """(label, episode, value) of the median, best and worst of a score; ties by name."""
+    ranked = sorted(values.items(), key=lambda item: (-item[1] if lower_is_better else item[1], item[0]))
     chosen: dict[tuple[str, float], str] = {}
     for label, place in (("median", (len(ranked) - 1) // 2), ("best", -1), ("worst", 0)) if ranked else ():
         chosen.setdefault(ranked[place], label)
@@ -61,18 +61,20 @@ def best_median_worst(values: Mapping[str, float]) -> list[tuple[str, str, float
 
 
 def choose_episodes(scores: VideoScores, available: Sequence[str]) -> list[ChosenEpisode]:
-    """Median, best and worst by the main method's robot IoU of the first held-out group, and the median of every further one.
+    """Median, best and worst by the main method's headline of the first held-out group, and the median of every further one.
 
     ``available`` have predicted videos; without scores the first, middle and last of them are taken.
     """
     chosen: list[ChosenEpisode] = []
     for group in scores.groups:
         first = scores.primary(group)
-        metric = first and scores.iou_metric(group, first.name)
+        metric = first and scores.headline(group, first.name)
         if first is None or metric is None or group == "train":
             continue
-        values = scores.per_episode(first.name, metric, "head", group)
-        ranked = best_median_worst({name: value for name, value in values.items() if name in available})
+        values = scores.per_episode(first.name, metric.name, "head", group)
+        ranked = best_median_worst(
+            {name: value for name, value in values.items() if name in available}, lower_is_better=metric.lower_is_better
+        )
         where = f"of {len(values)} on {SPLIT_LABELS.get(group, group)}"
         chosen += [
             ChosenEpisode(episode, f"{label} {where}", value)
@@ -104,8 +106,8 @@ def videos_section(context: ReportContext) -> Section:
     lead = "Every column starts from the same first frame; from there on a model sees only the controls."
     if any(item.score is not None for item in chosen):
         lead += (
-            " The episodes are not chosen by hand: they are the median, the best and the worst by the robot IoU of the first"
-            " model's prediction."
+            " The episodes are not chosen by hand: they are the median, the best and the worst by the first model's prediction of"
+            " the robot."
         )
     cards = [card(context, context.episodes, item, number) for number, item in enumerate(chosen)]
     return context.section("videos", TITLE, lead, cards=cards)
