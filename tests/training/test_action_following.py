@@ -123,6 +123,7 @@ def test_a_model_that_ignores_its_controls_is_stopped_from_the_given_step_on(wor
 
 def test_measuring_takes_its_share_of_the_time(world: Any, tokenizer: Path):
     probe = make_probe(world, tokenizer, Recorded(follows=True), tracks=True, share=0.1)
+    assert not probe.due(29) and probe.due(31)  # an assumed cost of 3 s
     probe.measure(1)
     cost = probe.spent
     assert not probe.due(19 * cost) and probe.due(21 * cost)

@@ -44,6 +44,8 @@ LEAST_MOTION = 0.05
 LEAST_CHANGE = 12.0
 """Blurred change of a picture that is motion [grey levels]."""
 LEAST_CLIPS = 4
+FIRST_SECONDS = 3.0
+"""Assumed cost of the first measurement."""
 STARTS = 4
 """Clips of an episode that are looked at; more where few episodes are held out."""
 
@@ -94,7 +96,7 @@ class ActionFollowing:
         self.config, self.predictor, self.loader, self.episodes = config, predictor, loader, episodes
         self.trainer = trainer
         self.tokenizer = _open_tokenizer(tokenizer, loader)
-        self.spent = self.longest = 0.0
+        self.spent, self.longest = 0.0, FIRST_SECONDS
         self.batches: list[tuple[ClipBatch, list[np.ndarray]]] = []
         self.frame = 0
         kinds = {row.episode_id: (_shared(row, view_sets), loader.frame_rates[row.episode_id]) for row in rows}
@@ -197,7 +199,8 @@ class ActionFollowing:
                 squared["frame"].append(float(difference.mean()))
                 squared["hand"].append(_around(difference, points[place]))
         took = time.monotonic() - began
-        self.spent, self.longest = self.spent + took, max(self.longest, took)
+        self.longest = max(self.longest, took) if self.spent else took
+        self.spent += took
         values = _summary(errors, squared)
         self._require_followed(step, values)
         return values
