@@ -47,7 +47,6 @@ from worldline_core.model.tokenizers import WanTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import match_views
 from worldline_core.store.atomic import write_bytes_atomic
-from worldline_core.training.action_following import ActionFollowing
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
@@ -61,7 +60,7 @@ from worldline_core.training.processes import (
     processes,
     wait_for_all,
 )
-from worldline_core.training.stage import input_facts, validation_function, weights_of
+from worldline_core.training.stage import HeldOutClips, input_facts, weights_of
 from worldline_core.training.trainer import ParameterGroup, batch_plan, train
 from worldline_core.training.training_config import TrainerConfig
 
@@ -255,24 +254,6 @@ class DistillationRun:
         plan = batch_plan(trainer, self._work(step))
         return TrajectoryLoader(store, self.loader, trainer, plan, kept_latents=kept_latents).load
 
-    def _probe[BatchT: Batch](
-        self, trainer: TrainerConfig, objective: CausalObjective[BatchT]
-    ) -> ActionFollowing | None:
-        config = self.config
-        if config.action_following is None:
-            return None
-        return ActionFollowing(
-            config.action_following,
-            objective,
-            self.loader,
-            [row for row in self.rows if row.split in config.validation_splits],
-            self.episodes,
-            self.tokenizer,
-            view_sets=self._sampler(trainer, config.clips, ALONE).view_sets(self.info.config.views),
-            frames_per_unit=TEMPORAL_FACTOR * config.spec.block_size,
-            trainer=trainer,
-        )
-
     def _train[BatchT: Batch](
         self,
         step: str,
@@ -287,22 +268,22 @@ class DistillationRun:
         if (folder / "checkpoint.json").is_file() and log.is_file():
             return {f"{step}/{name}": value for name, value in read_checkpoint_info(folder).metadata["metrics"].items()}
         config, work, model = self.config, self._work(step), objective.model
+        held_out = HeldOutClips(config, self.loader, self.rows, self.episodes, self.vector_share)
+        sampler = self._sampler(trainer, config.clips, ALONE)
         result = train(
             trainer,
             groups=(ParameterGroup("student", dict(model.named_parameters())), *(group for group, _ in others)),
             objective=objective,
             load=load,
-            validate=validation_function(
-                self.loader,
-                config.clips,
-                config.validation_splits,
+            validate=held_out.validation(trainer, objective),
+            probe=held_out.action_following(
+                config.action_following,
                 trainer,
-                self.rows,
                 objective,
-                config.input,
-                self.vector_share,
+                self.tokenizer,
+                sampler,
+                TEMPORAL_FACTOR * config.spec.block_size,
             ),
-            probe=self._probe(trainer, objective),
             output=work,
             identity={
                 "step": step,
@@ -324,7 +305,7 @@ class DistillationRun:
                 kind="causal",
                 action_contract=self.info.contract,
                 causal=config.spec,
-                trained=self._sampler(trainer, config.clips, ALONE).trained(model.config.views),
+                trained=sampler.trained(model.config.views),
                 vectors=self.info.vectors,
                 metadata={
                     "distillation": step,

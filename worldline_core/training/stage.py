@@ -18,7 +18,8 @@ from worldline_core.model.checkpoint import CHECKPOINT_DTYPE, CheckpointInfo, sa
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, NativeVectors
 from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput, ReadingConfig
+from worldline_core.training.action_following import ActionFollowing, Predictor
+from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 from worldline_core.training.clip_source import ClipSource, open_source, training_rows
@@ -26,7 +27,13 @@ from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.processes import BatchPlan, gathered, join_processes, place_model, processes
 from worldline_core.training.trainer import ParameterGroup, Probe, TrainingResult, batch_plan, held_out_losses, train
-from worldline_core.training.training_config import LossWeighting, Stage2Config, StageConfig, TrainerConfig
+from worldline_core.training.training_config import (
+    ActionFollowingConfig,
+    LossWeighting,
+    Stage2Config,
+    StageConfig,
+    TrainerConfig,
+)
 
 logger = logging.getLogger(__name__)
 VALIDATION_SEED = 20_000
@@ -131,6 +138,10 @@ class Stage:
             **conditions,
         )
 
+    def held_out(self, loader: ClipLoader) -> HeldOutClips:
+        """Clips that the run is measured on."""
+        return HeldOutClips(self.config, loader, self.rows, self.episodes, self.vector_share)
+
     def train(
         self,
         objective: FlowMatchingObjective,
@@ -151,16 +162,7 @@ class Stage:
             groups=groups,
             objective=objective,
             load=loader.batches(self.sampler, config.input, self.output / "run", stop),
-            validate=validation_function(
-                loader,
-                config.clips,
-                config.validation_splits,
-                trainer,
-                self.rows,
-                objective,
-                config.input,
-                self.vector_share,
-            ),
+            validate=self.held_out(loader).validation(trainer, objective),
             probe=probe,
             output=self.output,
             identity={
@@ -237,50 +239,82 @@ def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str
     return facts
 
 
-class ValidatedObjective(Protocol):
+class MeasuredObjective(Predictor, Protocol):
     """An objective that can be measured on held-out clips."""
 
     def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]: ...
 
 
-def validation_function(
-    loader: ClipLoader,
-    clips: ClipSampling,
-    splits: Sequence[str],
-    trainer: TrainerConfig,
-    rows: Sequence[ClipRow],
-    objective: ValidatedObjective,
-    reading: ReadingConfig,
-    vector_share: float = 0.0,
-) -> Callable[[], dict[str, float]] | None:
-    """A function that measures the losses on held-out clips: always the same clips, noise and noise levels.
+class HeldOutConfig(Protocol):
+    """Settings of held-out clips, of a stage or of the distillation."""
 
-    They are of recordings that hold clips of every length and stride that is trained; where there are none, of all, at the
-    lengths and strides that fit. None where no clip fits. Both are said in the log.
-    """
-    shortest, longest = ((pick(clips.lengths) - 1) * pick(clips.strides) + 1 for pick in (min, max))
-    split_rows = [row for row in rows if row.split in splits and row.num_frames >= shortest]
-    if not split_rows or not trainer.validation_batches:
-        logger.warning("No held-out clips of %d frames in the splits %s: no validation loss.", shortest, splits)
-        return None
-    held_out = [row for row in split_rows if row.num_frames >= longest]
-    if not held_out:
-        held_out = split_rows
-        logger.warning(
-            "The longest recording of the splits %s has %d frames, the longest clips span %d: the validation loss is of the "
-            "lengths and strides that fit.",
-            splits,
-            max(row.num_frames for row in held_out),
-            longest,
-        )
-    # At least two clips, so that "shuffled actions" are another clip's.
-    size = max(2, trainer.batch_size)
-    # Where steps on one view are mixed in, it is still the joint prediction that counts.
-    if clips.view_weights is not None and JOINT in clips.view_weights:
-        clips = clips.model_copy(update={"view_weights": None})
-    sampler = ClipSampler(
-        held_out, clips, views=loader.views, splits=splits, start_step=loader.source.start_step, batch_size=size,
-        seed=VALIDATION_SEED, vector_share=vector_share,
-    )  # fmt: skip
-    load = loader.batches(sampler, reading.model_copy(update={"workers": 0}), stop=trainer.validation_batches)
-    return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)
+    @property
+    def clips(self) -> ClipSampling: ...
+    @property
+    def validation_splits(self) -> Sequence[str]: ...
+    @property
+    def input(self) -> ClipInput: ...
+
+
+@dataclass(frozen=True)
+class HeldOutClips:
+    """Clips that a run is measured on."""
+
+    config: HeldOutConfig
+    loader: ClipLoader
+    rows: Sequence[ClipRow]
+    episodes: EpisodeSet
+    vector_share: float
+
+    def validation(self, trainer: TrainerConfig, objective: MeasuredObjective) -> Callable[[], dict[str, float]] | None:
+        """A function that measures the losses: always the same clips, noise and noise levels.
+
+        The clips are of recordings long enough for every length and stride that is trained; where there are none, of all, at the
+        lengths and strides that fit. None where no clip fits. Both are logged.
+        """
+        clips, splits = self.config.clips, self.config.validation_splits
+        shortest, longest = ((pick(clips.lengths) - 1) * pick(clips.strides) + 1 for pick in (min, max))
+        split_rows = [row for row in self.rows if row.split in splits and row.num_frames >= shortest]
+        if not split_rows or not trainer.validation_batches:
+            logger.warning("No held-out clips of %d frames in the splits %s: no validation loss.", shortest, splits)
+            return None
+        held_out = [row for row in split_rows if row.num_frames >= longest]
+        if not held_out:
+            held_out = split_rows
+            logger.warning(
+                "The longest recording of the splits %s has %d frames, the longest clips span %d: the validation loss is of the "
+                "lengths and strides that fit.",
+                splits,
+                max(row.num_frames for row in held_out),
+                longest,
+            )
+        # At least two clips, so that "shuffled actions" are another clip's.
+        size = max(2, trainer.batch_size)
+        # Where steps on one view are mixed in, it is still the joint prediction that counts.
+        if clips.view_weights is not None and JOINT in clips.view_weights:
+            clips = clips.model_copy(update={"view_weights": None})
+        sampler = ClipSampler(
+            held_out, clips, views=self.loader.views, splits=splits, start_step=self.loader.source.start_step,
+            batch_size=size, seed=VALIDATION_SEED, vector_share=self.vector_share,
+        )  # fmt: skip
+        reading = self.config.input.model_copy(update={"workers": 0})
+        load = self.loader.batches(sampler, reading, stop=trainer.validation_batches)
+        return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)
+
+    def action_following(
+        self,
+        config: ActionFollowingConfig | None,
+        trainer: TrainerConfig,
+        objective: MeasuredObjective,
+        tokenizer: Path | None,
+        sampler: ClipSampler,
+        frames_per_unit: int,
+    ) -> ActionFollowing | None:
+        """The measurement, where it is asked for, on views that ``sampler`` shows together."""
+        if config is None:
+            return None
+        rows = [row for row in self.rows if row.split in self.config.validation_splits]
+        return ActionFollowing(
+            config, objective, self.loader, rows, self.episodes, tokenizer,
+            view_sets=sampler.view_sets(self.loader.views), frames_per_unit=frames_per_unit, trainer=trainer,
+        )  # fmt: skip

@@ -19,7 +19,6 @@ from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, WorldModelConfig
-from worldline_core.training.action_following import ActionFollowing
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
 from worldline_core.training.relational import RelationalTerm, TeacherSimilarities
@@ -111,20 +110,11 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         action_dropout=config.action_dropout,
         relational=_relational(config, inputs, model),
     )
-    probe = None
     if config.action_following is not None:
         objective.sampler_steps = config.action_following.steps
-        probe = ActionFollowing(
-            config.action_following,
-            objective,
-            loader,
-            [row for row in stage.rows if row.split in config.validation_splits],
-            stage.episodes,
-            inputs.get("tokenizer"),
-            view_sets=stage.sampler.view_sets(model.config.views),
-            frames_per_unit=TEMPORAL_FACTOR,
-            trainer=config.trainer,
-        )
+    probe = stage.held_out(loader).action_following(
+        config.action_following, config.trainer, objective, inputs.get("tokenizer"), stage.sampler, TEMPORAL_FACTOR
+    )
     groups = stage2_groups(model, config.action_multiplier)
     result = stage.train(objective, groups, loader, probe)
     facts = {
