@@ -56,12 +56,12 @@ def test_an_episode_set_and_its_mcap_files(tmp_path: Path, project_root: Path) -
     shipped = project_root / "artifacts/shipped/recordings"
     found = look(shipped)
     views = ["head", "right_wrist"]  # of all robots
-    assert (found.kind, found.views, found.calibrated) == ("episode_set", views, True)
+    assert (found.kind, found.views, found.cameras) == ("episode_set", views, "all")
     write_config(found, tmp_path / "my.yaml", str(shipped))
     assert PipelineConfig.load(None, tmp_path / "my.yaml").render_actions is not None
     export(shipped, tmp_path / "mcap", ["mcap"], episode_ids=[EpisodeSet.open(shipped).rows[0].episode_id])
     exported = look(tmp_path / "mcap")
-    assert (exported.kind, set(exported.views) >= {"head", "right_wrist"}, exported.calibrated) == ("mcap", True, True)
+    assert (exported.kind, set(exported.views) >= {"head", "right_wrist"}, exported.cameras) == ("mcap", True, "all")
 
 
 def test_ros_2_topics(tmp_path: Path, toy: Any) -> None:
@@ -114,7 +114,7 @@ def test_agibot_and_enerverse(tmp_path: Path) -> None:
     for n in range(3):
         write_agibot(tmp_path / "world", 327, 648642 + n, 20 * n)
     found = look(tmp_path / "world")
-    assert (found.kind, found.views, found.calibrated) == ("agibot_world", ["head", "left_wrist", "right_wrist"], True)
+    assert (found.kind, found.views, found.cameras) == ("agibot_world", ["head", "left_wrist", "right_wrist"], "all")
     write_clip(tmp_path / "clips", "1-2-3")
     assert look(tmp_path / "clips").kind == "enerverse_ac"
     for name in ("world", "clips"):

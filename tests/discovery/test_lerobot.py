@@ -268,17 +268,19 @@ def test_texts_of_others_are_no_yaml_and_no_escapes(tmp_path: Path) -> None:
     assert arms_of(found)[0]["state"]["joints"]["indices"] == [0, 1, 2, 3, 4]  # a name with a pattern's characters
 
 
-def test_a_calibration_file_lets_controls_be_drawn(tmp_path: Path) -> None:
-    write_so101(tmp_path / "raw", cameras={"observation.images.front": "still"})
+@pytest.mark.parametrize("wrist", [False, True], ids=["every view", "one of two views"])
+def test_a_calibration_file_lets_controls_be_drawn(tmp_path: Path, wrist: bool) -> None:
+    cameras = {"observation.images.front": "still"} | ({"observation.images.wrist": "wrist"} if wrist else {})
+    write_so101(tmp_path / "raw", cameras=cameras)
     view = {"width": 64, "height": 48, "K": [[50, 0, 32], [0, 50, 24], [0, 0, 1]], "maps": "camera_to_base"}
     view |= {"axes": "opencv", "T": [[1, 0, 0, 0.4], [0, -1, 0, 0], [0, 0, -1, 0.8], [0, 0, 0, 1]]}
     (tmp_path / "raw/meta/calibration.yaml").write_text(json.dumps({"views": {"head": view}}))
     (tmp_path / "raw/README.md").write_text("---\nlicense: apache-2.0\n---\nlicense: nonsense\n")
     found, path = init(tmp_path)
     config = PipelineConfig.load(None, path)
-    assert found.calibrated
+    assert found.cameras == ("some" if wrist else "all")
     assert config.render_actions is not None
-    assert config.train_stage2.native_size is None
+    assert config.train_stage2.native_size == (6 if wrist else None)  # the view without a camera takes the vectors
     assert config.curate.sources[0].license == "Apache-2.0"
 
 

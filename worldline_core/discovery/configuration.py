@@ -105,20 +105,22 @@ def _stages(found: Discovery) -> list[str]:
         "# Views that models see; of each episode those that it has.",
         f"encode_latents: {{views: {views}}}",
     ]
-    if found.calibrated and found.source.get("embodiment") != NO_EMBODIMENT:
+    described = found.source.get("embodiment") != NO_EMBODIMENT
+    if found.cameras == "all" and described:
         return lines
-    why = "No camera is calibrated" if not found.calibrated else "No description of the robot"
-    text = (
-        f"{why}: the joints themselves drive the model. With cameras (docs/your_robot.md) remove both lines,"
-        " and the controls are drawn into the pictures, which models follow better."
-    )
-    return [
-        *lines,
-        "",
-        *_comment(text, 0),
-        "render_actions: null",
-        f"train_stage2: {{native_size: {found.state_size}}}",
-    ]
+    if found.cameras == "some" and described:
+        drawn = []
+        text = (
+            "Controls are drawn into the views that have a camera; in the others the joints themselves drive the model."
+        )
+    else:
+        why = "No camera is calibrated" if found.cameras == "none" else "No description of the robot"
+        drawn = ["render_actions: null"]
+        text = (
+            f"{why}: the joints themselves drive the model. With cameras (docs/your_robot.md) remove both lines,"
+            " and the controls are drawn into the pictures, which models follow better."
+        )
+    return [*lines, "", *_comment(text, 0), *drawn, f"train_stage2: {{native_size: {found.state_size}}}"]
 
 
 def _comment(text: str, indent: int) -> list[str]:

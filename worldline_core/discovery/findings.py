@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from worldline_core.untrusted_text import cut, visible
 
@@ -32,7 +32,7 @@ class Discovery:
         fps: of the recordings.
         state_size: columns of the state; None of videos without states.
         episodes: those that can be read, where that is known without reading them; `frames`: of half of them, or more.
-        calibrated: every view has a camera.
+        cameras: how many of these views have one.
         trains: False of recordings that are for evaluation only.
         notes: what the user should know, and no value says.
     """
@@ -46,7 +46,7 @@ class Discovery:
     state_size: int | None = None
     episodes: int | None = None
     frames: int | None = None
-    calibrated: bool = False
+    cameras: Literal["all", "some", "none"] = "none"
     trains: bool = True
     notes: list[str] = field(default_factory=list)
 
@@ -57,6 +57,11 @@ class Discovery:
             inner = inner.setdefault(key, {})
         inner[place[-1]] = value
         self.evidence[place] = evidence
+
+    def count_cameras(self, *known: Container[str]) -> None:
+        """Set ``cameras`` from the views with a camera, of each episode looked at."""
+        have = [view in each for each in known for view in self.views]
+        self.cameras = "all" if have and all(have) else "some" if any(have) else "none"
 
     @property
     def questions(self) -> list[Question]:

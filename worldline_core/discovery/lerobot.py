@@ -192,7 +192,7 @@ def _calibration(found: Discovery, root: AnyPath) -> None:
             continue
         known = list(read_calibration(root / name).views)
         found.say(("calibration",), name, f"cameras of {named(known)}")
-        found.calibrated = set(found.views) <= set(known)
+        found.count_cameras(known)
         return
 
 

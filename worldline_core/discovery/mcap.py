@@ -79,7 +79,7 @@ def _of_this_project(root: AnyPath, files: Sequence[AnyPath], episode_id: str) -
     found = Discovery("mcap", about, {"kind": "mcap", "path": str(root)}, views=list(loaded.views), fps=episode.fps)
     found.evidence["kind",] = f"the first file is the episode {named([episode_id])}"
     found.state_size = episode.state.shape[1] or None
-    found.calibrated = set(loaded.views) <= set(episode.cameras)
+    found.count_cameras(episode.cameras)
     return found
 
 
@@ -217,9 +217,10 @@ def _views(
         found.evidence["views", view] = chosen.evidence[topic]
     found.source["views"] = views
     found.views = list(views)
-    found.calibrated = all("calibration" in view for view in views.values())
+    found.count_cameras([name for name, view in views.items() if "calibration" in view])
+    posed = found.cameras != "none"
     roots = sorted(parents - frames)
-    if found.calibrated and roots:
+    if posed and roots:
         base = next((root for root in sorted(parents) if "base" in root), roots[0])
         found.say(
             ("base_frame",),
@@ -227,8 +228,8 @@ def _views(
             f"transforms lead from {named(roots)}; frames called base: {named([f for f in sorted(parents | frames) if 'base' in f])}",
         )
     static = [topic for topic in transforms if "static" in topic]
-    found.source["transforms"] = [topic for topic in transforms if topic not in static] if found.calibrated else []
-    found.source["static_transforms"] = static if found.calibrated else []
+    found.source["transforms"] = [topic for topic in transforms if topic not in static] if posed else []
+    found.source["static_transforms"] = static if posed else []
 
 
 def _shared(one: str, other: str) -> int:

@@ -46,13 +46,10 @@ def discover_episode_set(root: AnyPath) -> Discovery:
         episodes=len(rows),
     )
     found.evidence["kind",] = "index.parquet and manifest.json of this project"
-    episode = opened.episode(0)
-    found.state_size = (
-        None if episode.state_kind == "none" else max(opened.episode(i).state.shape[1] for i in _spread(rows, _FILES))
-    )
-    found.calibrated = all(row.stage2_reason != "missing_calibration" for row in rows) and set(views) <= set(
-        episode.cameras
-    )
+    episodes = [opened.episode(i) for i in _spread(rows, _FILES)]
+    if episodes[0].state_kind != "none":
+        found.state_size = max(episode.state.shape[1] for episode in episodes)
+    found.count_cameras(*(episode.cameras for episode in episodes))
     return found
 
 
@@ -199,7 +196,7 @@ def discover_enerverse(root: AnyPath) -> Discovery:
 
 
 def _agibot(kind: str, about: str, root: AnyPath, why: str) -> Discovery:
-    result = Discovery(kind, about, {"kind": kind, "path": str(root)}, fps=30, calibrated=True)
+    result = Discovery(kind, about, {"kind": kind, "path": str(root)}, fps=30, cameras="all")
     result.evidence["kind",] = why
     result.say(("embodiment",), "agibot_g1", "AgiBot World is recorded with this robot")
     robot = load_embodiment("agibot_g1")
@@ -404,7 +401,7 @@ def discover_robotwin(root: AnyPath) -> Discovery:
         "robotwin",
         f"RoboTwin 2: {len(files)} episodes",
         {"kind": "robotwin", "path": str(root)},
-        calibrated=True,
+        cameras="all",
         trains=False,
     )
     found.evidence["kind",] = "data/episode<n>.hdf5 with observation/<camera>"

@@ -24,7 +24,7 @@ def as_json(found: Discovery, written: Path, commands: Sequence[str]) -> dict[st
         "views": found.views,
         "fps": found.fps,
         "state_size": found.state_size,
-        "calibrated": found.calibrated,
+        "cameras": found.cameras,
         "trains": found.trains,
         "evidence": [{"key": list(place), "sentence": text} for place, text in found.evidence.items()],
         "todo": {each.name: each.text for each in found.questions},
