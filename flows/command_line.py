@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 
@@ -248,7 +251,6 @@ def _task(arguments: argparse.Namespace) -> None:
 
 
 def _init(arguments: argparse.Namespace) -> None:
-    import json
 
     from worldline_core.discovery.configuration import write_config
     from worldline_core.discovery.hub import fetch_sample, hub_id
@@ -309,13 +311,9 @@ def _verify(arguments: argparse.Namespace) -> None:
 
 
 def _calibrate_check(arguments: argparse.Namespace) -> None:
-    import json
-    import sys
-
-    from worldline_core.errors import WorldLineError
     from worldline_core.store.store import clear_full_disk
 
-    try:
+    with _unusable_is_2():  # 1 says that something was found
         from worldline_core.calibration.check import check_command
         from worldline_core.calibration.check_report import as_json, table_text
 
@@ -327,33 +325,32 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
                 episodes=arguments.episodes,
                 output=arguments.output,
             )
-    except WorldLineError as error:
-        # 1 says that something was found; what cannot be checked at all is another status.
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
     print(json.dumps(as_json(found), indent=1) if arguments.json else table_text(found))
     raise SystemExit(0 if found.consistent else 1)
 
 
 def _calibrate_estimate(arguments: argparse.Namespace) -> None:
-    import json
-    import sys
-
-    from worldline_core.errors import WorldLineError
-
-    try:
+    with _unusable_is_2():  # 1 says that a camera is not sure
         from worldline_core.calibration.estimate.estimate import estimate_command
         from worldline_core.calibration.estimate.estimate_report import as_json, estimate_text
 
         found = estimate_command(
             arguments.config, overrides=arguments.overrides, views=arguments.views, output=arguments.output
         )
-    except WorldLineError as error:
-        # 1 says that a camera is not sure; what cannot be estimated at all is another status.
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
     print(json.dumps(as_json(found), indent=1) if arguments.json else estimate_text(found))
     raise SystemExit(0 if found.sure else 1)
+
+
+@contextmanager
+def _unusable_is_2() -> Iterator[None]:
+    """Exit with status 2 where the command cannot answer."""
+    from worldline_core.errors import WorldLineError
+
+    try:
+        yield
+    except WorldLineError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
 
 
 def _embodiment_list(_arguments: argparse.Namespace) -> None:
@@ -422,7 +419,6 @@ def _doctor(arguments: argparse.Namespace) -> None:
         return
     findings = examine_machine(Path.cwd())
     if arguments.json:
-        import json
         from dataclasses import asdict
 
         print(json.dumps([asdict(finding) for finding in findings], indent=1))

@@ -1,17 +1,22 @@
-"""One HTTP request to an untrusted server: bounded in time and size, without redirects."""
+"""Requests to untrusted servers, bounded in time and size and without redirects; snapshots of the Hugging Face hub."""
 
 from __future__ import annotations
 
 import asyncio
 import functools
+import os
 import ssl
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
+from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
+
+from worldline_core.errors import UnavailableError
 
 
 class UnreachableError(Exception):
@@ -94,6 +99,35 @@ def within[T](seconds: float, call: Callable[[], T], *, discard: Callable[[T], N
         if future.cancel():
             raise
         return future.result()  # done at the last moment, or a time-out of its own
+
+
+def hub_snapshot(repo_id: str, patterns: list[str], *, what: str, **options: Any) -> Path:
+    """Folder with the files of a hub repository that fit ``patterns``; what was fetched before is not fetched again.
+
+    Raises: UnavailableError: the hub does not give it.
+    """
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+
+    try:
+        found = snapshot_download(
+            repo_id,
+            allow_patterns=patterns,
+            endpoint=os.environ.get("HF_ENDPOINT"),
+            # False: without a token the client would look for one that some other program stored.
+            token=os.environ.get("HF_TOKEN") or False,
+            **options,
+        )
+    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, httpx.HTTPError, OSError, ValueError) as error:
+        text = str(error).strip().splitlines()
+        raise UnavailableError(
+            f"The hub does not give this {what}",
+            where=repo_id,
+            expected="a folder of that name here, or the repository on the hub or in its local cache",
+            got=f"{type(error).__name__}: {text[0] if text else ''}"[:300],
+            next_step="check the name, the network and HF_TOKEN; offline, download it elsewhere and give its folder",
+        ) from error
+    return Path(found)
 
 
 @functools.cache

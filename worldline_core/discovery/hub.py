@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from worldline_core.data.guards.source_paths import fill_template
 from worldline_core.data.lerobot.dataset import DATA_PATH, VIDEO_PATH, LeRobotV3Dataset, LeRobotV21Dataset, read_info
-from worldline_core.errors import DataError, UnavailableError
+from worldline_core.errors import DataError
+from worldline_core.http_exchange import hub_snapshot
 
 _HUB_ID = re.compile(r"(?:hf://datasets/)?([A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)")
 _META = ["meta/*", "README.md", "LICENSE*"]
@@ -75,27 +75,4 @@ def _sample_files(folder: Path) -> list[str]:
 
 
 def _snapshot(repo_id: str, patterns: list[str], revision: str | None = None) -> Path:
-    import httpx
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
-
-    try:
-        found = snapshot_download(
-            repo_id,
-            repo_type="dataset",
-            revision=revision,
-            allow_patterns=patterns,
-            endpoint=os.environ.get("HF_ENDPOINT"),
-            # False: without a token the client would look for one that some other program stored.
-            token=os.environ.get("HF_TOKEN") or False,
-        )
-    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, httpx.HTTPError, OSError, ValueError) as error:
-        text = str(error).strip().splitlines()
-        raise UnavailableError(
-            "The hub does not give this dataset",
-            where=repo_id,
-            expected="a folder of that name here, or the dataset on the hub or in its local cache",
-            got=f"{type(error).__name__}: {text[0] if text else ''}"[:300],
-            next_step="check the name, the network and HF_TOKEN; offline, download it elsewhere and give its folder",
-        ) from error
-    return Path(found)
+    return hub_snapshot(repo_id, patterns, what="dataset", repo_type="dataset", revision=revision)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Iterator
@@ -10,7 +9,8 @@ from pathlib import Path
 
 import torch
 
-from worldline_core.errors import ArtifactError, CheckpointError, UnavailableError
+from worldline_core.errors import ArtifactError, CheckpointError
+from worldline_core.http_exchange import hub_snapshot
 from worldline_core.model.checkpoint import CheckpointInfo, read_checkpoint_info
 from worldline_core.model.model_card import write_model_card
 from worldline_core.model.tokenizers import VideoTokenizer, load_tokenizer, tokenizer_fingerprint
@@ -35,28 +35,8 @@ def pretrained_folder(source: Path | str) -> Path:
         return Path(source)
     if isinstance(source, Path) or _HUB_ID.fullmatch(source) is None:
         raise CheckpointError("No model here", where=source, expected="a folder, or ORG/NAME of the hub")
-    import httpx
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
-
-    try:
-        found = snapshot_download(
-            source,
-            allow_patterns=["*.safetensors", "*.json"],  # numbers and JSON, nothing that could run
-            endpoint=os.environ.get("HF_ENDPOINT"),
-            # False: without a token the client would look for one that some other program stored.
-            token=os.environ.get("HF_TOKEN") or False,
-        )
-    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, httpx.HTTPError, OSError, ValueError) as error:
-        text = str(error).strip().splitlines()
-        raise UnavailableError(
-            "The hub does not give this model",
-            where=source,
-            expected="a folder of that name here, or the repository on the hub or in its local cache",
-            got=f"{type(error).__name__}: {text[0] if text else ''}"[:300],
-            next_step="check the name, the network and HF_TOKEN; offline, download it elsewhere and give its folder",
-        ) from error
-    return Path(found)
+    # Numbers and JSON, nothing that could run.
+    return hub_snapshot(source, ["*.safetensors", "*.json"], what="model")
 
 
 def load_model_tokenizer(
