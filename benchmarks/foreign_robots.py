@@ -21,9 +21,9 @@ import cv2
 import mujoco
 import numpy as np
 
-from benchmarks.harness import command_line
+from benchmarks.harness import command_line, read_recordings
 from tools.description_import import kinematics_text
-from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.geometry.embodiment import Embodiment
 
 HEIGHT, WIDTH = 144, 192
@@ -242,25 +242,11 @@ def record(name: str, site: Path, output: Path, source: int, episodes: int) -> N
 
 def read_source(facts_file: Path) -> tuple[Embodiment, list[tuple[Episode, dict[str, np.ndarray]]]]:
     """The robot, and (episode, grey pictures by view) of each recording."""
-    facts = json.loads(facts_file.read_text())
-    robot = ROBOTS[facts["robot"]]
-    embodiment = embodiment_of(facts["robot"], robot, facts_file.with_suffix(".xml"))
-    found = []
-    with np.load(facts_file.with_suffix(".npz"), allow_pickle=False) as arrays:
-        for number in range(facts["episodes"]):
-            state = arrays[f"{number}/state"]
-            cameras = {
-                view: CameraTrack(view, arrays[f"{number}/K/{view}"], arrays[f"{number}/T/{view}"], WIDTH, HEIGHT)
-                for view in facts["views"]
-            }
-            episode = Episode(
-                episode_id=f"{facts_file.stem}-{number:02d}", source=facts_file.stem, embodiment=embodiment.name,
-                scene="foreign", task_family="unknown", instruction="move", outcome="success", split="test",
-                fps=robot.fps, state=state, action=state, timestamps=np.arange(len(state)) / robot.fps, cameras=cameras,
-                T_base_ee=None, gripper=None, state_names=embodiment.state_names, state_kind="joints",
-            )  # fmt: skip
-            found.append((episode, {view: arrays[f"{number}/gray/{view}"] for view in facts["views"]}))
-    return embodiment, found
+    name = json.loads(facts_file.read_text())["robot"]
+    robot = ROBOTS[name]
+    embodiment = embodiment_of(name, robot, facts_file.with_suffix(".xml"))
+    names = embodiment.state_names
+    return embodiment, read_recordings(facts_file, "gray", embodiment.name, robot.fps, state_names=names)
 
 
 def _set(model: mujoco.MjModel, data: mujoco.MjData, robot: ForeignRobot, row: np.ndarray) -> None:

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.shipped import shipped_folder
 
 RECORDINGS = shipped_folder() / "recordings"
@@ -47,6 +53,35 @@ def best_seconds(call: Callable[[], object], at_least: float = 1.0) -> float:
         took = clock() - start
         best, spent = min(best, took), spent + took
     return best
+
+
+def read_recordings(
+    facts_file: Path, pictures: str, robot: str, fps: float, **facts: Any
+) -> list[tuple[Episode, dict[str, np.ndarray]]]:
+    """(episode with the true cameras, pictures by view) of each recording of a drawn set.
+
+    Args:
+        pictures: name of their arrays: (n, h, w) or (n, h, w, 3) uint8.
+    """
+    written = json.loads(facts_file.read_text())
+    found: list[tuple[Episode, dict[str, np.ndarray]]] = []
+    with np.load(facts_file.with_suffix(".npz"), allow_pickle=False) as arrays:
+        for number in range(written["episodes"]):
+            shown = {view: arrays[f"{number}/{pictures}/{view}"] for view in written["views"]}
+            cameras = {
+                view: CameraTrack(view, arrays[f"{number}/K/{view}"], arrays[f"{number}/T/{view}"], *each.shape[2:0:-1])
+                for view, each in shown.items()
+            }
+            state = arrays[f"{number}/state"]
+            action = arrays.get(f"{number}/action", state)
+            episode = Episode(
+                episode_id=f"{facts_file.stem}-{number:02d}", source=facts_file.stem, embodiment=robot, scene="drawn",
+                task_family="unknown", instruction="move", outcome="success", split="test", fps=fps, state=state,
+                action=action, timestamps=np.arange(len(state)) / fps, cameras=cameras, T_base_ee=None, gripper=None,
+                state_kind="joints", **facts,
+            )  # fmt: skip
+            found.append((episode, shown))
+    return found
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -15,8 +15,8 @@ from unittest import mock
 
 import numpy as np
 
-from benchmarks.harness import command_line
-from worldline_core.data.episodes.episode import CameraTrack, Episode
+from benchmarks.harness import command_line, read_recordings
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.recorder.bodies import BODIES, CENTRE, CameraMount
 from worldline_core.recorder.record import SPLIT_STREAM
 from worldline_core.recorder.rendering import SceneRenderer, prepare_rendering
@@ -82,26 +82,7 @@ def record(body: str, output: Path, episodes: int, seed: int) -> None:
 
 def read_set(facts_file: Path) -> list[tuple[Episode, dict[str, np.ndarray]]]:
     """(episode with the true cameras, uint8 (n, h, w, 3) frames by view) of each recording."""
-    facts = json.loads(facts_file.read_text())
-    found = []
-    with np.load(facts_file.with_suffix(".npz"), allow_pickle=False) as arrays:
-        for number in range(facts["episodes"]):
-            frames = {view: arrays[f"{number}/frames/{view}"] for view in facts["views"]}
-            cameras = {
-                view: CameraTrack(
-                    view, arrays[f"{number}/K/{view}"], arrays[f"{number}/T/{view}"], *shown.shape[2:0:-1]
-                )
-                for view, shown in frames.items()
-            }
-            state = arrays[f"{number}/state"]
-            episode = Episode(
-                episode_id=f"{facts_file.stem}-{number:02d}", source=facts_file.stem, embodiment=facts["body"],
-                scene="drawn", task_family="unknown", instruction="move", outcome="success", split="test", fps=8.0,
-                state=state, action=arrays[f"{number}/action"], timestamps=np.arange(len(state)) / 8.0, cameras=cameras,
-                T_base_ee=None, gripper=None, state_kind="joints",
-            )  # fmt: skip
-            found.append((episode, frames))
-    return found
+    return read_recordings(facts_file, "frames", json.loads(facts_file.read_text())["body"], 8.0)
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ episodes give it alone, and its interval in the picture is small. In doubt it is
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -157,21 +157,14 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
         reasons.append(f"{len(low)} of {len(recorded.episodes)} episodes do not fit")
     if typical < LEAST_AGREEMENT:  # then nothing else means anything
         reasons, moved = reasons[:1], None
-    rival = None if found.rival is None else full_size(found.rival.camera, recorded.image_size)
-    return ViewEstimate(
-        recorded.view,
-        wrist=False,
-        verdict="unsure" if reasons else "sure",
-        camera=full_size(fitted.camera, recorded.image_size),
-        lag_frames=fitted.lag * recorded.every,
-        intervals=error.kinds,
-        agreement=typical,
-        rival=rival,
-        rival_agreement=None if found.rival_agreements is None else float(np.median(found.rival_agreements)),
-        reasons=tuple(reasons),
+    estimate = _estimate(recorded, fitted, error, typical, reasons, wrist=False)
+    agreements = found.rival_agreements
+    return replace(
+        estimate,
+        rival=None if found.rival is None else full_size(found.rival.camera, recorded.image_size),
+        rival_agreement=None if agreements is None else float(np.median(agreements)),
         notes=notes,
         moved_at=moved,
-        episodes=len(recorded.episodes),
     )
 
 
@@ -208,9 +201,21 @@ def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
     interval = error.kinds[-1].half_interval
     if interval > LARGEST_WRIST_INTERVAL:
         reasons.append(f"the tool's place in the picture is known to {interval:.1f} % of the width only")
+    return _estimate(recorded, fitted, error, typical, reasons, wrist=True)
+
+
+def _estimate(
+    recorded: RecordedView,
+    fitted: FittedCamera,
+    error: CameraError,
+    typical: float,
+    reasons: Sequence[str],
+    *,
+    wrist: bool,
+) -> ViewEstimate:
     return ViewEstimate(
         recorded.view,
-        wrist=True,
+        wrist=wrist,
         verdict="unsure" if reasons else "sure",
         camera=full_size(fitted.camera, recorded.image_size),
         lag_frames=fitted.lag * recorded.every,
