@@ -1,4 +1,4 @@
-"""How often the calibration check names a mistake, how well it measures a camera error, and how well cameras are estimated.
+"""Accuracy of the calibration check (mistakes named, camera errors measured) and of estimated cameras.
 
     python -m benchmarks.calibration mistakes [--splits test,ood_test] [--every 1]
     python -m benchmarks.calibration cameras [--foreign FOLDER] [--sources 8] [--episodes 6] [--seed 0]

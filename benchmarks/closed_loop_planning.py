@@ -81,7 +81,7 @@ class World:
         return World(self.recorder, self.kinematics, self.layout, self.spec)
 
     def ended(self, controls: np.ndarray) -> ExecutedMotion:
-        """What comes of more controls."""
+        """Returns the outcome of more controls."""
         return self.recorder.replay(self.layout, np.concatenate((self.actions, controls)).astype(np.float32))
 
     def execute(self, controls: np.ndarray) -> None:

@@ -27,7 +27,7 @@ from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion
 
 
 def facts_of(recorder: EpisodeRecorder, layout: Layout, motions: list[ExecutedMotion], scene: str) -> BankFacts:
-    """What a planner knows of a bank before anything is predicted."""
+    """Facts about a bank that need no prediction."""
     # Where the commands send the hands: how far fingers really closed tells what they hold.
     tools, gripper = [], []
     for motion in motions:

@@ -1,4 +1,4 @@
-"""How well the measured judge tells success from failure: in true videos, in these through a tokenizer, in predictions.
+"""Accuracy of the measured judge: on true videos, on these through a tokenizer, and on predictions.
 
     python benchmarks/judge_recordings.py RECORDINGS [--tokenizer FOLDER | --rollouts FOLDER | --model FOLDER --level 0.75]
         [--segmenter FOLDER] [--split train validation] [--every 3] [--limit 500]

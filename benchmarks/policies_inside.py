@@ -116,7 +116,7 @@ class Starts:
                 self.recorded.setdefault(row.source, {})[row.bank] = position
 
     def attempts(self, policy: str, number: int, size: tuple[int, int]) -> Attempts:
-        """What a recorded policy did at a start, with pictures of a size (H, W)."""
+        """Rollout of a recorded policy from a start, with pictures of a size (H, W)."""
         position = self.recorded[policy][self.names[number]]
         row = self.episodes.rows[position]
         videos: dict[str, np.ndarray] = {}
@@ -197,7 +197,7 @@ def table(attempts: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def causes(attempts: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """What each cause adds to the rate of success: its mean, and its interval over starts, by kind of policy."""
+    """Contribution of each cause to the rate of success: its mean, and its interval over starts, by kind of policy."""
     found: dict[str, dict[str, Any]] = {}
     for kind, learned in (("learned", True), ("scripted", False)):
         chosen = [a for a in attempts if a["learned"] == learned]

@@ -1,4 +1,4 @@
-"""How good are the videos of another simulator? Any folder of mp4 files, one per episode and view, against recordings.
+"""Evaluate the videos of another simulator: any folder of mp4 files, one per episode and view, against recordings.
 
 The files are named {episode}_{view}.mp4 and show what was recorded, from the first frame on, at the recordings' rate.
 

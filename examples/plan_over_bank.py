@@ -1,4 +1,4 @@
-"""Which of N candidate control sequences should the robot execute? Chosen by their predicted videos.
+"""Choose one of N candidate control sequences by their predicted videos.
 
 Rolls out the first candidates of one shipped bank with the causal model, chooses, and only then reads the outcomes.
 

@@ -1,4 +1,4 @@
-"""What will the cameras see if the robot follows these controls? Predicted from one observation, as a video file.
+"""Predict the camera pictures of a robot that follows given controls, from one observation, as a video file.
 
 Takes the first image of each camera and the controls of a shipped held-out recording, and writes the recorded head view
 beside the predicted one.

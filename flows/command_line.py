@@ -169,7 +169,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     check.set_defaults(run=_calibrate_check)
     estimate = actions.add_parser(
         "estimate",
-        help="estimate the cameras that nobody measured, from the recorded episodes alone",
+        help="estimate uncalibrated cameras from the recorded episodes alone",
         description="Estimate the cameras of a source: of the views that have none, or of those named. Exit status: 0 all"
         " are sure, 1 at least one is not, 2 wrong usage.",
     )

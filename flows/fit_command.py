@@ -30,7 +30,7 @@ def add_fit_command(commands: argparse._SubParsersAction[argparse.ArgumentParser
     fit = commands.add_parser(
         "fit",
         help="from recordings of your own to a simulator that you can drive, in one command",
-        description="Look at the recordings (as `init` does), estimate the cameras that nobody measured, read, filter, train,"
+        description="Look at the recordings (as `init` does), estimate uncalibrated cameras, read, filter, train,"
         " distill, evaluate, report. Interrupted or stopped, the same command continues. It stops, with the next step, where"
         " a person has to decide.",
     )

@@ -1,10 +1,10 @@
-"""`estimate_cameras`: cameras that nobody measured, from the recorded episodes alone."""
+"""`estimate_cameras`: uncalibrated cameras, estimated from the recorded episodes alone."""
 
 from tasks.execution.artifact_task import ArtifactTask
 
 estimate_cameras = ArtifactTask(
     name="estimate_cameras",
-    summary="cameras that nobody measured, from the recorded episodes alone",
+    summary="estimate uncalibrated cameras from the recorded episodes alone",
     version=1,
     function="worldline_core.calibration.estimate.estimate:estimate_cameras",
     config="worldline_core.calibration.estimate.estimate_config:EstimateConfig",

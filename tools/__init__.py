@@ -1,1 +1,1 @@
-"""What maintainers and tests use and no user runs: damaged recordings, labelled clips, importers of descriptions."""
+"""Tools for maintainers and tests: damaged recordings, labelled clips, importers of descriptions."""

@@ -165,7 +165,7 @@ def frozen(clip: Clip, random: np.random.Generator) -> Clip:
     change = np.abs(np.diff(images, axis=0)).mean(axis=(1, 2, 3))
     while True:
         start, stop = _stretch(clip, random, round(0.75 * clip.episode.fps), 24)
-        # Nobody can see a freeze in which nothing would have happened.
+        # A freeze in which nothing would have happened cannot be seen.
         if change[start:stop].sum() > 0.25 * change.sum() * (stop - start) / len(change):
             break
     return _spoil(clip, random, "corrupted", "frozen", (start, stop), lambda part: np.repeat(part[:1], len(part), 0))

@@ -11,7 +11,7 @@ from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails
 
 
 def view_thumbnails(frames_rgb: Iterable[np.ndarray], fps: float = 30.0) -> ViewThumbnails:
-    """Of pictures that do not come from a video.
+    """Thumbnails of pictures that do not come from a video.
 
     Args:
         frames_rgb: uint8 (H, W, 3) each, RGB.

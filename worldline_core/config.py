@@ -28,7 +28,7 @@ CONFIG_ROOT = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACK
 
 
 MAX_VALUES = 200_000
-"""Of one file, with what its aliases repeat: some lines of aliases can stand for more values than memory holds."""
+"""Limit of one file with its aliases expanded: some lines of aliases can expand to more values than memory holds."""
 Side = Annotated[int, Field(ge=1, le=16_384)]
 MAX_PIXELS = 40_000_000
 """One image; 8K video has 33 million pixels."""

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from urllib.parse import quote
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
-"""What moves a terminal's cursor or turns the direction of the text around it. Line breaks and tabs stay."""
+"""Characters that move a terminal's cursor or turn the direction of the text around them. Line breaks and tabs stay."""
 _HALF_PAIR = re.compile("[\ud800-\udfff]")
 _PARAMETERS = (
     r"signature|sig|token|credential|secret|password|passwd|api[-_]?key|access[-_]?key(?:[-_]?id)?|authorization"

@@ -170,12 +170,12 @@ def exit_with_clear_errors(action: Callable[[], object]) -> None:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from error
     except BrokenPipeError as error:
-        if not _nobody_reads():
+        if not _output_closed():
             raise
         raise SystemExit(128 + signal.SIGPIPE) from error
 
 
-def _nobody_reads() -> bool:
+def _output_closed() -> bool:
     """Returns whether the reader of stdout has ended (`worldline ... | head`); then nothing is written at the exit either."""
     watched = select.poll()
     watched.register(sys.stdout.fileno(), 0)

@@ -33,7 +33,7 @@ from worldline_core.store.store import helper_lock
 _DEATHS = frozenset(
     {"BrokenProcessPool", "KilledWorker", "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "OwnerDiedError"}
 )
-"""How the runners say that a worker ended without an answer (concurrent.futures, distributed, ray)."""
+"""Errors of the runners for a worker that ended without an answer (concurrent.futures, distributed, ray)."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -145,7 +145,7 @@ def process_runner(workers: int) -> Any:
     from prefect.task_runners import ProcessPoolTaskRunner
 
     class ProcessRunner(ProcessPoolTaskRunner):
-        """Does not wait for its queue of messages: a worker that was killed while it wrote there holds the lock for ever,
+        """Does not wait for its queue of messages: a worker that was killed while it wrote there never releases the lock,
         and this process would then never end."""
 
         def _stop_message_forwarding(self) -> None:

@@ -12,7 +12,7 @@ from types import FrameType
 from worldline_core.scale.process import end_with_parent
 
 GRACE_SECONDS = 3.0
-"""How long the work may take to say goodbye, to Prefect's server for example, before it is killed."""
+"""Time that the work has to end by itself, for example at Prefect's server, before it is killed."""
 SAVE_SECONDS = 27.0
 """The same where a scheduler asks (SIGTERM): a training saves its state. Less than the 30 s after which torchrun kills."""
 
@@ -85,4 +85,4 @@ def _kill_group(child: int) -> None:
     try:
         os.killpg(child, signal.SIGKILL)
     except ProcessLookupError:
-        return  # nobody is left
+        return  # no process is left

@@ -59,6 +59,6 @@ def test_a_robot_that_nobody_describes_is_a_mistake_in_the_configuration(name: s
         views = {"observation.images.top": "head"}
         return {"kind": "lerobot_v3", "path": "x", "embodiment": embodiment, "angle_unit": "rad", "views": views}
 
-    with pytest.raises(ConfigError, match=rf"(?s)embodiment: .*nobody describes the robot {name} .*{hint}.*none"):
+    with pytest.raises(ConfigError, match=rf"(?s)embodiment: .*no description of the robot {name} .*{hint}.*none"):
         validate(CurateConfig, {"sources": [source(name)]}, where="my.yaml")
     assert validate(CurateConfig, {"sources": [source("none")]}, where="my.yaml").sources[0].label == "x"

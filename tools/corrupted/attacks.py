@@ -69,7 +69,7 @@ _JOINTS = "puppet/joint_position"
 
 
 def _entry(path: Path) -> int:
-    """Where the first entry of the images lies: length (4 bytes), address of its heap (8), number there (4)."""
+    """First entry of the images: length (4 bytes), address of its heap (8), number there (4)."""
     with require_h5py().File(path) as file:
         return file[_IMAGES].id.get_offset()
 

@@ -65,7 +65,7 @@ def corrupt(episode: Episode, conventions: RecordedConventions) -> Episode:
 
 
 def corrupted_image_frames(num_frames: int, conventions: RecordedConventions, view: str) -> slice:
-    """Which images of a healthy episode's view belong to the frames of `corrupt(episode, conventions)`, in order."""
+    """Images of a healthy episode's view that belong to the frames of `corrupt(episode, conventions)`, in order."""
     first, last = frames_with_all(num_frames, _backwards(conventions))
     return slice(first - conventions.image_lag(view), last - conventions.image_lag(view))
 
@@ -96,11 +96,11 @@ def _corrupt_camera(camera: CameraTrack, conventions: RecordedConventions) -> Ca
 
 
 def written_as_wxyz(rotation: np.ndarray) -> np.ndarray:
-    """What rotations (..., 3, 3) become when they are written wxyz and read as xyzw."""
+    """Rotations (..., 3, 3) after they are written wxyz and read as xyzw."""
     return rotation_from_quaternion_xyzw(quaternion_wxyz_from_rotation(rotation))
 
 
 def written_as_moving(rotation: np.ndarray) -> np.ndarray:
-    """What rotations (..., 3, 3) become when their angles are written about moving axes and read about fixed ones."""
+    """Rotations (..., 3, 3) after their angles are written about moving axes and read about fixed ones."""
     moving = -euler_fixed_xyz_from_rotation(np.swapaxes(rotation, -1, -2))
     return rotation_from_euler_fixed_xyz(moving)

@@ -20,7 +20,7 @@ LAYOUTS = (lerobot_v21, droid_annotation, mcap)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one recording: where it ended, and the code that says why ("" for kept)."""
+    """Outcome of one recording: its stage, and the reason code ("" for kept)."""
 
     stage: str
     reason: str
@@ -51,7 +51,7 @@ def outcomes(curated: Path, filtered: Path) -> dict[str, Outcome]:
 
 
 def is_right(label: Label, outcome: Outcome | None) -> bool:
-    """Whether the outcome tells the truth: the stage that has to find it, by a code that names it.
+    """True if the right stage rejects the recording, with a code that names the defect.
 
     A clean recording that Stage II alone leaves out is kept: the synthetic ones have no calibration that fits.
     """

@@ -72,7 +72,7 @@ def missing(path: Path, random: np.random.Generator) -> None:
 
 
 def pipe(path: Path, random: np.random.Generator) -> None:
-    """A named pipe nobody writes to lies in the file's place."""
+    """A named pipe without a writer in the file's place."""
     path.unlink()
     os.mkfifo(path)
 

@@ -87,7 +87,7 @@ _TEXTS: tuple[tuple[str, Callable[[str, np.random.Generator], bytes]], ...] = (
 )
 
 
-"""How many recordings `write` adds for each of `each`."""
+"""Number of recordings that `write` adds for each of `each`."""
 
 
 def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:

@@ -156,7 +156,7 @@ _PICTURES: tuple[tuple[str, PictureDefect, tuple[str, ...]], ...] = (
 )
 
 
-"""How many recordings `write` adds for each of `each`."""
+"""Number of recordings that `write` adds for each of `each`."""
 
 
 @dataclass
@@ -178,7 +178,7 @@ class _Dataset:
         return episode
 
     def list_again(self) -> None:
-        """The last episode a second time; its second id names its source, whose number nobody knows yet."""
+        """The last episode a second time; its second id names its source, whose number is not known yet."""
         last = self.labels[-1]
         self.labels.append(replace(last, episode_id=f"{last.episode_id}{SECOND}"))
         self.rows.append(self.rows[-1])

@@ -106,7 +106,7 @@ FILE_KINDS = (
 )
 
 
-"""How many recordings `write` adds for each of `each`."""
+"""Number of recordings that `write` adds for each of `each`."""
 
 
 def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:

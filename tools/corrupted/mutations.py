@@ -114,7 +114,7 @@ def _somewhere(value: Any, random: np.random.Generator) -> tuple[Any, Any]:
 
 
 def mutations_of(path: Path) -> tuple[Mutation, ...]:
-    """What may be done to a file of this kind."""
+    """Mutations of a file of this kind."""
     blind = (flip_bytes, flip_head, flip_tail, cut, overwrite, repeat)
     if path.suffix == ".json":
         return (change_json, change_json, change_json, flip_bytes, cut)

@@ -1,4 +1,4 @@
-"""Which camera is the head view and which a wrist view: by its name, and by its picture while the arms move."""
+"""Head and wrist views, from a camera's name and from its picture while the arms move."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SIZE, _LEVELS = (64, 48), 8
 
 @dataclass(frozen=True)
 class Seen:
-    """What a camera's picture does while the arms move.
+    """Motion of a camera's picture while the arms move.
 
     Attributes:
         moving, resting: median share of its details that change, in the quarter of the frames with most and with least motion

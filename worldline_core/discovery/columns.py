@@ -1,4 +1,4 @@
-"""Which columns of recorded vectors are whose joints and gripper, by their names and by the usual layouts."""
+"""Columns of recorded vectors that are joints and gripper of each arm, by their names and by the usual layouts."""
 
 from __future__ import annotations
 

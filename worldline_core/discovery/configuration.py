@@ -15,13 +15,13 @@ from worldline_core.errors import ConfigError
 from worldline_core.untrusted_text import visible
 
 BASE_RATE = 8.0
-"""Of the shipped base model: episodes are thinned to the rate nearest to it."""
+"""Rate of the shipped base model: episodes are thinned to the nearest one."""
 _CLIP_FRAMES = 33
 _WIDTH = 120
 
 
 def kept_frame(fps: float, frames: int | None) -> int:
-    """Which frames are kept: every so many, so that the rate is near BASE_RATE and the usual episode as long as a clip."""
+    """Step between kept frames, so that the rate is near BASE_RATE and the usual episode as long as a clip."""
     nearest = max(1, round(fps / BASE_RATE))
     return nearest if frames is None else max(1, min(nearest, frames // _CLIP_FRAMES))
 
@@ -82,7 +82,7 @@ def _rate(found: Discovery) -> list[str]:
 
 
 def _splits(found: Discovery) -> list[str]:
-    """Which episodes are held out, where the preset's shares do not do."""
+    """Splits of few episodes, for which the preset's shares do not work."""
     if not found.trains:
         return ["  # They are not for training: every episode keeps the split above, or test.", "  splits: null"]
     if found.episodes is None or found.episodes > 2:

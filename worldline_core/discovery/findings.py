@@ -1,4 +1,4 @@
-"""What was found out about a folder of recordings, with the evidence, and what has to be asked."""
+"""Findings about a folder of recordings with their evidence, and open questions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which kind of recordings a folder holds."""
+"""The kind of recordings in a folder."""
 
 from __future__ import annotations
 

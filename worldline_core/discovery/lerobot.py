@@ -95,7 +95,7 @@ def _vectors(dataset: LeRobotDataset, prefix: str) -> list[Column]:
     """Columns of the feature of this name, where its names or its width say whose they are; else of those that begin with it."""
 
     def width(name: str) -> int:
-        """Of a vector of floats; 0 for all else."""
+        """Size of a vector of floats; 0 for all else."""
         feature = dataset.features[name]
         match feature.get("dtype"), feature.get("shape"):
             case (("float32" | "float64"), [int(size)]) if 0 < size <= MAX_COLUMNS:
@@ -151,7 +151,7 @@ def _views(found: Discovery, sample: Sample, arms: list[ArmColumns]) -> None:
 
 
 def _watched(sample: Sample, camera: str, arms: list[ArmColumns]) -> Seen | None:
-    """What the camera's picture does while the arms of one episode move; None where it cannot be read."""
+    """Motion of the camera's picture while the arms of one episode move; None where it cannot be read."""
     if not arms:
         return None
     dataset = sample.dataset

@@ -19,7 +19,7 @@ from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 
 _OLD_SIGNS, _OLD_ZEROS = (1, -1, 1, 1, 1), (0, 90, 90, 0, 0)
-"""Of an SO-100 before LeRobot's change of calibration (PR 777): its arm stretched out is where shoulder and elbow are 0."""
+"""An SO-100 before LeRobot's change of calibration (PR 777): shoulder and elbow are 0 with the arm stretched out."""
 _FULL_TURN, _RIGHT_ANGLE = "wrist_roll", 1.5708
 _MOVES_RAD = 0.02
 _ALIKE = 0.5
@@ -27,7 +27,7 @@ _ALIKE = 0.5
 
 
 class ArmDescription:
-    """What is said about the arms of one dataset: `describe` fills the discovery's source and evidence."""
+    """Description of the arms of one dataset: `describe` fills the discovery's source and evidence."""
 
     def __init__(self, found: Discovery, sample: Sample, robot_type: str, arms: list[ArmColumns]) -> None:
         self._found = found
@@ -249,7 +249,7 @@ def _like_the_state(sample: Sample, column: Column, arm: ArmColumns, measured: d
 
 
 def _makers(robot_type: str, lerobot: bool, column: Column, *, fingers: bool) -> tuple[bool | None, str]:
-    """Whether high readings are open, where the makers of the recording's robot state it."""
+    """True if high readings are open, where the makers of the recording's robot state it."""
     said = "".join(words_of(robot_type))
     if lerobot:
         return True, "LeRobot's grippers are 0 closed .. 100 open"

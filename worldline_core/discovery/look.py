@@ -40,7 +40,7 @@ _LOOKS: dict[str, Callable[[AnyPath], Discovery]] = {
 
 
 def discover(folder: Path) -> Discovery:
-    """What the folder holds, with evidence for everything that was found out.
+    """The folder's recordings, with evidence for every value.
 
     Raises: DataError where nothing in it is known, or nothing can be read; UnavailableError without h5py for HDF5 files.
     """

@@ -126,7 +126,7 @@ def _rate(video: AnyPath | None) -> float | None:
 
 
 def _first[T](files: Sequence[AnyPath], read: Callable[[AnyPath], T]) -> T:
-    """What the first readable file holds."""
+    """Contents of the first readable file."""
     fault: RejectedInputError | None = None
     for path in files[:50]:
         try:

@@ -1,4 +1,4 @@
-"""Which described robot has these arms: by the dataset's name for it, by joint names, counts and limits."""
+"""The described robot that has these arms: by the dataset's name for it, by joint names, counts and limits."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def match_robot(
         ]
         fitting.append((score, Match(name, "; ".join(reasons), signs, fits)))
     if not fitting and stranger:
-        return None, [], f"nobody describes a {named([robot_type])}"
+        return None, [], f"there is no description of a {named([robot_type])}"
     if not fitting:
         count = "+".join(str(len(arm.joints)) for arm in arms)
         return (
@@ -154,7 +154,7 @@ def joint_order(arm: ArmColumns, robot: Embodiment, number: int) -> list[int]:
 def _within_limits(
     described: Sequence[Arm], arms: Sequence[ArmColumns], angles: Sequence[np.ndarray]
 ) -> tuple[bool, dict[str, tuple[int, ...]]]:
-    """Whether the joints are within the limits, and signs by arm where some have to be turned for that."""
+    """True if the joints are within the limits; and signs by arm where some have to be inverted for that."""
     signs: dict[str, tuple[int, ...]] = {}
     for robot, arm, values in zip(described, arms, angles, strict=True):
         low, high = np.array(robot.limits).T

@@ -12,7 +12,7 @@ from worldline_core.data.sources.lerobot import AngleUnit
 MOST_RADIANS = 6.5
 """A joint that turns once, and a little; larger readings are degrees or a share of the range."""
 _TICK_DEG = 360 / 4095
-"""Of the motors of LeRobot's own arms: readings in degrees are whole multiples, those of a range are of other steps."""
+"""Step of the motors of LeRobot's own arms: readings in degrees are multiples of it, those of a range are not."""
 _ON_GRID, _OFF_GRID = 0.97, 0.6
 RANGES: tuple[tuple[float, float], ...] = (
     (0, 1),
@@ -142,7 +142,7 @@ def gripper_readings(
 
 
 def _squeeze(state: np.ndarray, command: np.ndarray, span: float) -> tuple[bool, float] | None:
-    """Whether grippers close towards low readings: a gripper that holds a thing cannot follow its command."""
+    """True where grippers close towards low readings: a gripper that holds a thing cannot follow its command."""
     resting = np.abs(np.gradient(state)) < 0.01 * span
     gap = (command - state)[resting] / span
     far = gap[np.abs(gap) > 0.08]

@@ -44,7 +44,7 @@ def side_of(words: Sequence[str]) -> Side | None:
 
 
 def part_of(words: Sequence[str]) -> Part:
-    """What a column of these words measures; bodies count as joints until sides are known (`belongs_to_body`)."""
+    """Quantity that a column of these words measures; bodies count as joints until sides are known (`belongs_to_body`)."""
     found = set(words)
     if found & _FINGERS and found & {"hand", "finger", *_FINGERS - {"index", "ring", "middle"}}:
         return "finger"

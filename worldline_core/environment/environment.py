@@ -107,7 +107,7 @@ class RunningEpisode:
     facts: dict[str, float] = field(default_factory=dict)
 
     def info(self) -> dict[str, Any]:
-        """What Gymnasium calls info."""
+        """Gymnasium's info."""
         known = {"is_success": self.success, "episode_id": self.start.episode_id, "task": self.start.instruction}
         return known | ({"score": self.score, "task_state": dict(self.facts)} if self.facts else {})
 
@@ -355,7 +355,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         return self.spaces.observed(pictures, np.stack([episode.state for episode in episodes]))
 
     def infos(self) -> list[dict[str, Any]]:
-        """What is known of each episode now."""
+        """Current facts of each episode."""
         return [episode.info() for episode in self._episodes]
 
     def _infos(self) -> dict[str, Any]:

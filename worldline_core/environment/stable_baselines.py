@@ -73,7 +73,7 @@ class WorldLineVecEnv(VecEnv):
         return self.envs.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """What Gymnasium's ``call`` knows of each environment, or else an attribute that all share."""
+        """An attribute of each environment by Gymnasium's ``call``, or else one that all share."""
         if hasattr(self.envs, attr_name):
             return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
         found = self.envs.call(attr_name)

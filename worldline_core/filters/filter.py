@@ -107,7 +107,7 @@ DETECTORS: tuple[Detector, ...] = (
 
 
 _NUMBERS = (DataError, ValueError, ArithmeticError, cv2.error)
-"""What a judgement of unusual numbers ends with (numpy's LinAlgError is a ValueError); another error is a mistake in the code."""
+"""Errors that judging unusual numbers may raise (numpy's LinAlgError is a ValueError); another one is a mistake in the code."""
 
 
 def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:

@@ -26,7 +26,7 @@ QUATERNION_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's length from 1 that is taken for rounding and normalised away."""
 EMBODIMENT_ROOT = CONFIG_ROOT / "embodiments"
 OWN_ROOT = Path("configs", "embodiments")
-"""Of the working folder."""
+"""Embodiments of the working folder."""
 LIMIT_TOLERANCE_RAD = 0.02
 """Joint positions may pass their limits by this much."""
 

@@ -144,7 +144,7 @@ def distortion_from_ros(model: str, coefficients: Sequence[float]) -> Distortion
 
 
 def is_fisheye(model: str) -> bool:
-    """Whether a ROS `distortion_model` is a fisheye's, for which zeros are no pinhole."""
+    """True if a ROS `distortion_model` is a fisheye's, for which zeros are no pinhole."""
     return _ROS_MODELS.get(model.strip().lower()) == "fisheye"
 
 

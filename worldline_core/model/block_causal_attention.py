@@ -137,7 +137,7 @@ class CacheWindow:
 
     @property
     def joined(self) -> list[tuple[Tensor, Tensor]]:
-        """What `read` remembers of the layers, as large again as the blocks: every Euler step of a block reads it."""
+        """Bytes that `read` keeps of the layers, as many again as the blocks take: every Euler step of a block reads them."""
         return list(self._rotated.values())
 
     def read(self, layer: int, by: Rotation) -> tuple[Tensor, Tensor] | None:

@@ -71,7 +71,7 @@ def load_model_tokenizer(
 
 
 def _tokenizer_folders(folder: Path) -> Iterator[Path]:
-    """Where a checkpoint's tokenizer may be, likeliest first: with its files, named by its manifest or by those of its
+    """Candidate folders of a checkpoint's tokenizer, likeliest first: with its files, named by its manifest or by those of its
     inputs, or anywhere in its store.
     """
     yield from (folder / "tokenizer", folder.parent / "tokenizer")

@@ -13,7 +13,7 @@ from worldline_core.pages.page import MINUS, NARROW_SPACE, number, percent, rend
 WIDTH, HEIGHT = 480, 270
 LEFT, RIGHT, TOP, BOTTOM = 62, 14, 12, 30
 VALUE_WIDTH, ROW_HEIGHT = 70, 46
-"""Of a row of an interval chart: room for the number at its right end, and its height."""
+"""Room for the number at the right end of an interval chart's row, and the row's height."""
 
 
 @dataclass(frozen=True)

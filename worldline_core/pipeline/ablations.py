@@ -120,7 +120,7 @@ def _with_row(config: PipelineConfig) -> PipelineConfig:
 
 
 _CHOICE = ("splits", "banks", "embodiments", "max_episodes_per_embodiment", "num_frames", "batch_size")
-"""Which candidates, and how much of them: as another model's rollout of the banks has it."""
+"""Candidates and their lengths, as in another model's rollout of the banks."""
 
 
 def _settings(run: RolloutRun) -> RolloutConfig:

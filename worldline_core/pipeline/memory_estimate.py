@@ -212,7 +212,7 @@ class Estimate:
 
 
 class Work(NamedTuple):
-    """What a device computes again and again: ``run``, by the step's number, returns the loss where something is trained.
+    """A device's repeated work: ``run``, by the step's number, returns the loss where something is trained.
 
     Attributes:
         models, scores: world models that are trained, the first alone averaged, and those that are not.
@@ -439,7 +439,7 @@ def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sou
 def stage_rows(
     config: AnyStage, model: WorldModelConfig, source: Sources, devices: int, memory: float
 ) -> Iterator[tuple[Estimate, str]]:
-    """What the trainings of one step take, and the setting with which each would fit; empty where it does."""
+    """Memory of the trainings of one step, and the setting with which each would fit; empty where it does."""
     for one in trainings(config, model, source):
         if isinstance(config, DistillConfig) and one.title.endswith("regression"):
             shard = trajectory_shard(config, model, source)

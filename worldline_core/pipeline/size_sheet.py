@@ -58,7 +58,7 @@ class SizeSheet(StrictModel):
         return Sources.of(self.folder("tokenizer"), self.folder("teacher"), reading.image_size)
 
     def rows(self) -> Iterator[tuple[Estimate, str]]:
-        """What every training takes, in the order of a run, and the setting with which it would fit."""
+        """Memory of every training in the order of a run, and the setting with which it would fit."""
         generation = self.model.model_copy(update={"towers": "generation"})
         stages = (
             (self.config.train_stage1, self.model),

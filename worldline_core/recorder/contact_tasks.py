@@ -27,7 +27,7 @@ POLE_HALF = (0.013, 0.065, 0.0)
 
 @dataclass(frozen=True)
 class Ended:
-    """Where everything is in each frame of an executed plan; ``data`` is at the last one."""
+    """Places of everything in each frame of an executed plan; ``data`` is at the last one."""
 
     scene: SceneModel
     data: Any
@@ -333,7 +333,7 @@ def _detour_judge(ended: Ended, layout: Layout) -> Judged:
 
 # peg and stack: two goals of one colour, of which one takes the block; of about equal area, so that the colour's middle tells nothing.
 def _two_goals(robot: Robot, arm: int, random: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Where the block stands, and the two goals; the one that takes it comes first."""
+    """Place of the block and of the two goals; the one that takes it comes first."""
     low, high = robot.reach_y if len(robot.arms) == 2 else (-0.0875, 0.0875)
     middle = robot.side(arm) * (low + high) / 2
     goals = [np.array([random.uniform(0.435, 0.45), middle + side * random.uniform(0.064, 0.070)]) for side in (-1, 1)]

@@ -27,7 +27,7 @@ _STREAM = {"wide": 0, "unseen": 1}
 
 @dataclass(frozen=True)
 class HeadCamera:
-    """Where a head camera stands, across the table, so that arms do not hide what they work on: degrees aside from facing the robot,
+    """Place of a head camera, across the table, so that arms do not hide what they work on: degrees aside from facing the robot,
     degrees of elevation, and distance to the workspace [m]."""
 
     aside_deg: Range
@@ -120,7 +120,7 @@ TRAIN_SCENES, TEST_SCENES = tuple(SCENES)[:12], tuple(SCENES)[12:]
 
 @dataclass(frozen=True)
 class LookRange:
-    """What looks are drawn from.
+    """Ranges that looks are drawn from.
 
     Attributes:
         table: choices of (saturation, value), each a pair of ranges.

@@ -141,7 +141,7 @@ class RecordConfig(StrictModel):
     misses: float = Field(default=0.0, ge=0, le=1)
 
     def policy(self, family: str, entropy: tuple[int, ...]) -> ScriptedPolicy | None:
-        """How one episode is carried out; None: as planned."""
+        """Change to the execution of one episode; None: as planned."""
         miss = miss_of(self.misses, family, entropy)
         return miss or (self.variety and self.variety.draw(np.random.default_rng((*entropy, 2))))
 

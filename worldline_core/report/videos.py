@@ -39,7 +39,7 @@ GROUP_CAPTIONS = {
     "run": "This run: what its own training reached",
 }
 MOST_COLUMNS, IN_A_LINE = 6, 3
-"""Of one video: a phone shows three columns beside each other."""
+"""Width of one video: a phone shows three columns beside each other."""
 MOMENTS = 6
 
 

@@ -253,7 +253,7 @@ class _ListedFile(BaseModel):
 
 
 class _Manifest(BaseModel):
-    """What readers of a manifest rely on."""
+    """Fields of a manifest that readers rely on."""
 
     model_config = ConfigDict(strict=True)
     digest: str

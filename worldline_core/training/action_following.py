@@ -51,7 +51,7 @@ STARTS = 4
 
 
 class Predictor(Protocol):
-    """What predicts a batch's latents from its first frames: the objective that trains the model."""
+    """Predicts a batch's latents from its first frames: the objective that trains the model."""
 
     def predict(
         self, batch: Batch, action_maps: Float[Tensor, "b v a t #h #w"], noise: Float[Tensor, "b v c t h w"]

@@ -35,7 +35,7 @@ from worldline_core.training.processes import processes
 logger = logging.getLogger(__name__)
 
 START_METHOD = "spawn"
-"""How loader processes start: forked ones would share the threads and CUDA state of this one."""
+"""Start method of loader processes: forked ones would share the threads and CUDA state of this one."""
 _ATTEMPTS = 20
 MOST_SKIPPED = 100
 """Unreadable clips of one process after which a run that skips them stops."""

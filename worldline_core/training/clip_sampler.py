@@ -17,7 +17,7 @@ from worldline_core.training.clip_config import JOINT, PRIMARY, SUBSET, ClipSamp
 from worldline_core.training.processes import ALONE, BatchPlan
 
 LEAST_SHARE = 0.01
-"""Of the steps; a set of views that fewer of them show is not known."""
+"""Least share of the steps that show a set of views which the model is said to know."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class ClipSampler:
         return ClipBatch(clips, views, primary=name == PRIMARY), kind
 
     def _drawn(self, kind: _Kind) -> dict[str, float]:
-        """What steps on clips of a kind may train on, with its weight."""
+        """Choices of views for steps on clips of a kind, with their weights."""
         here = (PRIMARY, *((JOINT, SUBSET, *kind.views) if kind.views else ()))
         return {name: weight * (name in here) for name, weight in self._view_weights.items()}
 

@@ -94,7 +94,7 @@ class Stage:
 
     @property
     def vector_share(self) -> float:
-        """How often a view of a clip takes the control vector instead of the map: never, of a model of maps alone."""
+        """Share of views that take the control vector instead of the map; 0 for a model of maps alone."""
         config = self.config
         return config.vector_share if isinstance(config, Stage2Config) and config.native_size is not None else 0.0
 

@@ -188,7 +188,7 @@ class TrainingStates:
         self.average = average
         self.optimizer = optimizer
         self.seconds = 0.0
-        """How long the last save took."""
+        """Duration of the last save."""
         self._writing: Future[float] | None = None
         self._rank, world_size = processes()
         self._alone = world_size == 1

@@ -1,1 +1,1 @@
-"""Cameras that nobody measured, estimated from recorded episodes alone."""
+"""Cameras estimated from recorded episodes alone."""

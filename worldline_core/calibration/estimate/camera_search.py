@@ -1,4 +1,4 @@
-"""Where a still camera may stand, searched for over the whole sphere: starts for the estimate, none is assumed.
+"""Search for a still camera over the whole sphere: starts for the estimate, without a guess by the user.
 
 A camera is scored by how well the robot's projected motion agrees with the measured flow: both are vector maps on the
 picture's cells, one for each step, and the score is the cosine between them over all cells and steps. A wrong camera lets
@@ -25,7 +25,7 @@ FOCALS = (0.65, 1.0, 1.6)
 SCALES = (0.7, 1.0, 1.4)
 """Distances beside the one at which the predicted motion is as large in the picture as the measured one."""
 STEPS, POINTS = 80, 32
-"""Of all: the steps with most motion, and points that are spread over what moves."""
+"""Numbers of steps, those with most motion, and of points, spread over what moves."""
 ROUGH_STEPS = 40
 BLURS = (1.5, 1.5, 1.1, 0.8, 0.8)
 """Blur of the maps in cells, one round of random changes after another."""

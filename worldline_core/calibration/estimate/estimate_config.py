@@ -25,7 +25,7 @@ class EstimateConfig(StrictModel):
 
     @classmethod
     def of(cls, curate: CurateConfig, description_paths: Mapping[str, str]) -> Self | None:
-        """Of recordings that have a robot with a description and could name a calibration file, but do not; else None."""
+        """Settings for recordings whose robot is described and whose source names no calibration file; None for all others."""
         source = curate.sources[0]
         robot = getattr(source, "embodiment", NO_EMBODIMENT)
         if len(curate.sources) > 1 or getattr(source, "calibration", "") is not None or robot == NO_EMBODIMENT:

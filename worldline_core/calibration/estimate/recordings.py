@@ -1,4 +1,4 @@
-"""What the estimate needs of a set of episodes: thinned grey pictures of one view, and where the robot was meanwhile."""
+"""Input of the estimate: thinned grey pictures of one view of a set of episodes, and the robot's motion meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How sure an estimated camera is: intervals, and every reason not to believe it.
+"""Intervals and verdict of an estimated camera, with every reason to doubt it.
 
 A camera is sure only if it agrees with episodes that it was not fitted to, better than every rival, two halves of the
 episodes give it alone, and its interval in the picture is small. In doubt it is unsure, with the reason.
@@ -51,9 +51,9 @@ LARGEST_WRIST_HALVES_APART, LARGEST_WRIST_INTERVAL = 0.05, 10.0
 """The same of wrist cameras, which are nearer to what they see."""
 FEWEST_EPISODES = 3
 LEAST_TRAVEL_M, LEAST_CHANGE = 2.5, 0.02
-"""Of the busiest tool over all episodes together: of less, a mirrored camera can look right."""
+"""Travel of the busiest tool over all episodes together; after less, a mirrored camera can look right."""
 MOVED_SHARE, MOVED_DEVIATIONS = 2.5, 5.0
-"""Of the width, and standard deviations, by which the robot is displaced in the picture from one episode on."""
+"""Displacement of the robot in the picture from one episode on: shares of the width, standard deviations."""
 
 Verdict = Literal["sure", "unsure"]
 
@@ -260,7 +260,7 @@ def _moved_at(recorded: RecordedView, found: StillCamera, views: Sequence[StillV
 
 
 def _clearest_split(values: np.ndarray, least: float) -> int | None:
-    """Where a series (n, k) steps by `least` and by many standard deviations of what remains; None where it does not."""
+    """Index at which a series (n, k) steps by `least` and by many standard deviations of what remains; None where it does not."""
     best, at = 0.0, None
     for k in range(2, len(values) - 1):
         before, after = values[:k], values[k:]

@@ -155,7 +155,7 @@ class RecordedConventions(StrictModel):
 
 
 def image_frames(num_frames: int, conventions: RecordedConventions, view: str) -> slice:
-    """Which recorded images of a view belong to the frames of the repaired episode, in order."""
+    """Indices of a view's recorded images that belong to the frames of the repaired episode, in order."""
     first, last = frames_with_all(num_frames, conventions)
     lag = conventions.image_lag(view)
     return slice(first + lag, last + lag)

@@ -20,7 +20,7 @@ from worldline_core.geometry.cameras import ImageTransform
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 NO_EMBODIMENT = "none"
-"""Embodiment of recordings whose robot nobody describes: there is no forward kinematics of their joints."""
+"""Embodiment of recordings whose robot has no description: there is no forward kinematics of their joints."""
 TaskFamily = Literal["grasp", "lift", "place", "state_change", "unknown"]
 Outcome = Literal["success", "failure", "unknown"]
 Split = Literal["train", "validation", "test", "ood_test", "bank"]

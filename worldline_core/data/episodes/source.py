@@ -171,12 +171,12 @@ def _described(name: str) -> str:
                 check_embodiment_name(name)
         except ConfigError as error:
             next_step = f"{error.next_step}; or embodiment: {NO_EMBODIMENT}, which takes the recordings for Stage I"
-            raise ValueError(f"nobody describes the robot {name} ({error.expected}); {next_step}") from error
+            raise ValueError(f"there is no description of the robot {name} ({error.expected}); {next_step}") from error
     return name
 
 
 EmbodimentName = Annotated[str, AfterValidator(_described)]
-"""Field type of a configuration: a robot by its name or by the path of its file, or `none` where nobody describes it."""
+"""Field type of a configuration: a robot by its name or by the path of its file, or `none` without a description."""
 
 
 class ForeignSourceConfig(SourceConfigBase):

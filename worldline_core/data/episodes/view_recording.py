@@ -280,7 +280,7 @@ def _packets_from(clip: VideoClip, container: InputContainer, stream: VideoStrea
 
 
 def _select(clip: VideoClip, container: InputContainer, stream: VideoStream) -> tuple[int, np.ndarray] | None:
-    """Which packets of a file make up a clip: the number of the first one, counted in the order of decoding from
+    """Packets of a file that make up a clip: the number of the first one, counted in the order of decoding from
     `start_time`'s key frame (the others follow without a gap), and for each its frame's place in the order of presentation.
     """
     times: list[int] = []

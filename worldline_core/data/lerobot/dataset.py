@@ -4,7 +4,7 @@ v3.0 (LeRobot 0.6): meta/info.json, meta/stats.json, meta/tasks.parquet, meta/ep
 data/chunk-*/file-*.parquet (one row group per episode), videos/<key>/chunk-*/file-*.mp4 (episodes joined; each
 episode's place is given by from_timestamp and to_timestamp in the episodes table).
 v2.1: meta/info.json, meta/tasks.jsonl, meta/episodes.jsonl, and per episode one Parquet file and one mp4 per view; v2.0
-differs in its statistics alone, which nobody reads here.
+differs in its statistics alone, which are not read here.
 """
 
 from __future__ import annotations

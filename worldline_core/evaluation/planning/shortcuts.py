@@ -34,7 +34,7 @@ Scores = Float[np.ndarray, " c"]
 
 @dataclass(frozen=True)
 class Reach:
-    """Where the hands go, and what they could reach for.
+    """Paths of the hands, and the things that they could reach for.
 
     Attributes:
         tools: (c, n, a, 3); gripper: (c, n, a), 0 closed .. 1 open.
@@ -49,7 +49,7 @@ class Reach:
 
 @dataclass(frozen=True)
 class BankFacts:
-    """What is known of the candidates of a bank before anything is predicted.
+    """Facts about the candidates of a bank that need no prediction.
 
     Attributes:
         commands: (c, n, j), in the units of the recording.
@@ -139,7 +139,7 @@ def nearest_hand(facts: BankFacts) -> Scores | None:
 
 
 def hand_rule(facts: BankFacts) -> Scores | None:
-    """What somebody would write by hand, with the places of the named things in the first picture.
+    """A hand-written heuristic, given the places of the named things in the first picture.
 
     A thing to be pressed: come down on it. To be closed or pushed: get far beyond its first place. Else close the gripper at the thing
     (both, where the instruction says so); then open it at the destination, or where none is named, hold on and rise.
@@ -162,7 +162,7 @@ def _press(tools: Float[np.ndarray, "c n a 3"], thing: np.ndarray) -> Scores:
 
 
 def _push(tools: Float[np.ndarray, "c n a 3"], thing: np.ndarray) -> Scores:
-    """How far beyond the thing's first place a tool gets, along the way that the candidates come to it."""
+    """Distance that a tool gets beyond the thing's first place, along the candidates' way of approach."""
     away = tools - thing
     distances = np.linalg.norm(away, axis=-1)
     each = np.arange(len(tools))
