@@ -28,7 +28,7 @@ from benchmarks.harness import RECORDINGS, command_line, print_table, timed
 from tools.thumbnails import view_thumbnails
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.curation.near_duplicates import find_near_duplicates
+from worldline_core.data.curation.rules import find_near_duplicates
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.fingerprint import Fingerprint, fingerprint

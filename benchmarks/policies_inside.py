@@ -34,7 +34,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment.environment import WorldLineVectorEnv, measured_success
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.evaluation.paired import paired_tests
-from worldline_core.evaluation.policy.agreement import policy_agreement
+from worldline_core.evaluation.policy.evaluate_policy import policy_agreement
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.model.tokenizers import resize_frame
 

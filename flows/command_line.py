@@ -253,9 +253,9 @@ def _task(arguments: argparse.Namespace) -> None:
 def _init(arguments: argparse.Namespace) -> None:
 
     from worldline_core.discovery.configuration import write_config
+    from worldline_core.discovery.findings import as_json, as_text
     from worldline_core.discovery.hub import fetch_sample, hub_id
     from worldline_core.discovery.look import discover
-    from worldline_core.discovery.report import as_json, as_text
 
     hub = None if (name := hub_id(arguments.recordings)) is None else fetch_sample(name)
     found = discover(Path(arguments.recordings) if hub is None else hub.folder)

@@ -73,7 +73,7 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
 def _card(arguments: argparse.Namespace) -> None:
     if (arguments.artifact / "checkpoint.json").is_file():
         from worldline_core.model.model_card import write_model_card
-        from worldline_core.report.model_figures import evaluations_of_store, measurements
+        from worldline_core.report.results import evaluations_of_store, measurements
 
         evaluations = arguments.evaluation or evaluations_of_store(arguments.artifacts)
         output = arguments.output or arguments.artifact / "run" / "card"

@@ -88,7 +88,7 @@ def check_card(config: PipelineConfig, file: Path, memory: str) -> None:
     from worldline_core.config import validate
     from worldline_core.errors import ConfigError
     from worldline_core.model.tokenizers import require_device
-    from worldline_core.pipeline.size_sheet import SizeSheet
+    from worldline_core.pipeline.memory_estimate import SizeSheet
 
     require_device("cuda")
     card = {"config": config, "project": Path.cwd(), "devices": 1, "memory": memory}
@@ -107,8 +107,8 @@ def fit_command(arguments: argparse.Namespace) -> None:
     recordings = Path(arguments.recordings) if (name := hub_id(arguments.recordings)) is None else fetch_dataset(name)
     if not arguments.config.exists():
         from worldline_core.discovery.configuration import write_config
+        from worldline_core.discovery.findings import as_text
         from worldline_core.discovery.look import discover
-        from worldline_core.discovery.report import as_text
 
         found = discover(recordings)
         write_config(found, arguments.config, arguments.recordings)

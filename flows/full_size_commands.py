@@ -31,8 +31,8 @@ def _plan(arguments: argparse.Namespace) -> None:
     preset = arguments.preset or (None if arguments.config else "demo")
     if preset is not None:
         preset_path(preset)  # answers before torch is imported
+    from worldline_core.pipeline.memory_estimate import SizeSheet
     from worldline_core.pipeline.pipeline_config import PipelineConfig
-    from worldline_core.pipeline.size_sheet import SizeSheet
 
     config = PipelineConfig.load(preset, arguments.config, arguments.overrides)
     machine = {"devices": arguments.gpus, "memory": arguments.memory}

@@ -14,8 +14,7 @@ from benchmarks import hidden_cameras
 from flows.command_line import main
 from worldline_core.calibration.camera_errors import moved_camera
 from worldline_core.calibration.estimate import estimate
-from worldline_core.calibration.estimate.camera_file import camera_file
-from worldline_core.calibration.estimate.estimate import estimate_views
+from worldline_core.calibration.estimate.estimate import camera_file, estimate_views
 from worldline_core.calibration.estimate.recordings import recorded_views
 from worldline_core.calibration.estimate.refine import fit_still
 from worldline_core.calibration.estimate.still_camera import agreement, tools_apart

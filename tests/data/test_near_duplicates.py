@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from worldline_core.data.curation.near_duplicates import MIN_MOTION_OVERLAP, find_near_duplicates
+from worldline_core.data.curation.rules import MIN_MOTION_OVERLAP, find_near_duplicates
 from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint
 
 VIEWS = ("head", "left_wrist")

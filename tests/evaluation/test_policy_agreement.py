@@ -6,8 +6,7 @@ from scipy import stats
 
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
-from worldline_core.evaluation.policy.agreement import mmrv, pearson, policy_agreement, spearman
-from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
+from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy, mmrv, pearson, policy_agreement, spearman
 from worldline_core.report.results import policy_ranking
 
 OPTIONS = {"resamples": 400, "seed": 1}

@@ -20,9 +20,16 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.geometry.tensor_transforms import is_rigid
 from worldline_core.recorder.attempts import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
-from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.looks import SCENES
-from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, record
+from worldline_core.recorder.record import (
+    DEFECTS,
+    DEFECTS_FILE,
+    RecordConfig,
+    RecordGroup,
+    _record_job,
+    plan_jobs,
+    record,
+)
 from worldline_core.recorder.scene import sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, Job, Recording
 

@@ -14,8 +14,8 @@ from tests.report.conftest import write_planning_scores, write_video_scores  # p
 from worldline_core.errors import CheckpointError
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.model_card import model_facts
-from worldline_core.report.model_figures import evaluations_of_store, measurements
 from worldline_core.report.report import ReportConfig, report
+from worldline_core.report.results import evaluations_of_store, measurements
 from worldline_core.store.artifact_files import read_manifest, write_manifest
 
 KEY = "0123456789abcdef"

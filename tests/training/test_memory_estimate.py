@@ -22,6 +22,7 @@ from worldline_core.pipeline import memory_estimate
 from worldline_core.pipeline.memory_estimate import (
     Estimate,
     Held,
+    SizeSheet,
     Sources,
     Training,
     Work,
@@ -30,7 +31,6 @@ from worldline_core.pipeline.memory_estimate import (
     trainings,
 )
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.size_sheet import SizeSheet
 from worldline_core.store.store import ArtifactStore
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.trainer import ParameterGroup, train

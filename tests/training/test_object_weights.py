@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from worldline_core.errors import DataError
+from worldline_core.training.clip_loader import ObjectWeights, object_weights
 from worldline_core.training.clip_sampler import Clip
-from worldline_core.training.object_weights import ObjectWeights, object_weights
 
 
 class Masks:

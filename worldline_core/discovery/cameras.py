@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from worldline_core.discovery.columns import Side, side_of, words_of
 from worldline_core.discovery.findings import named
-from worldline_core.discovery.words import Side, side_of, words_of
 
 _WRIST = {"wrist", "hand", "gripper", "inhand", "handeye", "eih", "eye", "palm", "endeffector", "ee"}
 _HEAD = (

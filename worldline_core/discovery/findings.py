@@ -1,12 +1,17 @@
-"""Findings about a folder of recordings with their evidence, and open questions."""
+"""Findings about a folder of recordings with their evidence, open questions, and the stated licence; as text and as JSON."""
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
-from worldline_core.untrusted_text import cut, visible
+from worldline_core.config import QUESTIONS
+from worldline_core.data.guards.source_paths import AnyPath, is_file, regular_file
+from worldline_core.untrusted_text import cut, printable, shown, visible
 
 Place = tuple[str, ...]
 """Keys that lead to a value within the source: ("arms", "right", "state", "gripper")."""
@@ -80,3 +85,86 @@ def named(texts: Sequence[object], most: int = 8) -> str:
     """A list of texts of others within a sentence."""
     shown = [cut(visible(str(text)).replace("\n", " "), 60) for text in texts[:most]]
     return ", ".join(shown) + (f" and {len(texts) - most} more" if len(texts) > most else "")
+
+
+_WIDTH = 110
+
+
+def as_json(found: Discovery, written: Path, commands: Sequence[str]) -> dict[str, Any]:
+    """Everything that was found, what is to be filled in, the file and what to run next."""
+    return {
+        "kind": found.kind,
+        "about": found.about,
+        "file": str(written),
+        "source": _plain(found.source),
+        "views": found.views,
+        "fps": found.fps,
+        "state_size": found.state_size,
+        "cameras": found.cameras,
+        "trains": found.trains,
+        "evidence": [{"key": list(place), "sentence": text} for place, text in found.evidence.items()],
+        "todo": {each.name: each.text for each in found.questions},
+        "notes": found.notes,
+        "next": list(commands),
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Question):
+        return f"{QUESTIONS}.{value.name}"
+    if isinstance(value, dict):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def as_text(found: Discovery, written: Path, commands: Sequence[str]) -> str:
+    """The same for a terminal."""
+    lines = [shown(found.about)]
+    for place, text in found.evidence.items():
+        lines += _wrapped(f"{'.'.join(place)}: {shown(text)}", "  ")
+    for note in found.notes:
+        lines += _wrapped(f"note: {shown(note)}", "")
+    lines.append(f"written: {written}")
+    if found.questions:
+        lines.append(f"to be filled in there, under `{QUESTIONS}`:")
+        for each in found.questions:
+            lines += _wrapped(f"{each.name}: {shown(each.text)}", "  ")
+    return "\n".join([*lines, *(f"next: {command}" for command in commands)])
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    return textwrap.wrap(
+        " ".join(text.split()), _WIDTH, initial_indent=indent, subsequent_indent=f"{indent}    ", break_on_hyphens=False
+    )
+
+
+_SPDX = {
+    "apache-2.0": "Apache-2.0", "mit": "MIT", "bsd-3-clause": "BSD-3-Clause", "cc0-1.0": "CC0-1.0", "cc-by-4.0": "CC-BY-4.0",
+    "cc-by-sa-4.0": "CC-BY-SA-4.0", "cc-by-nc-4.0": "CC-BY-NC-4.0", "cc-by-nc-sa-4.0": "CC-BY-NC-SA-4.0",
+}  # fmt: skip
+_TEXTS = {
+    "apache license": "Apache-2.0", "mit license": "MIT", "attribution-noncommercial-sharealike 4.0": "CC-BY-NC-SA-4.0",
+    "attribution-noncommercial 4.0": "CC-BY-NC-4.0", "attribution-sharealike 4.0": "CC-BY-SA-4.0",
+    "attribution 4.0": "CC-BY-4.0", "cc0 1.0": "CC0-1.0",
+}  # fmt: skip
+_IN_CARD = re.compile(r"^licen[cs]e:[ \t]*[\"']?([\w.+-]{2,40})[\"']?[ \t]*$", re.MULTILINE)
+_MOST_BYTES = 1 << 16
+
+
+def stated_licence(root: AnyPath) -> tuple[str, str] | None:
+    """(identifier, evidence) by the head of the dataset's card, or by the text of its licence file; None where nothing says."""
+    for name in ("README.md", "LICENSE", "LICENSE.md", "LICENSE.txt", "LICENCE"):
+        if not is_file(root / name):
+            continue
+        with regular_file(root / name).open("rb") as file:
+            text = file.read(_MOST_BYTES).decode("utf-8", errors="replace")
+        if name == "README.md":
+            head = text.split("---", 2)[1] if text.startswith("---") and text.count("---") > 1 else ""
+            if (found := _IN_CARD.search(head)) is not None:
+                said = found[1]
+                return _SPDX.get(said.lower(), cut(printable(visible(said)), 40)), "README.md says so"
+            continue
+        first = " ".join(text[:400].lower().split())
+        if (known := next((spdx for words, spdx in _TEXTS.items() if words in first), None)) is not None:
+            return known, f"by the text of {name}"
+    return None

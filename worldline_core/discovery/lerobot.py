@@ -20,12 +20,9 @@ from worldline_core.data.sources.calibration_file import read_calibration
 from worldline_core.data.sources.lerobot import flat_names
 from worldline_core.data.video.clip import decode_frames
 from worldline_core.discovery.cameras import Seen, name_views, watch
-from worldline_core.discovery.columns import ArmColumns, Column, columns_of, find_arms
-from worldline_core.discovery.findings import Discovery, named
-from worldline_core.discovery.lerobot_arms import ArmDescription
-from worldline_core.discovery.lerobot_sample import EPISODES, Sample, sample_of
-from worldline_core.discovery.licence import stated_licence
-from worldline_core.discovery.words import Side
+from worldline_core.discovery.columns import ArmColumns, Column, Side, columns_of, find_arms
+from worldline_core.discovery.findings import Discovery, named, stated_licence
+from worldline_core.discovery.lerobot_arms import EPISODES, ArmDescription, Sample, sample_of
 from worldline_core.errors import DataError
 
 _PICTURES, _PICTURE_S = 48, 0.25

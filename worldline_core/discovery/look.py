@@ -1,14 +1,14 @@
-"""Look at a folder of recordings, in a process with limits: the files are those of others."""
+"""Kind of a folder of recordings, and a look at it in a process with limits: the files are those of others."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
-from worldline_core.data.guards.source_paths import AnyPath
-from worldline_core.discovery.findings import Discovery
-from worldline_core.discovery.kinds import recognise
+from worldline_core.data.guards.source_paths import AnyPath, find_files, relative_name
+from worldline_core.discovery.findings import Discovery, named
 from worldline_core.discovery.lerobot import discover_collection, discover_lerobot
 from worldline_core.discovery.mcap import discover_mcap
 from worldline_core.discovery.recordings import (
@@ -22,6 +22,80 @@ from worldline_core.discovery.recordings import (
     discover_unitree,
     discover_videos,
 )
+from worldline_core.errors import DataError
+
+_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".zst")
+_LOOKED_FOR = (
+    "meta/info.json (LeRobot), *.mcap, proprio_stats.h5 or sample_*/demo_* bundles (AgiBot), trajectory.hdf5 (RoboMIND),"
+    " episode*.hdf5 or transitions/*/*.h5 (Unitree, ALOHA, RoboTwin), annotation/*/*.json (DROID), index.parquet (EpisodeSet), or *.mp4"
+)
+_MOST_FILES = 200_000
+
+
+def recognise(root: AnyPath) -> tuple[str, AnyPath]:
+    """The kind of a folder, and the folder that holds it: one level may lie around it.
+
+    Raises: DataError where there is nothing, or nothing that any reader knows; the message says what there is.
+    """
+    if not root.exists():
+        raise DataError("No such folder", where=root, next_step="give a folder, or ORG/NAME of the Hugging Face hub")
+    if not root.is_dir():
+        if root.suffix == ".mcap":
+            return "mcap", root
+        raise DataError(
+            "Not a folder",
+            where=root,
+            expected="a folder of recordings, or one MCAP file",
+            next_step=f"give the folder: {root.parent}",
+        )
+    files = find_files(root, "*")
+    if isinstance(root, Path):
+        files = [path for path in files[:_MOST_FILES] if path.is_file()]
+    names = [relative_name(path, root) for path in files]
+    texts = [str(name) for name in names]
+
+    def any_named(*wanted: str) -> bool:
+        return any(name.name in wanted for name in names)
+
+    if "index.parquet" in texts and "manifest.json" in texts:
+        return "episode_set", root
+    if found := [name for name in names if name.name == "info.json" and name.parent.name == "meta"]:
+        inner = [root.joinpath(*name.parts[:-2]) for name in found]
+        return ("lerobot", inner[0]) if len(inner) == 1 else ("lerobot_collection", root)
+    if any(name.suffix in (".mcap", ".db3", ".bag") or name.name.endswith(".mcap.zst") for name in names):
+        return "mcap", root
+    if any(name.parts[0] in ("proprio_stats", "observations") and len(name.parts) >= 4 for name in names):
+        return "agibot_world", root
+    if any_named("proprio_stats.h5", "action.npy"):
+        return "enerverse_ac", root
+    if any_named("actions.npy", "state_joints_0.npy"):
+        return "agibot_gesim", root
+    if any_named("trajectory.hdf5"):
+        return "robomind", root
+    if any(name.suffix == ".h5" and name.parts[:-2] == ("transitions",) for name in names):
+        return "unitree_h5", root
+    if any(name.suffix == ".hdf5" and name.name.startswith("episode_") for name in names):
+        return "unitree_h5", root
+    if any(name.suffix == ".hdf5" and name.name.startswith("episode") and name.parent.name == "data" for name in names):
+        return "robotwin", root
+    if any(name.suffix == ".json" and len(name.parts) >= 3 and name.parts[-3] == "annotation" for name in names):
+        return "droid_annotation", root
+    if any(name.suffix.lower() == ".mp4" for name in names):
+        return "video_folder", root
+    archives = [text for text in texts if text.endswith(_ARCHIVES)]
+    counted = Counter(name.suffix or "no suffix" for name in names)
+    raise DataError(
+        "Nothing here that a reader knows" if texts else "The folder is empty",
+        where=root,
+        expected=_LOOKED_FOR,
+        got=", ".join(f"{count} {suffix}" for suffix, count in counted.most_common(6)) + f": {named(texts, 3)}"
+        if texts
+        else "no files",
+        next_step=f"unpack {named(archives, 2)}"
+        if archives
+        else "give the folder of one dataset (docs/sources.md lists what is read)",
+    )
+
 
 _LOOKS: dict[str, Callable[[AnyPath], Discovery]] = {
     "episode_set": discover_episode_set,

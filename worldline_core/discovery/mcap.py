@@ -15,12 +15,10 @@ from worldline_core.data.mcap.exported import exported_episode_id, read_exported
 from worldline_core.data.mcap.file import McapFile, Stream
 from worldline_core.data.mcap.messages import IMAGE_KINDS, SCHEMA_KINDS, Kind
 from worldline_core.discovery.cameras import name_views
-from worldline_core.discovery.columns import ArmColumns, Column, find_arms
-from worldline_core.discovery.findings import Discovery, Question, named
-from worldline_core.discovery.licence import stated_licence
+from worldline_core.discovery.columns import ArmColumns, Column, Side, find_arms, words_of
+from worldline_core.discovery.findings import Discovery, Question, named, stated_licence
 from worldline_core.discovery.robots import joint_order, match_robot
 from worldline_core.discovery.units import gripper_readings
-from worldline_core.discovery.words import Side, words_of
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 

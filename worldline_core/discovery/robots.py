@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldline_core.discovery.columns import ArmColumns
+from worldline_core.discovery.columns import ArmColumns, plain, words_of
 from worldline_core.discovery.findings import named
-from worldline_core.discovery.words import plain, words_of
 from worldline_core.geometry.embodiment import Arm, Embodiment, embodiment_names, load_embodiment
 
 LEROBOT_ARMS = ("so100", "so101", "so", "koch", "omx", "lekiwi")

@@ -16,7 +16,7 @@ from worldline_core.model.model_card import DESCRIPTIONS, model_card, model_fact
 from worldline_core.pages.charts import Series, line_chart
 from worldline_core.pages.page import Table, code, render, words
 from worldline_core.report.context import ReportContext, Section
-from worldline_core.report.model_figures import measurements
+from worldline_core.report.results import measurements
 from worldline_core.store.artifact_files import JsonObject, read_json, read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.training_state import PROBE_LOG

@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.guards.orientation import UPRIGHT
+from worldline_core.data.guards.plain_files import UPRIGHT
 from worldline_core.data.guards.source_paths import find_files, relative_name
 from worldline_core.data.video.clip import VideoClip, frame_times, read_clip, shown_size, video_size
 from worldline_core.errors import DataError

@@ -20,11 +20,10 @@ from worldline_core.model.world_model_config import ActionContract, NativeVector
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training.action_following import ActionFollowing, Predictor
 from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput
-from worldline_core.training.clip_loader import Batch, ClipLoader
+from worldline_core.training.clip_loader import Batch, ClipLoader, ObjectWeights
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 from worldline_core.training.clip_source import ClipSource, open_source, training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.processes import BatchPlan, gathered, join_processes, place_model, processes
 from worldline_core.training.trainer import ParameterGroup, Probe, TrainingResult, batch_plan, held_out_losses, train
 from worldline_core.training.training_config import (

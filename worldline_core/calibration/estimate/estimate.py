@@ -21,7 +21,6 @@ from worldline_core.calibration.check import (
     episodes_of_config,
     episodes_of_sources,
 )
-from worldline_core.calibration.estimate.camera_file import camera_file
 from worldline_core.calibration.estimate.estimate_config import CAMERAS, EstimateConfig
 from worldline_core.calibration.estimate.estimate_report import as_json, headline, page, view_picture
 from worldline_core.calibration.estimate.recordings import RecordedView, recorded_views
@@ -178,3 +177,22 @@ def _pictures(
         name = f"{safe_stem(estimate.view)}.jpg"
         write_bytes_atomic(folder / name, jpeg_bytes(view_picture(estimate, shown, kinematics)))
         yield estimate.view, name
+
+
+DIGITS = 6
+
+
+def camera_file(estimates: Iterable[ViewEstimate]) -> dict[str, Any]:
+    """Content of the file: the views whose camera is sure."""
+    return {"views": {each.view: _entry(each) for each in estimates if each.verdict == "sure"}}
+
+
+def _entry(estimate: ViewEstimate) -> dict[str, Any]:
+    camera = estimate.camera
+    if camera is None:
+        raise ValueError(f"a sure estimate without a camera: {estimate.view}")
+    pose = camera.T_base_camera[0].round(DIGITS).tolist()
+    common = {"width": camera.width, "height": camera.height, "K": camera.K.round(DIGITS).tolist()}
+    if estimate.wrist:
+        return common | {"T_tool_camera": pose}
+    return common | {"maps": "camera_to_base", "axes": "opencv", "T": pose}

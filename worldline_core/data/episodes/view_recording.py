@@ -23,8 +23,7 @@ from av.packet import Packet
 from av.video.stream import VideoStream
 
 from worldline_core.data.episodes.lerobot_writer import EpisodeVideo, ImageSampler
-from worldline_core.data.guards.orientation import UPRIGHT
-from worldline_core.data.guards.plain_files import expect_layout
+from worldline_core.data.guards.plain_files import UPRIGHT, expect_layout
 from worldline_core.data.guards.reader_process import still_reading
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.video.clip import (

@@ -33,8 +33,7 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 
 from worldline_core.data.episodes.episode import CameraTrack
-from worldline_core.data.guards.orientation import UPRIGHT, turned_view
-from worldline_core.data.guards.plain_files import decode_image
+from worldline_core.data.guards.plain_files import UPRIGHT, decode_image, turned_view
 from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.data.mcap.messages import (

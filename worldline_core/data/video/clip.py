@@ -22,7 +22,7 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 
-from worldline_core.data.guards.orientation import UPRIGHT, turned_view
+from worldline_core.data.guards.plain_files import UPRIGHT, turned_view
 from worldline_core.data.guards.rejection import (
     MAX_PIXELS,
     RejectedInputError,

@@ -13,7 +13,7 @@ import numpy as np
 from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange, Interpolation, VideoReformatter
 
-from worldline_core.data.guards.orientation import QUARTER_TURNS, UPRIGHT, orientation_of, upright
+from worldline_core.data.guards.plain_files import QUARTER_TURNS, UPRIGHT, orientation_of, upright
 from worldline_core.data.guards.rejection import RejectedInputError
 
 _LUMA_FIRST = frozenset(
