@@ -37,7 +37,7 @@ def _plan(arguments: argparse.Namespace) -> None:
     config = PipelineConfig.load(preset, arguments.config, arguments.overrides)
     machine = {"devices": arguments.gpus, "memory": arguments.memory}
     sheet = validate(SizeSheet, {"config": config, "project": Path.cwd(), **machine}, where="worldline plan")
-    rows = list(sheet.rows())
+    rows = sheet.rows()
     print(sheet.as_text(rows))
     raise SystemExit(0 if not any(setting for _, setting in rows) else 1)
 

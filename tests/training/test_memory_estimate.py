@@ -168,7 +168,7 @@ def sheet(preset: str, *overrides: str, devices: int = 1) -> SizeSheet:
 @pytest.mark.slow
 def test_distillation_from_frames_holds_what_encodes_them() -> None:
     frames = "distill.input={kind: frames, image_size: [64, 96]}"
-    cached, online = (list(sheet("smoke", *more).rows())[2:] for more in ((), (frames,)))
+    cached, online = (sheet("smoke", *more).rows()[2:] for more in ((), (frames,)))
     assert [row.title for row, _ in cached] == [
         "distill: teacher forcing", "distill: trajectories (a shard of 2 clips)", "distill: trajectory regression",
         "distill: distribution matching",
@@ -208,7 +208,7 @@ def test_what_does_not_fit_ends_with_status_one_and_the_setting(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     need = Estimate("stage II", 7, {"weights": 3e9, "activations": 1e9})
-    monkeypatch.setattr(SizeSheet, "rows", lambda _: iter([(need, "shorter clips")]))
+    monkeypatch.setattr(SizeSheet, "rows", lambda _: [(need, "shorter clips")])
     with pytest.raises(SystemExit, match="1"):
         main(["plan", "--preset", "smoke", "--gpus", "1", "--memory", "4GB"])
     printed = capsys.readouterr().out

@@ -7,13 +7,15 @@ tokenizers and Stage III do.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from pydantic import ByteSize, Field
@@ -37,6 +39,7 @@ from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig, cosmos3_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.progress import Progress
 from worldline_core.shipped import project_path
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
@@ -84,8 +87,9 @@ class _Tracker(TorchDispatchMode):
         if func is torch.ops.aten._local_scalar_dense.default:
             return True if args[0].dtype == torch.bool else 0.5 if args[0].is_floating_point() else 1
         result = func(*args, **(kwargs or {}))
-        given = {storage._cdata for storage in _storages((args, kwargs))}
-        for storage in _storages(result):
+        unknown = [storage for storage in _storages(result) if storage._cdata not in self._followed]
+        given = {storage._cdata for storage in _storages((args, kwargs))} if unknown else set[int]()
+        for storage in unknown:
             if storage._cdata not in given and storage._cdata not in self._followed:  # else it is no new memory
                 self._followed.add(storage._cdata)
                 self.live += storage.nbytes()
@@ -184,9 +188,25 @@ class Sources:
         count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
         return self.batch(model, count * trainer.batch_size, views, max(clips.lengths), text)
 
-    def video(self, batch: Batch, views: int = 1) -> Tensor:
+    def video(self, frames: int, views: int = 1) -> Tensor:
         """Pictures of a clip; clips are encoded one by one, and so are their views."""
-        return torch.empty(views, 3, batch.clips[0].num_frames, *self.image_size)
+        return torch.empty(views, 3, frames, *self.image_size)
+
+    @cache  # noqa: B019 - a few sources a process
+    def encoding(self, frames: int, precision: Literal["bf16", "fp32"]) -> float:
+        """Most bytes held while the tokenizer encodes a clip."""
+        trainer = TrainerConfig(steps=1, precision=precision)
+        with FakeTensorMode(), torch.no_grad(), autocast(trainer):
+            tokenizer = tokenizer_outline(self.tokenizer)
+            return traced(lambda: tokenizer.encode(self.video(frames))).forward
+
+    @cache  # noqa: B019 - a few sources a process
+    def teaching(self, frames: int, views: int, precision: Literal["bf16", "fp32"]) -> float:
+        """Most bytes held while the relational teacher looks at a clip."""
+        trainer = TrainerConfig(steps=1, precision=precision)
+        with FakeTensorMode(), torch.no_grad(), autocast(trainer):
+            features = teacher_outline(self.teacher)[1]
+            return traced(lambda: features(self.video(frames, views))).forward
 
 
 @dataclass(frozen=True)
@@ -212,6 +232,10 @@ class Estimate:
 
     def describe_parts(self) -> str:
         return ", ".join(f"{name} {gigabytes(size)}" for name, size in self.parts.items())
+
+
+Row = tuple[Estimate, str]
+"""A line of the sheet: what a training takes, and the setting with which it would fit; empty where it does."""
 
 
 class Work(NamedTuple):
@@ -241,6 +265,7 @@ class Training:
         work: a step with a model of some depth, made without values.
         trained: whether a parameter gets gradients, by its name.
         turns: numbers of steps, one of each kind that the training takes (distribution matching alternates).
+        before: most bytes held before each step's forward pass, where clips are encoded or a teacher looks at them.
     """
 
     title: str
@@ -249,6 +274,7 @@ class Training:
     work: Callable[[WorldModel], Work]
     trained: Callable[[str], bool] = lambda _: True
     turns: Sequence[int] = (0,)
+    before: Sequence[Callable[[], float]] = ()
 
     def outline(self, layers: int) -> Work:
         """The step of a model of so many layers; call it within a FakeTensorMode."""
@@ -276,7 +302,8 @@ class Training:
 
                 return traced(loss, [value for one in work.models for value in one.parameters()])
 
-        return max(max(extrapolated(partial(trace, step), self.model.num_layers)) for step in self.turns)
+        steps = (max(extrapolated(partial(trace, step), self.model.num_layers)) for step in self.turns)
+        return max([*steps, *(held() for held in self.before)])
 
     def estimate(self, devices: int) -> Estimate:
         """Memory on each of so many devices that share the training."""
@@ -317,15 +344,14 @@ class Training:
 
 
 class _Similarities(ClipSimilarities):
-    """Similarity matrices of a relational teacher that looks at ``video``."""
+    """Similarity matrices of a relational teacher."""
 
-    def __init__(self, config: RelationalConfig, features: Callable[[Tensor], Tensor], video: Tensor) -> None:
-        self.config, self.features, self.video = config, features, video
+    def __init__(self, config: RelationalConfig) -> None:
+        self.config = config
 
     def similarities(
         self, clips: Sequence[Clip], views: Sequence[str], grid: tuple[int, int, int], frames: Tensor | None = None
     ) -> SimilarityMatrices:
-        self.features(self.video)
         shape = bins, rows, columns = common_shape(self.config, grid)
         count, cells = len(clips), rows * columns
         cross = torch.empty(count, len(views) - 1, bins, cells, cells)
@@ -334,13 +360,17 @@ class _Similarities(ClipSimilarities):
 
 def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> list[Training]:
     """The trainings of one step, in their order."""
+    frames = isinstance(config.input, FrameInput)
     if isinstance(config, DistillConfig):
-        model = model.model_copy(update={"towers": "generation"})
+        model, first = model.model_copy(update={"towers": "generation"}), config.teacher_forcing.trainer
         return [
             Training(
                 f"distill: {part.replace('_', ' ')}", getattr(config, part).trainer, model,
                 partial(_distillation, part, config, source),
                 turns=(0, CYCLE - 1) if part == "distribution_matching" else (0,),
+                before=[partial(source.encoding, max(config.first_clips.lengths), first.precision)]
+                if part == "teacher_forcing" and frames
+                else [],
             )
             for part in ("teacher_forcing", "trajectory_regression", "distribution_matching")
         ]  # fmt: skip
@@ -350,24 +380,26 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
     def work(network: WorldModel) -> Work:
         batch, term = source.largest(model, config.trainer, config.clips, model.views, text), None
         tokenizer, whole = tokenizer_outline(source.tokenizer), dict[str, nn.Module]()
-        if isinstance(config.input, FrameInput):
+        if frames:
             whole["tokenizer"] = tokenizer
         if relational is not None:
-            whole["teacher"], features = teacher_outline(source.teacher)
-            seen = _Similarities(relational, features, source.video(batch, len(batch.views)))
-            term = RelationalTerm(relational, seen, network.config.num_layers)
+            whole["teacher"] = teacher_outline(source.teacher)[0]
+            term = RelationalTerm(relational, _Similarities(relational), network.config.num_layers)
             term.layer = max(1, network.config.num_layers // 2)  # it makes no difference which: all are held
         objective = FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
 
         def run(step: int) -> Tensor:
-            if "tokenizer" in whole:
-                tokenizer.encode(source.video(batch))
             return objective.loss(batch, torch.Generator(), step)[0]
 
         return Work(run, (network,), whole=whole)
 
     title = {"base": "base", "stage1": "stage I"}[config.kind] if isinstance(config, Stage1Config) else "stage II"
-    return [Training(title, config.trainer, model, work, is_trained if text else lambda _: True)]
+    longest, precision, before = max(config.clips.lengths), config.trainer.precision, list[Callable[[], float]]()
+    if frames:
+        before.append(partial(source.encoding, longest, precision))
+    if relational is not None:
+        before.append(partial(source.teaching, longest, len(model.views), precision))
+    return [Training(title, config.trainer, model, work, is_trained if text else lambda _: True, before=before)]
 
 
 def _distillation(part: str, config: DistillConfig, source: Sources, network: WorldModel) -> Work:
@@ -404,8 +436,6 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
             objective = DistributionMatchingObjective(network, real, fake, config, distance)
 
     def run(step: int) -> Tensor:
-        if "encoder" in whole and part == "teacher_forcing":
-            tokenizer.encode(source.video(batch))
         return objective.loss(batch, torch.Generator(), step)[0]
 
     return Work(run, models, scores, whole)
@@ -425,8 +455,6 @@ def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sou
             teacher = WorldModel(model.model_copy(update={"num_layers": layers})).requires_grad_(False)
 
             def run() -> None:
-                for tokenizer in encoder.values():
-                    tokenizer.encode(source.video(batch))
                 teacher_trajectories(
                     teacher, batch.latents, maps_of(batch), torch.empty_like(batch.latents), views=batch.views,
                     spec=config.spec, substeps=(1,) * config.spec.steps,
@@ -434,20 +462,32 @@ def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sou
 
             return traced(run)
 
-    held, count = extrapolated(trace, model.num_layers), parameter_counts(model)[0]
-    parts = {"weights": 4 * count, **whole_bytes(encoder), "activations": held.forward}
+    held, count = extrapolated(trace, model.num_layers).forward, parameter_counts(model)[0]
+    if encoder:
+        held = max(held, source.encoding(batch.clips[0].num_frames, trainer.precision))
+    parts = {"weights": 4 * count, **whole_bytes(encoder), "activations": held}
     return Estimate(f"distill: trajectories (a shard of {clips} clips)", count, parts)
 
 
 def stage_rows(
     config: AnyStage, model: WorldModelConfig, source: Sources, devices: int, memory: float
-) -> Iterator[tuple[Estimate, str]]:
-    """Memory of the trainings of one step, and the setting with which each would fit; empty where it does."""
+) -> list[Callable[[], Row]]:
+    """Functions that estimate the trainings of one step, and the setting with which each would fit; empty where it does."""
+    rows: list[Callable[[], Row]] = []
     for one in trainings(config, model, source):
         if isinstance(config, DistillConfig) and one.title.endswith("regression"):
-            shard = trajectory_shard(config, model, source)
-            yield shard, "" if shard.fits(memory) else "fewer clips_per_shard"
-        yield one.estimate(devices), one.fitting_setting(devices, memory)
+            rows.append(partial(_shard_row, config, model, source, memory))
+        rows.append(partial(_training_row, one, devices, memory))
+    return rows
+
+
+def _training_row(training: Training, devices: int, memory: float) -> Row:
+    return training.estimate(devices), training.fitting_setting(devices, memory)
+
+
+def _shard_row(config: DistillConfig, model: WorldModelConfig, source: Sources, memory: float) -> Row:
+    shard = trajectory_shard(config, model, source)
+    return shard, "" if shard.fits(memory) else "fewer clips_per_shard"
 
 
 def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
@@ -468,7 +508,8 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
         model = read_checkpoint_info(Path(start)).config
     if isinstance(config, Stage2Config):
         model = stage2_model_config(config, model)
-    for need, setting in stage_rows(config, model, source, int(os.environ.get("WORLD_SIZE", "1")), memory):
+    for row in stage_rows(config, model, source, int(os.environ.get("WORLD_SIZE", "1")), memory):
+        need, setting = row()
         if setting:
             raise ConfigError(
                 "This training does not fit the device's memory.",
@@ -535,19 +576,34 @@ class SizeSheet(StrictModel):
         reading = stage.input if isinstance(stage.input, FrameInput) else self.config.encode_latents
         return Sources.of(self.folder("tokenizer"), self.folder("teacher"), reading.image_size)
 
-    def rows(self) -> Iterator[tuple[Estimate, str]]:
-        """Memory of every training in the order of a run, and the setting with which it would fit."""
+    def _rows(self) -> list[Callable[[], Row]]:
         generation = self.model.model_copy(update={"towers": "generation"})
         stages = (
             (self.config.train_stage1, self.model),
             (self.config.train_stage2, generation),
             (self.config.distill, generation),
         )
-        for stage, model in stages:
-            if stage is not None:
-                yield from stage_rows(stage, model, self.source(stage), self.devices, self.memory)
+        given = ((stage, model) for stage, model in stages if stage is not None)
+        return [row for s, m in given for row in stage_rows(s, m, self.source(s), self.devices, self.memory)]
 
-    def as_text(self, rows: Iterable[tuple[Estimate, str]]) -> str:
+    def row(self, number: int) -> Row:
+        """One line of the sheet."""
+        return self._rows()[number]()
+
+    def rows(self) -> list[Row]:
+        """Memory of every training in the order of a run, and the setting with which it would fit; two are traced at a time."""
+        numbers = range(len(self._rows()))
+        with (
+            Progress("worldline plan", len(numbers), "training") as progress,
+            ProcessPoolExecutor(2, multiprocessing.get_context("fork")) as pool,
+        ):
+            # The last ones take longest.
+            waiting = {number: pool.submit(self.row, number) for number in reversed(numbers)}
+            for _ in as_completed(waiting.values()):
+                progress.advance()
+        return [waiting[number].result() for number in numbers]
+
+    def as_text(self, rows: Iterable[Row]) -> str:
         """The sheet as a Markdown table; the last column names the setting with which a stage would fit."""
         lines = [
             f"{self.devices} devices of {gigabytes(self.memory)} GB ({USABLE:.0%} of it usable)\n",
