@@ -269,7 +269,7 @@ def _init(arguments: argparse.Namespace) -> None:
 
 
 def _record(arguments: argparse.Namespace) -> None:
-    from worldline_core.recorder.recording import load_recording, record_into
+    from worldline_core.recorder.attempts import load_recording, record_into
 
     print(record_into(load_recording(arguments.config, arguments.overrides), arguments.output))
 

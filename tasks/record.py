@@ -6,8 +6,8 @@ record = ArtifactTask(
     name="record",
     summary="simulated robots, scenes and scripted controllers into an EpisodeSet",
     version=1,
-    function="worldline_core.recorder.recording:record_artifact",
-    config="worldline_core.recorder.recording:RecordingConfig",
+    function="worldline_core.recorder.attempts:record_artifact",
+    config="worldline_core.recorder.attempts:RecordingConfig",
 )
 
 if __name__ == "__main__":

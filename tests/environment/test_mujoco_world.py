@@ -27,9 +27,8 @@ from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.tokenizers import resize_frame
-from worldline_core.recorder.attempts import BankGrid, RecordPoliciesConfig
+from worldline_core.recorder.attempts import BankGrid, RecordingConfig, RecordPoliciesConfig, record_into
 from worldline_core.recorder.controllers import ScriptedPolicy
-from worldline_core.recorder.recording import RecordingConfig, record_into
 from worldline_core.rollout.recorded_starts import RecordedStarts
 
 ROBOT = "ur5e_silver"

@@ -22,7 +22,7 @@ from worldline_core.evaluation.evaluation_config import (
 )
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.model.world_model_config import ImportBackboneConfig
-from worldline_core.recorder.recording import RecordingConfig
+from worldline_core.recorder.attempts import RecordingConfig
 from worldline_core.report.context import ReportConfig
 from worldline_core.rollout.rollout_config import ImportRolloutsConfig, RolloutConfig
 from worldline_core.scale.mapping import RunnerConfig

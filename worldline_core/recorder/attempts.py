@@ -7,30 +7,40 @@ from the index; with them, where there are any, the facts measured in contact ta
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self, cast
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import Field, model_validator
 
-from worldline_core.config import StrictModel
+from worldline_core.config import StrictModel, load_config, read_yaml
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.progress import Progress
 from worldline_core.recorder.bodies import Robot
 from worldline_core.recorder.controllers import ScriptedPolicy, miss_of
 from worldline_core.recorder.looks import SCENE_PATTERN, look_of
-from worldline_core.recorder.record import SPLIT_STREAM, Embodiment, check_recorded, run_in_processes
+from worldline_core.recorder.record import (
+    SPLIT_STREAM,
+    Embodiment,
+    RecordConfig,
+    check_recorded,
+    record,
+    run_in_processes,
+)
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene import CONTACT, Family, Layout
 from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, draw_layout
-from worldline_core.store.atomic import atomic_path
+from worldline_core.store.artifact_files import MANIFEST_NAME, write_manifest
+from worldline_core.store.atomic import atomic_path, remove_unfinished
+from worldline_core.store.store import describe_environment, folder_lock
 
 SEALED_FILE = "sealed_outcomes.parquet"
 PolicyName = Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,39}$")]
@@ -260,3 +270,60 @@ def record_policies(config: RecordPoliciesConfig, output: Path) -> dict[str, Any
             cell["successes"] += outcome == "success"
     counts = {name: table[name] for name in config.policies}
     return {"starts": len(recorded), "episodes": sum(len(found) for _, found in recorded), "policies": counts}
+
+
+class RecordingConfig(StrictModel):
+    """One of the three kinds of recordings."""
+
+    episodes: RecordConfig | None = None
+    banks: RecordBanksConfig | None = None
+    policies: RecordPoliciesConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if sum(config is not None for config in (self.episodes, self.banks, self.policies)) != 1:
+            raise ValueError("give episodes, banks or policies, one of the three")
+        return self
+
+    def record(self, output: Path) -> dict[str, Any]:
+        """Record into ``output``, or continue there; returns counts. Raises as `record`, `record_banks`, `record_policies`."""
+        if self.episodes is not None:
+            return record(self.episodes, output)
+        if self.policies is not None:
+            return record_policies(self.policies, output)
+        return record_banks(cast("RecordBanksConfig", self.banks), output)
+
+
+def load_recording(path: Path, overrides: Sequence[str] = ()) -> RecordingConfig:
+    """Read a file of one recording; its keys say of which kind."""
+    keys = read_yaml(path).keys()
+    if "policies" in keys:
+        return RecordingConfig(policies=load_config(RecordPoliciesConfig, path=path, overrides=overrides))
+    if "banks" in keys:
+        return RecordingConfig(banks=load_config(RecordBanksConfig, path=path, overrides=overrides))
+    return RecordingConfig(episodes=load_config(RecordConfig, path=path, overrides=overrides))
+
+
+def record_artifact(config: RecordingConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    """The step `record`."""
+    del inputs
+    return config.record(output)
+
+
+def record_into(config: RecordingConfig, output: Path) -> dict[str, Any]:
+    """Record into a folder outside of a store, or continue a killed recording there; the manifest is written last.
+
+    Raises:
+        DataError: the folder holds a finished recording.
+        ArtifactError: another command is recording into it.
+    """
+    with folder_lock(output):
+        if (output / MANIFEST_NAME).exists():
+            raise DataError("Folder already holds a recording", where=output, next_step="record into a new folder")
+        remove_unfinished(output)
+        counts = config.record(output)
+        environment = describe_environment()
+        environment["packages"]["mujoco"] = importlib.metadata.version("mujoco")
+        facts = {"step": "record", "version": 1, "config": config.model_dump(mode="json"), "metrics": counts}
+        write_manifest(output, {**facts, "environment": environment})
+        return counts
