@@ -118,7 +118,7 @@ def _construct_mapping(loader: _StrictLoader, node: yaml.MappingNode, deep: bool
 
 _StrictLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
 # Of the words that YAML 1.1 takes for booleans only true and false: `off`, `yes` and `no` name choices here.
-# Numbers have no colons: 1:30 is 90 in YAML 1.1 (base 60), and somebody's mistake.
+# Numbers have no colons: 1:30 is 90 in YAML 1.1 (base 60), which is a mistake here.
 _BOOLEAN = "tag:yaml.org,2002:bool"
 _BASE_60 = re.compile(r"[-+]?[0-9][0-9_]*(?::[0-5]?[0-9])+(?:\.[0-9_]*)?")
 
@@ -362,7 +362,7 @@ def load_config[Model: BaseModel](
 
 
 TODO = "TODO"
-"""Beginning of a value that somebody has to fill in; the rest says what with."""
+"""Beginning of a value that the user has to fill in; the rest says how."""
 QUESTIONS = "todo"
 """Section with such values, to which the others refer as YAML aliases: `fps: &fps TODO ...`, and `fps: *fps` where it belongs."""
 

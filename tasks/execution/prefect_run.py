@@ -2,7 +2,7 @@
 
 Prefect's cache key is the store's own key (step, version, config, digests of the inputs), so Prefect shows a task as cached
 exactly when the store has the artifact. Where an artifact is and what its digest is, the store alone decides: a record of
-Prefect's that says anything else (its artifact was deleted, the store was moved, somebody wrote it) is not read but
+Prefect's that says anything else (its artifact was deleted, the store was moved, it was edited) is not read but
 written anew.
 """
 

@@ -199,7 +199,7 @@ def _missing(extra: str, error: ImportError) -> UnavailableError:
 @contextmanager
 def shared_server() -> Iterator[None]:
     """Processes that are started within speak to the server of this one, a temporary one too: each would start its own, which
-    knows none of the runs that it is told of."""
+    does not know their runs."""
     from prefect.client.orchestration import get_client
     from prefect.settings import PREFECT_API_URL, temporary_settings
 

@@ -232,7 +232,7 @@ class Reading:
         cameras: by view, K at the size of the grey images.
         gripper, gripper_command: (n, a) openings, None where the state has no gripper columns.
         points, radii: (n, p, 3), (p,) on the arms [m].
-        capsules: points and radii along the links' capsules, whose thin fingers are told apart.
+        capsules: points and radii along the links' capsules, whose thin fingers are separate.
         shape: what the points are of: the links' surfaces, capsules along the links, or hands where only tools are known.
         first: recorded frame that is frame 0.
     """

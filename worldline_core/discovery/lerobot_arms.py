@@ -31,7 +31,7 @@ class Sample:
     listed: int
 
     def values(self, columns: Sequence[Column]) -> np.ndarray:
-        """(N, len(columns)) float64 of all sampled episodes; the median stands for what is no number."""
+        """(N, len(columns)) float64 of all sampled episodes; missing numbers are replaced by the median."""
         values = np.concatenate([self.episode(index, columns) for index in self.indices])
         usual = [np.median(column[np.isfinite(column)]) if np.isfinite(column).any() else 0.0 for column in values.T]
         return np.where(np.isfinite(values), values, usual)

@@ -1,4 +1,4 @@
-"""Recordings of other layouts than LeRobot's and MCAP: what their readers have to be told."""
+"""Recordings of other layouts than LeRobot's and MCAP: the settings of their readers."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The distill step: Stage II in, a few-step block-causal simulator out (paper, Stage III).
 
 Folder: `teacher_forcing/` and `trajectory_regression/` hold the intermediate checkpoints (kind "causal"; both can be
-rolled out), every step has its `metrics.jsonl`, the result itself lies at the top. `run/` keeps the training states and
+rolled out), every step has its `metrics.jsonl`, the result itself is at the top. `run/` keeps the training states and
 the offline trajectories; a killed run continues there, and on a CPU ends with the same bytes.
 """
 

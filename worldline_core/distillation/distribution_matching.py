@@ -6,7 +6,7 @@ score and the fake score, which follows the student's distribution. With v = eps
 
     g = v_real - v_fake = (x0_fake - x0_real) / sigma,
 
-so the student target sg(G - g) lies towards what the real score believes and away from the fake one.
+so the student target sg(G - g) points to what the real score predicts and away from the fake one.
 
 A gradient flows only through the pass of one random exit step of every block.
 """

@@ -2,7 +2,7 @@
 
     L_traj = lambda_next sum_k ||z^(k+1) - z_T^(k+1)||^2 + lambda_terminal ||z^clean - z_T^clean||^2 + L_aux
 
-The student stands at a node of the teacher's trajectory, takes one Euler step to the next node, and its clean
+The student starts at a node of the teacher's trajectory, takes one Euler step to the next node, and its clean
 prediction is compared with the teacher's clean end. A node is drawn for every block of every clip, so the sum over
 nodes is taken in expectation (times K); all blocks are trained in one teacher-forcing pass.
 """

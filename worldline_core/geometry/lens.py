@@ -200,7 +200,7 @@ def _radial_inverse(radius: np.ndarray, distortion: Distortion) -> np.ndarray:
     # Tangential terms move a point by little, so a radtan pixel just past the turn is left to Newton and its check.
     if distortion.model == "fisheye" and not (radius < largest).all():
         raise CalibrationError(
-            "Pixel lies outside of what the lens model covers",
+            "Pixel is outside of what the lens model covers",
             expected=f"distorted radius below {largest:.4f}",
             got=f"{float(radius.max()):.4f}",
             next_step="check the coefficients and that K belongs to this image size",

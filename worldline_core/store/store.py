@@ -346,7 +346,7 @@ class ArtifactStore:
                 if not is_remote(path):
                     verify_artifact(path, self.verify, f"Input {name}")
             if folder.exists():
-                # Not an artifact without its manifest: somebody deleted the manifest, or copied half of the folder.
+                # Not an artifact without its manifest: the manifest was deleted, or half of the folder copied.
                 shutil.rmtree(folder)
             resumed = partial.exists()
             partial.mkdir(parents=True, exist_ok=True)

@@ -96,10 +96,10 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     seen = Counter(row.embodiment for row in stage.training_rows)
     if learnt is not None:
         known = before.metadata.get("embodiments")
-        told = "does not say which embodiments it saw" if known is None else f"saw {sorted(known)}"
+        known_robots = "does not say which embodiments it saw" if known is None else f"saw {sorted(known)}"
         new = sorted(name for name in seen if known is None or name not in known)
         if new:
-            logger.warning("The Stage II model that training goes on from %s; it now learns %s.", told, new)
+            logger.warning("The Stage II model that training goes on from %s; it now learns %s.", known_robots, new)
         if learnt.grid_size != contract.grid_size:
             logger.warning("It saw latents of %s, and now sees %s.", learnt.grid_size, contract.grid_size)
     loader = stage.loader(tracks=tracks)

@@ -134,7 +134,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
     """Keeps or quarantines listed episodes.
 
     Attributes:
-        roots: where each source lies.
+        roots: folder of each source.
     """
 
     step: ClassVar[str] = "curate"

@@ -150,8 +150,8 @@ def described(
     Raises: ConfigError when a recording for evaluation only is given a training split.
     """
     primary = with_primary_view(episode, config.primary_view, views, thumbnails)
-    told = with_instruction(primary) if config.normalise_instructions else primary
-    result = with_split(told, config.splits)
+    normalised = with_instruction(primary) if config.normalise_instructions else primary
+    result = with_split(normalised, config.splits)
     check_split(result)
     return result
 

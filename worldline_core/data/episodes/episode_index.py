@@ -25,7 +25,7 @@ QUARANTINE_FILE = "quarantine.parquet"
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeRow(EpisodeLabels):
-    """One episode, or a kept segment of one: its labels, and where it lies.
+    """One episode, or a kept segment of one: its labels, and its place.
 
     Attributes:
         dataset: folder of the LeRobot dataset, relative to the set; may lie in another artifact.

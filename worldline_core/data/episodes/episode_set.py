@@ -53,7 +53,7 @@ class EpisodeSet:
 
         Raises:
             DataError: the index is missing or incomplete.
-            ConfigError: the set carries the description of a robot whose name stands for another one here.
+            ConfigError: the set has a description of a robot whose name is another one's here.
         """
         root = Path(root) if isinstance(root, str) else root
         if not is_remote(root):
@@ -140,7 +140,7 @@ class EpisodeSet:
         )
         if not 0 <= row.start < row.stop <= whole.num_frames:
             raise DataError(
-                "Index row lies outside of its episode",
+                "Index row is outside of its episode",
                 where=f"{self.root}, episode {row.episode_id}",
                 expected=f"0 <= start < stop <= {whole.num_frames}",
                 got=f"{row.start}..{row.stop}",
@@ -233,7 +233,7 @@ class EpisodeSetWork[R: InputRow](EpisodeWork[int, R]):
 
 
 class ShardFilesWork[R: InputRow](EpisodeSetWork[R]):
-    """Work whose shards become a file each. What is known of a shard's episodes lies in `run/` until all shards are done.
+    """Work whose shards become a file each. The facts of a shard's episodes are in `run/` until all shards are done.
 
     Attributes:
         shard_file: pattern of their names.

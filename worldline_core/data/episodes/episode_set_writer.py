@@ -130,7 +130,7 @@ class EpisodeSetWriter:
     """Collects episodes and quarantined inputs below `root`.
 
     Args:
-        root: the set's folder; work in progress lies in root/run/.
+        root: the set's folder; work in progress is in root/run/.
         video_crf: x264 quality; 18 is visually exact, 28 small.
         video_mode: "auto" copies encoded videos in which nothing changes, "encode" encodes every picture.
         key_frame_interval: frames from one key frame of an encoded video to the next.
@@ -414,7 +414,7 @@ def copy_embodiments(names: Iterable[str], folder: Path) -> None:
         embodiment = load_embodiment(name)
         relative = Path(embodiment.description.file)
         if relative.is_absolute() or ".." in relative.parts:
-            raise ConfigError("A description lies elsewhere than its robot's file", where=path, got=str(relative))
+            raise ConfigError("A description is not beside its robot's file", where=path, got=str(relative))
         write_bytes_atomic(folder / f"{name}.yaml", path.read_bytes())
         if embodiment.description_path.is_file():
             write_bytes_atomic(folder / relative, embodiment.description_path.read_bytes())

@@ -270,7 +270,7 @@ _SAMPLED_SIDE = 150
 def vector_statistics(values: np.ndarray) -> dict[str, np.ndarray]:
     """Statistics over axis 0 of (N, D) values; exact, in float64.
 
-    Rows with a value that is not finite are left out (a broken recording can still be stored, and is told apart later).
+    Rows with a value that is not finite are left out (a broken recording can still be stored, and is recognised later).
     """
     data = values.astype(np.float64)
     data = data[:, None] if data.ndim == 1 else data

@@ -176,7 +176,7 @@ class Sidecar:
         return self._images(episode_index, view, "thing_labels.parquet", np.uint8)
 
     def _images(self, episode_index: int, view: str, name: str, dtype: type) -> MadeFrames | None:
-        """A view's row in a table of masks, unpacked while somebody goes through it.
+        """A view's row in a table of masks, unpacked while it is iterated.
 
         Raises: RejectedInputError (unreadable, too_large), some of it only then, for bytes that are no images of their shape.
         """

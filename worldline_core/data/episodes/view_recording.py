@@ -1,7 +1,7 @@
 """One view of an episode is written into a set: in one pass over its pictures it gets its video, thumbnails and statistics.
 
 Where no pixel changes the video is copied without encoding: its packets stay as they are and only their times are written
-anew, on the exact grid of the clip's rate, so that frame i of the copy lies at i / fps whatever the source's times were.
+anew, on the exact grid of the clip's rate, so that frame i of the copy is at i / fps whatever the source's times were.
 Otherwise its pictures are encoded. Either way few pictures are in memory at a time.
 """
 
@@ -102,7 +102,7 @@ def store_view(
     """Write a view's video to `path`, beside it the thumbnails of a video that was copied.
 
     Args:
-        fps: rate of the stored video: frame i lies at i / fps.
+        fps: rate of the stored video: frame i is at i / fps.
         enlarged_from: (height, width) of the recording, where it was enlarged before.
 
     Returns:

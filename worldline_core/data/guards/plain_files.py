@@ -205,7 +205,7 @@ def read_table(path: AnyPath, columns: Sequence[str] | None = None) -> pa.Table:
     Raises: RejectedInputError: missing_file, special_file, missing_column (the message names it), out_of_memory, unreadable.
     """
     local = regular_file(path)
-    # No memory map: where somebody shortens the file meanwhile, a map ends in a signal instead of an error.
+    # No memory map: if the file is truncated meanwhile, a map ends in a signal instead of an error.
     with unreadable("Parquet file cannot be read", path, _PARQUET_FAULTS), pq.ParquetFile(local) as file:
         names = file.schema_arrow.names
         missing = [column for column in columns or () if column not in names]

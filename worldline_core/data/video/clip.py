@@ -1,4 +1,4 @@
-"""The encoded video of one view of an episode: where it lies, what its file says, and its pictures: all, or exact ones.
+"""The encoded video of one view of an episode: its place, what its file says, and its pictures: all, or exact ones.
 
 A picture keeps the decoder's frame: grey values cost nothing, colours are converted only when they are asked for.
 """

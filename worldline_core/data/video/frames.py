@@ -56,7 +56,7 @@ class VideoFrames:
 
 
 class MadeFrames:
-    """Images that are made, one after the other, each time somebody goes through them.
+    """Images made one after the other, each time they are iterated.
 
     Args:
         make: gives the images from the first one on.
