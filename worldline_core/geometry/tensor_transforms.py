@@ -40,7 +40,7 @@ def is_rigid(T: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
 
 
 def rot6d_from_rotation(rotation: Float[Tensor, "*b 3 columns"]) -> Float[Tensor, "*b 6"]:
-    """Rot6D (see `rotations`): the first two columns, one after the other."""
+    """Rot6D (see `transforms`): the first two columns, one after the other."""
     return rotation[..., :2].mT.flatten(-2)
 
 

@@ -161,6 +161,7 @@ class Sources:
     grid: tuple[int, int]
 
     @classmethod
+    @cache
     def of(cls, tokenizer: Path | None, teacher: Path | None, image_size: tuple[int, int]) -> Sources:
         """With the latents that a tokenizer makes of pictures of a size."""
         with FakeTensorMode():
