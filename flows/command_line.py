@@ -15,7 +15,7 @@ from flows.exchange_commands import add_exchange_commands
 from flows.fit_command import add_fit_command
 from flows.full_size_commands import add_plan_command, add_rehearse_command
 from tasks.execution.artifact_task import find_task, task_names
-from tasks.execution.command_line import add_config_arguments, add_task_arguments
+from tasks.execution.command_line import add_config_arguments, add_overrides, add_task_arguments
 from tasks.execution.temporary_server import prepare_prefect
 
 
@@ -53,9 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
     record.add_argument(
         "--config", type=Path, default=Path("configs/recording/sample.yaml"), help="recording configuration"
     )
-    record.add_argument(
-        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
-    )
+    add_overrides(record)
     record.add_argument("--output", type=Path, required=True, help="folder of the new EpisodeSet")
     record.set_defaults(run=_record)
     inspect = commands.add_parser("inspect", help="verify and describe an artifact, with a page of pictures")
@@ -119,9 +117,7 @@ def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         parser.add_argument(
             "--config", type=Path, metavar="FILE", help="what differs from the defaults (docs/serve.md)"
         )
-        parser.add_argument(
-            "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
-        )
+        add_overrides(parser)
         parser.set_defaults(run=_serve)
 
 
@@ -156,9 +152,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     what = check.add_mutually_exclusive_group(required=True)
     what.add_argument("config", nargs="?", type=Path, metavar="SOURCE_CONFIG.yaml", help="a file with a curate section")
     what.add_argument("--artifact", type=Path, metavar="FOLDER", help="an EpisodeSet instead of a source")
-    check.add_argument(
-        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value of the file"
-    )
+    add_overrides(check)
     check.add_argument(
         "--episode", action="append", default=[], metavar="ID", dest="episodes", help="only this one (repeatable)"
     )
@@ -174,9 +168,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
         " are sure, 1 at least one is not, 2 wrong usage.",
     )
     estimate.add_argument("config", type=Path, metavar="SOURCE_CONFIG.yaml", help="a file with a curate section")
-    estimate.add_argument(
-        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value of the file"
-    )
+    add_overrides(estimate)
     estimate.add_argument("--view", action="append", default=[], dest="views", help="only this one (repeatable)")
     estimate.add_argument(
         "--output",
@@ -251,7 +243,6 @@ def _task(arguments: argparse.Namespace) -> None:
 
 
 def _init(arguments: argparse.Namespace) -> None:
-
     from worldline_core.discovery.configuration import write_config
     from worldline_core.discovery.findings import as_json, as_text
     from worldline_core.discovery.hub import fetch_sample, hub_id

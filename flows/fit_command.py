@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tasks.execution.command_line import add_overrides
 from tasks.execution.temporary_server import prepare_prefect
 
 if TYPE_CHECKING:
@@ -45,9 +46,7 @@ def add_fit_command(commands: argparse._SubParsersAction[argparse.ArgumentParser
         "--stop-when-ignored", type=int, nargs="?", const=IGNORED_AFTER, metavar="STEPS",
         help=f"end a training in which, from this step on, the controls make no difference (default: {IGNORED_AFTER})",
     )  # fmt: skip
-    fit.add_argument(
-        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
-    )
+    add_overrides(fit)
     fit.add_argument("--artifacts", type=Path, default=Path("artifacts"), help="root of the store (default: artifacts)")
     fit.set_defaults(run=fit_command)
 

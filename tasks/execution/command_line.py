@@ -27,14 +27,19 @@ if TYPE_CHECKING:
     from worldline_core.data.curation.curate_config import CurateConfig
 
 
+def add_overrides(parser: argparse.ArgumentParser) -> None:
+    """The argument that changes values of a configuration."""
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
+    )
+
+
 def add_preset_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     """The arguments that say which configuration a command works on."""
     choice = parser.add_mutually_exclusive_group()
     choice.add_argument("--preset", help=f"a preset in configs/ (default: {default})")
     choice.add_argument("--config", type=Path, help="a configuration file of the same form as a preset")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
-    )
+    add_overrides(parser)
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
