@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,7 @@ def jumps(joints: np.ndarray) -> list[int]:
     return cut(detectors.detect_joint_jump(joints, configs.JointMotionConfig()))
 
 
-@pytest.mark.parametrize("steps", [1, 5])
+@pytest.mark.parametrize("steps", [1, 3, 5])
 def test_a_quick_way_home_is_a_reset_and_motion_is_not(steps: int) -> None:
     joints = swing()
     back = np.linspace(joints[-1], joints[0], steps + 1)[1:-1]
@@ -122,18 +123,18 @@ def test_a_quick_way_home_is_a_reset_and_motion_is_not(steps: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "joints", "jumped"),
+    ("arms", "frames", "joints", "off", "jumped"),
     [
-        (slice(20, None), slice(0, 1), {20}),
-        (slice(20, 23), slice(None), {20, 21, 22, 23}),
-        (slice(20, 30), slice(0, 2), {20, 30}),
+        (1, slice(20, None), slice(0, 1), 0.0, {20}),
+        (2, slice(20, 23), slice(None), 0.0, {20, 21, 22, 23}),
+        (2, slice(20, 30), slice(0, 2), 2.0, set(range(20, 31))),
     ],
 )
-def test_readings_that_break_are_jumps_and_no_reset(frames: slice, joints: slice, jumped: set[int]) -> None:
-    broken = np.concatenate([swing(), 0.7 * swing()], axis=1)  # two arms
-    broken[frames, joints] = broken[0, joints] + 2.0 * (jumped == {20, 30})
+def test_readings_that_break_are_jumps_and_no_reset(arms, frames, joints, off, jumped):
+    broken = np.concatenate([swing(), 0.7 * swing()], axis=1)[:, : 3 * arms]
+    broken[frames, joints] = broken[0, joints] + off
     assert resets(broken) == []
-    assert set(jumps(broken)) & jumped
+    assert set() < set(jumps(broken)) <= jumped
 
 
 def test_joint_readings_that_jump_run_away_or_ignore_their_commands() -> None:
@@ -236,6 +237,36 @@ def test_noise_is_noise_however_dark() -> None:
     assert cut(dark) == [20, 21, 22, 23]
     verdict = corrupted(gray, lost=dark.bad_frames)
     assert (cut(verdict), verdict.numbers["noise_frames"]) == ([10, 11, 12, 13], 4)
+
+
+def test_blurred_stretches_are_found_whatever_is_seen() -> None:
+    sharpness = np.repeat(np.random.default_rng(0).uniform(300, 900, 17), 2)[:33]  # what is seen changes
+    pictures = replace(picture_statistics(TABLE), detail=sharpness / 100)
+
+    def judged(values: np.ndarray, lost: np.ndarray = NOTHING) -> Verdict:
+        return detectors.detect_blur(values, pictures, lost, FPS, configs.BlurConfig())
+
+    blurred = np.where((np.arange(33) >= 10) & (np.arange(33) < 16), 0.1, 1.0) * sharpness
+    assert judged(sharpness).clean
+    assert cut(judged(blurred)) == list(range(10, 16))
+    assert judged(blurred, np.arange(33) < 16).clean
+    assert not judged(np.full(33, 5.0)).passed  # never in focus
+
+
+def test_a_driving_base_moves_the_whole_picture_an_arm_or_a_lamp_does_not() -> None:
+    config = configs.BaseMotionConfig()
+    centres = np.stack([10 + 2.0 * np.arange(33), 30 + 8 * np.sin(np.arange(33))], axis=1)
+
+    def judged(gray: np.ndarray, *, usable: bool = True) -> Verdict:
+        area = detectors.changed_area(gray, np.full(len(gray), usable), FPS, config)
+        return detectors.detect_base_motion(area, FPS, config)
+
+    lamp = np.concatenate([TABLE[:16], (TABLE[:17] * 1.3).clip(0, 255).astype(np.uint8)])
+    for healthy in (scene(centres=centres), lamp, TABLE[:3]):
+        assert judged(healthy).clean
+    for drift in (1.0, 2.5):
+        assert not judged(scene(drift=drift, centres=centres)).passed
+    assert judged(scene(drift=2.5), usable=False).clean
 
 
 def test_wrist_cameras_are_rigidly_mounted_or_condemned() -> None:

@@ -83,9 +83,7 @@ def test_kinematics_that_do_not_fit_are_not_used(recording: Recording) -> None:
     "error",
     [ValueError("no"), np.linalg.LinAlgError("no"), CalibrationError("no"), cv2.error("no"), TypeError("a mistake")],
 )
-def test_a_judgement_that_fails_does_not_cost_the_episode(
-    recording: Recording, error: Exception, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_judgement_that_fails_does_not_cost_the_episode(recording, error, monkeypatch):
     def fails(*_: object) -> list[Finding]:
         raise error
 

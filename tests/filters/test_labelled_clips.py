@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from tools.labelled_clips import FAULTS, HARMLESS, Clip
 from tools.thumbnails import view_thumbnails
-from worldline_core.config import CONFIG_ROOT, load_config
-from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure
 from worldline_core.filters.verdict import REASONS, Finding
-
-
-@pytest.fixture(scope="module")
-def recording(project_root: Path) -> Clip:
-    episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
-    i = episodes.position("ur5e_silver-test-s1-00002")
-    masks = {view: episodes.robot_masks(i, view) for view in episodes.rows[i].views}
-    frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
-    return Clip(episodes.episode(i), frames, {view: np.asarray(m) for view, m in masks.items() if m is not None})
 
 
 def findings_of(clip: Clip) -> list[Finding]:
@@ -60,11 +47,3 @@ def test_nothing_is_dropped_for_a_change_that_is_no_fault(recording: Clip, name:
     assert len(curves) > 5
     for name, values in curves.items():
         assert np.isfinite(values).all() and len(values) == clip.episode.num_frames, name
-
-
-@pytest.mark.parametrize("path", sorted((CONFIG_ROOT / "filters").glob("*.yaml")), ids=lambda path: path.stem)
-def test_thresholds_that_ship_are_valid(path: Path) -> None:
-    config = load_config(FilterConfig, path=path, section="filter")
-    assert config.sources
-    for name in config.sources:
-        assert config.for_source(name) != config
