@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from published_robomind import write_franka
-from recorded_sets import motion, pictures, write_so101, write_video
-from test_source_agibot_world import write_episode as write_agibot
-from test_source_enerverse_ac import write_clip
-from test_source_robotwin import write_episode as write_robotwin
-from test_source_unitree_h5 import write_hdf5, write_transitions
 
 from flows.command_line import main
+from tests.data.published_robomind import write_franka
+from tests.data.test_source_agibot_world import write_episode as write_agibot
+from tests.data.test_source_enerverse_ac import write_clip
+from tests.data.test_source_robotwin import write_episode as write_robotwin
+from tests.data.test_source_unitree_h5 import write_hdf5, write_transitions
+from tests.discovery.recorded_sets import motion, pictures, write_so101, write_video
+from tests.mcap.conftest import robot
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import decode_video
@@ -64,9 +65,9 @@ def test_an_episode_set_and_its_mcap_files(tmp_path: Path, project_root: Path) -
     assert (exported.kind, set(exported.views) >= {"head", "right_wrist"}, exported.cameras) == ("mcap", True, "all")
 
 
-def test_ros_2_topics(tmp_path: Path, toy: Any) -> None:
+def test_ros_2_topics(tmp_path: Path) -> None:
     for n in range(3):
-        toy.robot(seconds=3.0 + 0.2 * n, seed=n).write(tmp_path / f"raw/{n}.mcap")
+        robot(seconds=3.0 + 0.2 * n, seed=n).write(tmp_path / f"raw/{n}.mcap")
     found, config, counts = init(tmp_path)
     assert found.source["views"] == {
         view: {"image": f"/{name}/image/compressed", "calibration": f"/{name}/camera_info"}

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recorded_sets import SO_JOINTS, SO_NAMES, pictures, so101_states
 
+from tests.discovery.recorded_sets import SO_JOINTS, SO_NAMES, pictures, so101_states
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.lerobot import LeRobotSourceConfig, state_columns
