@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,
+    along_tool_z,
     apply_conventions,
     image_frames,
 )
@@ -93,14 +94,6 @@ MISTAKES += [
 ]
 
 
-def test_exchanged_arms_can_be_drawn() -> None:
-    recording = two_arms()
-    exchanged = apply_conventions(recording, RecordedConventions(arms="exchanged"))
-    for drawn, recorded in ((exchanged.T_base_ee, recording.T_base_ee), (exchanged.gripper, recording.gripper)):
-        # Tensors refuse an array that is read backwards; the doctor's pictures ended so.
-        assert np.array_equal(torch.from_numpy(drawn).numpy(), recorded[:, ::-1])
-
-
 def test_degrees_of_joints() -> None:
     episode = replace(two_arms(), state_kind="joints", T_base_ee=None, gripper=None)
     conventions = RecordedConventions(angle_unit="deg")
@@ -116,9 +109,12 @@ def test_a_mistake_is_undone_and_changes_something(mistake: dict[str, Any], sour
     conventions = RecordedConventions(**mistake)
     episode = two_arms(conventions={"tool_offset_m": source_offset} if source_offset else {})
     spoiled = corrupt(episode, conventions)
-    assert_same(apply_conventions(spoiled, conventions), episode)
+    repaired = apply_conventions(spoiled, conventions)
+    assert_same(repaired, episode)
     with pytest.raises(AssertionError):
         assert_same(spoiled, episode)
+    # Tensors refuse an array that is read backwards, such as exchanged arms.
+    assert torch.from_numpy(repaired.T_base_ee).shape == (*torch.from_numpy(repaired.gripper).shape, 4, 4)
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
@@ -139,29 +135,20 @@ def test_reordered_quaternions_and_angles_against_scipy(seed: int) -> None:
 def test_the_offset_that_a_reader_added_goes_along_the_true_axis() -> None:
     """A reader that misread the rotation moved the tool along a wrong z: the repaired pose has it along the true one."""
     flange = two_arms().T_base_ee
-    true_tool = flange.copy()
-    true_tool[..., :3, 3] += 0.2 * flange[..., :3, 2]
-    x, y, z, w = np.moveaxis(Rotation.from_matrix(flange[..., :3, :3].reshape(-1, 3, 3)).as_quat(), -1, 0)
-    misread = flange.copy()
-    misread[..., :3, :3] = Rotation.from_quat(np.stack([w, x, y, z], 1)).as_matrix().reshape(*flange.shape[:2], 3, 3)
-    misread[..., :3, 3] += 0.2 * misread[..., :3, 2]
-    read = two_arms(T_base_ee=misread, conventions={"tool_offset_m": 0.2})
+    misread = corrupt(two_arms(), RecordedConventions(quaternion="wxyz")).T_base_ee
+    read = two_arms(T_base_ee=along_tool_z(misread, 0.2), conventions={"tool_offset_m": 0.2})
     repaired = apply_conventions(read, RecordedConventions(quaternion="wxyz")).T_base_ee
-    assert np.allclose(repaired, true_tool, atol=1e-9)
+    assert np.allclose(repaired[..., :3, 3], flange[..., :3, 3] + 0.2 * flange[..., :3, 2], atol=1e-9)
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(camera_lag=st.integers(-2, 2), image_lag=st.integers(-3, 3), video_frames=st.sampled_from([None, 5]))
-def test_lags_keep_states_cameras_and_images_together(
-    camera_lag: int, image_lag: int, video_frames: int | None
-) -> None:
+def test_lags_keep_states_cameras_and_images_together(camera_lag, image_lag, video_frames):
     conventions = RecordedConventions(camera_lag_frames=camera_lag, image_lag_frames=image_lag)
     marks = np.arange(COUNT, dtype=np.float32)
-    poses = np.tile(np.eye(4), (COUNT, 1, 1))
-    poses[:, 0, 3] = marks
-    healthy = two_arms()
+    healthy, poses = two_arms(), np.tile(np.eye(4), (COUNT, 1, 1))
     state = healthy.state.copy()
-    state[:, 0] = marks
+    state[:, 0] = poses[:, 0, 3] = marks
     cameras = {"left_wrist": replace(healthy.cameras["left_wrist"], T_base_camera=poses)}
     healthy = replace(healthy, state=state, cameras=cameras, video_frames=video_frames)
     images = marks[: healthy.num_video_frames]
@@ -206,9 +193,7 @@ def test_repair_of_a_loaded_episode_takes_images_and_masks_along() -> None:
         ({}, {"camera_lag_frames": 11}, "too_short", "fewer than two frames"),
     ],
 )
-def test_a_convention_that_cannot_be_applied_is_refused(
-    changes: dict[str, Any], mistake: dict[str, Any], reason: str, needed: str
-) -> None:
+def test_a_convention_that_cannot_be_applied_is_refused(changes, mistake, reason, needed):
     with pytest.raises(RejectedInputError, match=needed) as caught:
         apply_conventions(two_arms(**changes), RecordedConventions(**mistake))
     assert caught.value.reason == reason

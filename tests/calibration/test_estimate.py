@@ -83,9 +83,7 @@ def test_what_cannot_be_estimated_is_named(bank: Loaded, kinematics: ArmKinemati
     assert found.camera is None and "wrist_camera" in found.reasons[0]
 
 
-def test_sure_cameras_are_read_back_as_a_calibration_file(
-    tmp_path: Path, bank: Loaded, kinematics: ArmKinematics
-) -> None:
+def test_sure_cameras_are_read_back_as_a_calibration_file(tmp_path, bank, kinematics):
     episode = bank[0][0]
     K = np.array([[90.0, 0, 47.5], [0, 90.0, 31.5], [0, 0, 1]])
     pose = np.array([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, -0.1], [0, 0, 0, 1.0]])
@@ -111,9 +109,7 @@ def test_sure_cameras_are_read_back_as_a_calibration_file(
     assert np.allclose(cameras.tracks["head"].K[:2, 2], (95.5, 63.5))
 
 
-def test_the_command_writes_cameras_pages_and_pictures(
-    tmp_path: Path, bank: Loaded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_cameras_pages_and_pictures(tmp_path, bank, monkeypatch, capsys):
     (tmp_path / "my.yaml").write_text(
         f"curate:\n  sources:\n  - {{kind: episode_set, path: {BANKS}, name: banks, include: ['bank_carry_ur5e-00[0-3]']}}\n"
     )
