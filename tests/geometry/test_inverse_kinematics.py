@@ -30,7 +30,7 @@ def tools(inverse: InverseKinematics, state: np.ndarray) -> np.ndarray:
     return inverse.kinematics.tool_poses(state[None])[0].numpy()
 
 
-@pytest.mark.parametrize("name", [*ROBOTS, "so101", "galaxea_r1"])
+@pytest.mark.parametrize("name", ["aloha_viperx", "agibot_g1", "kinova_gen3", "so101"])
 def test_jacobians_agree_with_finite_differences(name: str) -> None:
     inverse = solver(name)
     embodiment = inverse.kinematics.embodiment
