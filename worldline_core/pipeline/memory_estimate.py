@@ -592,11 +592,11 @@ class SizeSheet(StrictModel):
         return self._rows()[number]()
 
     def rows(self) -> list[Row]:
-        """Memory of every training in the order of a run, and the setting with which it would fit; two are traced at a time."""
+        """Memory of every training in the order of a run, and the setting with which it would fit; a core each."""
         numbers = range(len(self._rows()))
         with (
             Progress("worldline plan", len(numbers), "training") as progress,
-            ProcessPoolExecutor(2, multiprocessing.get_context("fork")) as pool,
+            ProcessPoolExecutor(len(os.sched_getaffinity(0)), multiprocessing.get_context("fork")) as pool,
         ):
             # The last ones take longest.
             waiting = {number: pool.submit(self.row, number) for number in reversed(numbers)}
