@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+
+from tests.data import curating
 
 FRAMES, HEIGHT, WIDTH = 12, 72, 128
 
@@ -24,15 +24,8 @@ def picture(seed: int, frame: int) -> np.ndarray:
 
 def write_video(path: Path, seeds: list[int], fps: int) -> None:
     """Episodes of FRAMES frames, one after the other."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w", format="mp4") as out:
-        stream = out.add_stream("libx264", rate=fps, options={"crf": "12", "g": "4"})
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        for n, (seed, frame) in enumerate((seed, frame) for seed in seeds for frame in range(FRAMES)):
-            image = av.VideoFrame.from_ndarray(picture(seed, frame), format="rgb24")
-            image.pts, image.time_base = n, Fraction(1, fps)
-            out.mux(stream.encode(image))
-        out.mux(stream.encode(None))
+    frames = np.stack([picture(seed, frame) for seed in seeds for frame in range(FRAMES)])
+    curating.write_video(path, frames, rate=fps, options={"crf": "12", "g": "4"})
 
 
 def vector(width: int, names: Any = None, dtype: str = "float64") -> dict[str, Any]:
@@ -44,25 +37,15 @@ def video_feature() -> dict[str, Any]:
 
 
 def write_v21(
-    root: Path,
-    features: dict[str, Any],
-    episodes: list[dict[str, np.ndarray]],
-    tasks: list[str],
-    *,
-    fps: int,
-    robot: str,
+    root: Path, features: dict[str, Any], episodes: list[dict[str, np.ndarray]], tasks: list[str], fps: int, robot: str
 ) -> None:
     keys = [key for key, feature in features.items() if feature["dtype"] == "video"]
     info = {
-        "codebase_version": "v2.1",
-        "robot_type": robot,
-        "total_episodes": len(episodes),
-        "fps": fps,
-        "chunks_size": 1000,
+        "codebase_version": "v2.1", "robot_type": robot, "total_episodes": len(episodes), "fps": fps, "chunks_size": 1000,
         "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
         "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
         "features": features,
-    }
+    }  # fmt: skip
     (root / "meta").mkdir(parents=True)
     (root / "meta/info.json").write_text(json.dumps(info))
     rows = [{"episode_index": i, "tasks": tasks[:1], "length": FRAMES} for i in range(len(episodes))]
@@ -71,13 +54,10 @@ def write_v21(
         "".join(json.dumps({"task_index": i, "task": task}, ensure_ascii=False) + "\n" for i, task in enumerate(tasks))
     )
     for index, columns in enumerate(episodes):
-        table = {name: values.tolist() for name, values in columns.items()}
-        table |= {
-            "timestamp": np.arange(FRAMES) / fps,
-            "frame_index": np.arange(FRAMES),
-            "episode_index": [index] * FRAMES,
-        }
-        table.setdefault("task_index", [0] * FRAMES)
+        table = {
+            "task_index": [0] * FRAMES, **{name: values.tolist() for name, values in columns.items()},
+            "timestamp": np.arange(FRAMES) / fps, "frame_index": np.arange(FRAMES), "episode_index": [index] * FRAMES,
+        }  # fmt: skip
         path = root / f"data/chunk-000/episode_{index:06d}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.table(table), path)
@@ -106,13 +86,13 @@ def write_galaxea(root: Path) -> dict[str, np.ndarray]:
     columns["observation.state.chassis.imu"] = wave(10)
     for name, values in columns.items():
         features[name] = vector(values.shape[1], [f"/hdas/{name}.position[{i}]" for i in range(values.shape[1])])
-    episode = columns | {
-        "task_index": np.array([1] * 5 + [2] * (FRAMES - 5)),
-        "coarse_task_index": np.zeros(FRAMES, np.int64),
-        "quality_index": np.full(FRAMES, 3),
+    indices = {
+        "task_index": [1] * 5 + [2] * (FRAMES - 5),
+        "coarse_task_index": [0] * FRAMES,
+        "quality_index": [3] * FRAMES,
     }
-    for name in ("task_index", "coarse_task_index", "quality_index"):
-        features[name] = vector(1, dtype="int64")
+    episode = columns | {name: np.array(values) for name, values in indices.items()}
+    features |= {name: vector(1, dtype="int64") for name in indices}
     tasks = ["擦镜子@Clean the mirror", "拿起抹布@Pick up the cloth", "擦@Wipe", "qualified"]
     write_v21(root, features, [episode], tasks, fps=15, robot="r1lite")
     return columns
@@ -186,25 +166,22 @@ def write_droid(root: Path) -> dict[str, np.ndarray]:
     pq.write_table(pa.table(columns), root / "data/chunk-000/file-000.parquet")
     rows: list[dict[str, Any]] = []
     for episode in range(2):
-        row: dict[str, Any] = {"episode_index": episode, "tasks": [f"task {episode}"], "length": FRAMES}
-        row |= {"data/chunk_index": 0, "data/file_index": 0}
-        row |= {"dataset_from_index": episode * FRAMES, "dataset_to_index": (episode + 1) * FRAMES}
+        first, last = episode * FRAMES, (episode + 1) * FRAMES
+        row = {"episode_index": episode, "tasks": [f"task {episode}"], "length": FRAMES, "data/chunk_index": 0}
+        row |= {"data/file_index": 0, "dataset_from_index": first, "dataset_to_index": last}
         for name in DROID_VIDEOS:
             key = f"videos/observation.images.{name}"
             row |= {f"{key}/chunk_index": 0, f"{key}/file_index": 0}
-            row |= {f"{key}/from_timestamp": episode * FRAMES / 15, f"{key}/to_timestamp": (episode + 1) * FRAMES / 15}
+            row |= {f"{key}/from_timestamp": first / 15, f"{key}/to_timestamp": last / 15}
         rows.append(row)
     pq.write_table(pa.Table.from_pylist(rows), root / "meta/episodes/chunk-000/file-000.parquet")
     tasks = pa.table({"task_index": [0, 1], "task": ["Put the pen in the cup.", "Close the drawer."]})
     pq.write_table(tasks, root / "meta/tasks.parquet")
     info = {
-        "codebase_version": "v3.0",
-        "robot_type": "Franka",
-        "fps": 15,
+        "codebase_version": "v3.0", "robot_type": "Franka", "fps": 15, "features": features,
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-        "features": features,
-    }
+    }  # fmt: skip
     (root / "meta/info.json").write_text(json.dumps(info))
     for number, name in enumerate(DROID_VIDEOS):
         write_video(root / f"videos/observation.images.{name}/chunk-000/file-000.mp4", [number, number + 1], 15)

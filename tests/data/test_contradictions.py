@@ -1,16 +1,21 @@
-"""Tracks of one recording that contradict each other are refused, whatever the source; what is merely unusual is kept."""
+"""Tracks that contradict each other are refused, whatever the source; recorded poses are repaired and counted, or refused."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from tests.data.curating import record, run
+from tools.corrupted.conventions import written_as_moving, written_as_wxyz
 from worldline_core.data.curation.episode_checks import check_commands, check_joints, check_tool_poses
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions
 from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.recorded_poses import camera_pose, with_rigid_poses
 from worldline_core.data.episodes.source import joint_names
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.geometry.embodiment import load_embodiment
@@ -20,6 +25,7 @@ from worldline_core.geometry.transforms import (
     pose_from_euler_fixed_xyz,
     reread_as_moving,
     reread_as_wxyz,
+    rotation_deviation,
 )
 
 LENGTH = 90
@@ -40,15 +46,26 @@ def episode(arms: tuple[str, ...] = ("left", "right"), **changes: object) -> Epi
     return Episode(**{**described, **changes})  # type: ignore[arg-type]
 
 
-def columns(chosen: object, change: Change) -> Change:
-    """A change of some columns alone."""
+def refused(check: Callable[[Episode], None], told: Episode, message: str) -> str:
+    """The reason."""
+    with pytest.raises(RejectedInputError, match=message) as caught:
+        check(told)
+    return caught.value.reason
+
+
+def part(chosen: object, change: Change) -> Change:
+    """A change of some columns, or of another part, alone."""
 
     def changed(values: np.ndarray) -> np.ndarray:
         values = values.copy()
-        values[:, chosen] = change(values[:, chosen])  # type: ignore[index]
+        values[chosen] = change(values[chosen])  # type: ignore[index]
         return values
 
     return changed
+
+
+def columns(chosen: object, change: Change) -> Change:
+    return part((slice(None), chosen), change)
 
 
 JOINTS = [*range(7), *range(8, 15)]
@@ -75,22 +92,14 @@ def test_commands_that_contradict_the_states_are_refused(name: str) -> None:
     # An opening about 0.5 looks alike both ways: this one opens and closes.
     if name == "inverted gripper":
         square = (np.arange(LENGTH) // 30 % 2).astype(np.float32)
-        state = good.state.copy()
-        state[:, 7], told.action[:, 7] = square, 1 - square
-        told = replace(told, state=state)
+        told = replace(told, state=columns([7], lambda _: square[:, None])(good.state))
+        told.action[:, 7] = 1 - square
     if meaning is None:
         check_commands(told)
-        return
-    with pytest.raises(RejectedInputError, match=meaning) as caught:
-        check_commands(told)
-    assert caught.value.reason == "contradicting_tracks"
-
-
-def test_commands_in_degrees_are_no_angles() -> None:
-    good = episode()
-    with pytest.raises(RejectedInputError, match="Commands of joints are no angles") as caught:
-        check_joints(replace(good, action=columns(JOINTS, np.rad2deg)(good.action)))
-    assert caught.value.reason == "joint_out_of_range"
+    else:
+        assert refused(check_commands, told, meaning) == "contradicting_tracks"
+    if name == "degrees":
+        assert refused(check_joints, told, "Commands of joints are no angles") == "joint_out_of_range"
 
 
 def test_an_arm_at_rest_may_have_no_commands() -> None:
@@ -100,19 +109,15 @@ def test_an_arm_at_rest_may_have_no_commands() -> None:
     check_commands(episode(state=state, action=state, conventions={"action": "repeats the state"}))
 
 
-@pytest.mark.parametrize("names", [("right/gripper",), ("gripper.pos",), ("main_gripper",)])
-@pytest.mark.parametrize(("reading", "kept"), [(0.9, True), (1.66, False), (-0.5, False)])
-def test_a_gripper_of_an_undescribed_robot_is_an_opening_too(
-    names: tuple[str, ...], reading: float, kept: bool
-) -> None:
-    values = np.full((LENGTH, 1), reading, np.float32)
-    one = episode(state=values, action=values, state_names=names)
-    if kept:
-        check_joints(one)
-        return
-    with pytest.raises(RejectedInputError, match="closed and open") as caught:
-        check_joints(one)
-    assert caught.value.reason == "invalid_gripper"
+@pytest.mark.parametrize("name", ["right/gripper", "gripper.pos", "main_gripper"])
+def test_a_gripper_of_an_undescribed_robot_is_an_opening_too(name: str) -> None:
+    for reading, kept in ((0.9, True), (1.66, False), (-0.5, False)):
+        values = np.full((LENGTH, 1), reading, np.float32)
+        one = episode(state=values, action=values, state_names=(name,))
+        if kept:
+            check_joints(one)
+        else:
+            assert refused(check_joints, one, "closed and open") == "invalid_gripper"
 
 
 def panda() -> Episode:
@@ -122,23 +127,19 @@ def panda() -> Episode:
 
 
 def reread(change: Change) -> Change:
-    def changed(poses: np.ndarray) -> np.ndarray:
-        poses = poses.copy()
-        poses[..., :3, :3] = change(poses[..., :3, :3])
-        return poses
+    return part((..., slice(3), slice(3)), change)
 
-    return changed
+
+def moved(change: Change) -> Change:
+    return part((..., slice(3), 3), change)
 
 
 TOOL = pose_from_euler_fixed_xyz(np.array([0.0, 0.02, 0.155]), np.array([0.0, 0.3, 1.0]))
 POSES: dict[str, tuple[Change, bool]] = {
     "as the joints": (lambda poses: poses, True),
     "another point of the gripper": (lambda poses: poses @ TOOL, True),
-    "a description that is a centimetre off": (
-        lambda poses: poses + 0.01 * np.eye(4)[0, 0] * (np.arange(4) == 3) * [[1], [0], [0], [0]],
-        True,
-    ),
-    "millimetres": (lambda poses: poses * np.where(np.arange(4) == 3, [[1000]] * 3 + [[1]], 1), False),
+    "a description that is a centimetre off": (moved(lambda places: places + np.array([0.01, 0, 0])), True),
+    "millimetres": (moved(lambda places: 1000 * places), False),
     "moving Euler angles": (reread(reread_as_moving), False),
     "another order of quaternions": (reread(reread_as_wxyz), False),
     "those of another recording": (lambda poses: poses[::-1], False),
@@ -152,19 +153,17 @@ def test_tool_poses_that_contradict_the_joints_are_refused(name: str) -> None:
     told = replace(good, T_base_ee=change(np.asarray(good.T_base_ee)))
     if kept:
         check_tool_poses(told)
-        return
-    with pytest.raises(RejectedInputError, match="do not move the tools") as caught:
-        check_tool_poses(told)
-    assert caught.value.reason == "contradicting_tracks"
+    else:
+        assert refused(check_tool_poses, told, "do not move the tools") == "contradicting_tracks"
     if name == "millimetres":
         check_tool_poses(apply_conventions(told, RecordedConventions(pose_unit="mm")))
 
 
-@pytest.mark.parametrize("joint", range(7))
-def test_a_flipped_joint_contradicts_the_tool_poses(joint: int) -> None:
+def test_a_flipped_joint_contradicts_the_tool_poses() -> None:
     good = panda()
-    with pytest.raises(RejectedInputError, match="do not move the tools"):
-        check_tool_poses(replace(good, state=columns([joint], np.negative)(good.state)))
+    for joint in range(7):
+        told = replace(good, state=columns([joint], np.negative)(good.state))
+        assert refused(check_tool_poses, told, "do not move the tools") == "contradicting_tracks"
 
 
 @pytest.mark.parametrize("name", ["droid_franka", "yam_station", "ur5e_pair"])
@@ -173,3 +172,90 @@ def test_kinematics_without_torch_are_those_with_it(name: str) -> None:
     state = np.random.default_rng(0).uniform(-1, 1, (5, robot.state_size))
     expected = ArmKinematics(robot).tool_poses(state).numpy()
     np.testing.assert_allclose(tool_poses(robot, read_tree(robot), state), expected, atol=1e-12)
+
+
+Make = Callable[..., tuple]
+
+
+def test_a_wrong_reading_and_its_repair_cancel() -> None:
+    rotations = Rotation.random(100, random_state=2).as_matrix()
+    for write, read in ((written_as_wxyz, reread_as_wxyz), (written_as_moving, reread_as_moving)):
+        wrong = write(rotations)
+        assert np.abs(wrong - rotations).max() > 0.1
+        assert np.abs(read(wrong) - rotations).max() < 1e-9
+    # From the definition: the four numbers are the same, read in the other order.
+    xyzw = Rotation.from_matrix(rotations).as_quat()
+    expected = Rotation.from_quat(np.roll(xyzw, 1, axis=1)).as_matrix()
+    assert np.abs(written_as_wxyz(rotations) - expected).max() < 1e-9
+
+
+def sheared(poses: np.ndarray, frame: int, deviation: float) -> np.ndarray:
+    result = poses.copy()
+    shear = np.eye(3)
+    shear[0, 1] = deviation
+    result[frame, ..., :3, :3] = shear @ result[frame, ..., :3, :3]
+    return result
+
+
+def test_both_sides_of_the_threshold_show_in_the_curated_set(tmp_path: Path, sample: Make) -> None:
+    samples = []
+    for number, deviation in enumerate((0.0, 0.9e-3, 1.1e-3)):
+        episode, *pictures = sample(number)
+        wrist = episode.cameras["left_wrist"]
+        wrist = replace(wrist, T_base_camera=sheared(wrist.T_base_camera, 4, deviation))
+        samples.append((replace(episode, cameras={**episode.cameras, "left_wrist": wrist}), *pictures))
+    counts, curated = run(tmp_path, {"kind": "episode_set", "path": str(record(tmp_path / "raw", samples))})
+    assert (counts["kept"], counts["reasons"]) == (2, {"invalid_extrinsics": 1})
+    clean, repaired = curated.episode(0), curated.episode(1)
+    assert not any(key.startswith("rotations_repaired") for key in clean.conventions)
+    assert np.array_equal(clean.cameras["left_wrist"].T_base_camera, samples[0][0].cameras["left_wrist"].T_base_camera)
+    assert repaired.conventions["rotations_repaired"] == 1
+    assert repaired.conventions["rotations_repaired_of"] == "left_wrist"
+    assert repaired.conventions["rotations_repaired_largest_deviation"] == pytest.approx(0.9e-3, rel=1e-2)
+    assert rotation_deviation(repaired.cameras["left_wrist"].T_base_camera[:, :3, :3]).max() < 1e-12
+    (row,) = curated.quarantine()
+    assert row.numbers.items() >= {"view": "left_wrist", "frame": 4, "frames": 1}.items()
+    assert row.numbers["rotation_deviation"] == pytest.approx(1.1e-3, rel=1e-2)
+
+
+def test_tool_poses_are_held_to_the_same(sample: Make) -> None:
+    tools = np.tile(np.eye(4), (9, 2, 1, 1))
+    values = {"T_base_ee": sheared(tools, 3, 5e-4), "gripper": np.zeros((9, 2))}
+    repaired = with_rigid_poses(sample(0, **values)[0])
+    assert repaired.conventions["rotations_repaired"] == 2  # both arms of frame 3
+    assert repaired.conventions["rotations_repaired_of"] == "tool poses"
+    assert rotation_deviation(repaired.T_base_ee[..., :3, :3]).max() < 1e-12
+    values["T_base_ee"] = sheared(tools, 3, 5e-3)
+    with pytest.raises(RejectedInputError, match=r"Not a rigid transform[\s\S]*tool poses, frame 3") as caught:
+        with_rigid_poses(sample(0, **values)[0])
+    assert caught.value.reason == "invalid_tool_pose"
+    assert caught.value.evidence["rotation_deviation"] == pytest.approx(5e-3, rel=1e-2)
+
+
+@pytest.mark.parametrize("track", ["state", "action"])
+def test_a_zero_quaternion_in_a_state_of_tool_poses_is_quarantined(track: str, sample: Make) -> None:
+    names = tuple(f"{a}/{n}" for a in ("left", "right") for n in ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper"))
+    rows = np.tile(np.array([0.1, 0.2, 0.3, 0, 0, 0, 1, 0.5] * 2, np.float32), (9, 1))
+    arrays = {"state": rows.copy(), "action": rows.copy()}
+    given = {"state_names": names, "state_kind": "ee_pose"}
+    whole = sample(0, **arrays, **given)[0]
+    assert with_rigid_poses(whole) is whole
+    arrays[track][5, 11:15] = 0
+    with pytest.raises(RejectedInputError, match=rf"no direction[\s\S]*{track} right/qx, entry 5") as caught:
+        with_rigid_poses(sample(0, **arrays, **given)[0])
+    assert caught.value.reason == "nan_state"
+    assert caught.value.evidence["columns"] == ["right/qx", "right/qy", "right/qz", "right/qw"]
+
+
+def test_a_source_may_name_the_other_conventions() -> None:
+    T_base_camera = np.tile(np.eye(4), (3, 1, 1))
+    T_base_camera[:, :3, :3] = Rotation.random(3, random_state=0).as_matrix()
+    T_base_camera[:, :3, 3] = [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+    inverse = np.linalg.inv(T_base_camera @ np.diag([1.0, -1, -1, 1]))
+    pose = camera_pose("head", inverse, extrinsics="base_to_camera", axes="opengl", where="episode 1")
+    np.testing.assert_allclose(pose.T_base_camera, T_base_camera, atol=1e-12)
+    inverse[1, :3, :3] *= 2
+    with pytest.raises(RejectedInputError, match=r"episode 1, view head, frame 1") as caught:
+        camera_pose("head", inverse, extrinsics="base_to_camera", axes="opengl", where="episode 1")
+    assert caught.value.reason == "invalid_extrinsics"
+    assert caught.value.evidence["view"] == "head"

@@ -1,8 +1,9 @@
-"""The rules over a whole set, and the options of single sources, through `curate` itself."""
+"""The rules over a whole set through `curate` itself; splits are drawn by scene, scenes under two names are found."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,15 +13,18 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.data.curating import record
 from tools.thumbnails import view_thumbnails
 from worldline_core.config import validate
 from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.curation.recorded_episode import described, with_primary_view
+from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits, LeakageConfig
+from worldline_core.data.curation.recorded_episode import described, drawn_split, with_primary_view, with_split
+from worldline_core.data.curation.rules import SceneView, decided_rows, drawn_episodes, find_scene_leaks
 from worldline_core.data.curation.source_table import read_source_table, write_source_weights
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow
-from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.fingerprint import fingerprint
 from worldline_core.errors import ConfigError, DataError
 
 Make = Callable[..., tuple]
@@ -48,17 +52,8 @@ def room(number: int, name: str, *, num_frames: int = 40, scene_seed: int = 0, *
     return Episode(**(values | changes)), {"head": np.stack(pictures)}
 
 
-def record(root: Path, samples: list[tuple], crf: int = 8) -> Path:
-    with EpisodeSetWriter(root, video_crf=crf) as writer:
-        for episode, frames in samples:
-            writer.add(episode, frames)
-    return root
-
-
 def config(*sources: Path | dict[str, Any], **changes: Any) -> CurateConfig:
-    listed = [
-        source if isinstance(source, dict) else {"kind": "episode_set", "path": str(source)} for source in sources
-    ]
+    listed = [each if isinstance(each, dict) else {"kind": "episode_set", "path": str(each)} for each in sources]
     return validate(CurateConfig, {"sources": listed, **changes}, where="test")
 
 
@@ -81,8 +76,7 @@ def test_a_copy_that_was_encoded_resized_and_cut_is_taken_out(tmp_path: Path) ->
     assert numbers["duplicate_of"] == "e2"
     assert numbers["motion_overlap"] >= 0.5
     assert numbers["frame_distance_bits"] <= 12
-    kept_all = config(raw, other, near_duplicates=False)
-    assert curate(kept_all, {}, tmp_path / "all")["kept"] == 8
+    assert curate(config(raw, other, near_duplicates=False), {}, tmp_path / "all")["kept"] == 8
 
 
 def test_the_first_listed_is_kept_and_a_copy_across_the_split_says_so(tmp_path: Path) -> None:
@@ -112,8 +106,6 @@ def test_a_scene_that_leaks_under_another_name(tmp_path: Path, action: str) -> N
 
 
 def test_an_interrupted_decision_is_carried_on_by_the_same_rows(tmp_path: Path) -> None:
-    from worldline_core.data.curation.rules import decided_rows
-
     parts = described_parts([room(0, "a"), room(0, "b"), room(1, "c")])
     first = decided_rows(config(tmp_path), parts, tmp_path)
     assert [row.episode_id for row in first] == ["b"]
@@ -123,8 +115,6 @@ def test_an_interrupted_decision_is_carried_on_by_the_same_rows(tmp_path: Path) 
 
 
 def described_parts(samples: list[tuple]) -> list[dict[str, Any]]:
-    from worldline_core.data.episodes.fingerprint import fingerprint
-
     return [
         {
             "episode_id": episode.episode_id, "source": "made", "scene": episode.scene, "split": episode.split,
@@ -219,20 +209,6 @@ def test_weights_give_each_source_its_share(tmp_path: Path) -> None:
     assert weights(tmp_path, [row("small", 9, "test")], 1.0) == {}
 
 
-def test_the_clip_sampler_follows_these_weights(tmp_path: Path) -> None:
-    """Drawn clips against the shares that the weights were made for."""
-    from worldline_core.training.clip_config import ClipSampling
-    from worldline_core.training.clip_sampler import ClipRow, ClipSampler
-
-    rows = [row("large", 100 + k) for k in range(30)] + [row("small", 60 + k) for k in range(3)]
-    stored = [ClipRow(r.episode_id, r.num_frames, ("head",), r.source, "e", r.split, "", "head") for r in rows]
-    config = ClipSampling(lengths=(33,), source_weights=weights(tmp_path, rows, 0.0))
-    sampler = ClipSampler(stored, config, views=("head",), splits=["train"], start_step=1, batch_size=50, seed=0)
-    drawn = [clip.episode_id for index in range(80) for clip in sampler.clips(index).clips]
-    share = sum(name.startswith("small") for name in drawn) / len(drawn)
-    assert share == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / len(drawn)))
-
-
 def test_one_scene_is_split_by_episode_or_refused(tmp_path: Path) -> None:
     raw = record(tmp_path / "raw", [room(n, f"e{n}", outcome=("success", "failure")[n % 2]) for n in range(12)])
     given: dict[str, Any] = {"image_size": None, "near_duplicates": False}
@@ -245,3 +221,102 @@ def test_one_scene_is_split_by_episode_or_refused(tmp_path: Path) -> None:
     rows = EpisodeSet.open(tmp_path / "out").rows
     assert {row.outcome for row in rows if row.split == "test"} == {"success", "failure"}
     assert EpisodeSet.open(tmp_path / "out").episode(0).split == rows[0].split
+
+
+def test_shares_are_met_and_new_scenes_move_no_old_one() -> None:
+    splits = DrawnSplits(by="scene", test=0.2, validation=0.1, seed=3)
+    scenes = [f"kitchen {i}" for i in range(5000)]
+    drawn = {scene: drawn_split(scene, splits) for scene in scenes}
+    shares = {name: sum(split == name for split in drawn.values()) / 5000 for name in ("test", "validation", "train")}
+    assert shares["test"] == pytest.approx(0.2, abs=0.02)
+    assert shares["validation"] == pytest.approx(0.1, abs=0.02)
+    assert {scene: drawn_split(scene, splits) for scene in reversed(scenes)} == drawn
+    other = DrawnSplits(by="scene", test=0.2, validation=0.1, seed=4)
+    assert sum(drawn_split(scene, other) != drawn[scene] for scene in scenes) > 1000
+
+
+def test_patterns_come_first_and_declared_splits_stay(sample: Make) -> None:
+    episode = sample(0)[0]
+    splits = DrawnSplits(by="scene", test=0, validation=0, patterns={"lab*": "test"})
+    assert with_split(replace(episode, scene="laboratory", split="train"), splits).split == "test"
+    assert with_split(replace(episode, split="test"), splits).split == "train"
+    for kept in ("bank", "ood_test"):
+        assert with_split(replace(episode, split=kept), splits).split == kept
+    evaluation = replace(episode, split="test", conventions={"layout": "robotwin"})
+    assert with_split(evaluation, splits).split == "test"
+    assert with_split(replace(episode, scene="kit"), {"k*": "test", "*": "train"}).split == "test"
+
+
+@pytest.mark.parametrize(
+    ("splits", "message"),
+    [
+        ({"by": "scene", "validaton": 0.2}, r"splits\.drawn\.validaton: unknown key"),
+        ({"by": "scene", "test": 0.6, "validation": 0.5}, "leave nothing to train on"),
+        ({"kitchen*": "tset"}, "'train', 'validation', 'test', 'ood_test' or 'bank'"),
+        ({"by": "room"}, "'scene' or 'episode'"),
+    ],
+)
+def test_configurations_are_strict(splits: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        validate(CurateConfig, {"sources": [{"kind": "episode_set", "path": "x"}], "splits": splits}, where="test")
+
+
+def flipped(words: np.ndarray, bits: int, rng: np.random.Generator) -> np.ndarray:
+    result = words.copy()
+    for bit in rng.choice(256, bits, replace=False):
+        result[bit // 64] ^= np.uint64(1) << np.uint64(bit % 64)
+    return result
+
+
+def test_one_scene_under_two_names_is_found() -> None:
+    rng = np.random.default_rng(0)
+    rooms = rng.integers(0, 2**63, (40, 4), dtype=np.uint64)
+    views = [SceneView(f"train-{i}-{k}", f"room {i}", "train", rooms[i]) for i in range(40) for k in range(3)]
+    # Up to 52 flipped bits are one scene.
+    views += [SceneView(f"test-{i}", f"lab {i}", "test", flipped(rooms[i], 31, rng)) for i in range(10)]
+    views.append(SceneView("same name", "lab 3", "validation", rooms[39]))
+    leaks = find_scene_leaks(views, LeakageConfig())
+    assert [(leak.learning_scene, leak.testing_scene, leak.distance) for leak in leaks] == [
+        (f"room {i}", f"lab {i}", 31) for i in range(10)
+    ]
+    assert find_scene_leaks(views, LeakageConfig(max_distance=30)) == []
+    assert find_scene_leaks(views, LeakageConfig(action="off")) == []
+    # Scenes of one side and of one name are no leak.
+    same = [SceneView(scene, scene, split, rooms[0]) for scene, split in (("room", "train"), ("lab", "validation"))]
+    assert find_scene_leaks([*same, SceneView("hall", "hall", "bank", rooms[0])], LeakageConfig()) == []
+    leaks = find_scene_leaks([*same, SceneView("d", "room", "test", rooms[0])], LeakageConfig())
+    assert leaks[0].learning_scene == "lab"
+
+
+def waiting(count: int, **changes: str) -> list[dict[str, object]]:
+    return [
+        {
+            "episode_id": f"e{i:03d}", "scene": "desk", "split": "train", "conventions": {}, "task_family": "lift",
+            "instruction": f"task {i % 4}", "outcome": "success" if i % 5 else "failure", **changes,
+        }
+        for i in range(count)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("count", "test", "validation"), [(200, 40, 20), (20, 4, 2), (5, 1, 1), (3, 1, 1)])
+def test_episodes_of_one_scene_are_drawn_evenly_over_tasks_and_outcomes(count: int, test: int, validation: int) -> None:
+    splits, parts = DrawnSplits(by="episode", test=0.2, validation=0.1), waiting(count)
+    drawn = drawn_episodes(splits, parts)
+    assert Counter(drawn.values()) == {"train": count - test - validation, "test": test, "validation": validation}
+    assert drawn_episodes(splits, parts[::-1]) == drawn
+    # A killed run draws again, over what it has written already.
+    assert drawn_episodes(splits, [part | {"split": drawn[str(part["episode_id"])]} for part in parts]) == drawn
+    flip = {"success": "failure", "failure": "success"}
+    assert drawn_episodes(splits, [part | {"outcome": flip[str(part["outcome"])]} for part in parts]) == drawn
+    if count == 200:
+        for key in ("instruction", "outcome"):
+            found = Counter(part[key] for part in parts if drawn[str(part["episode_id"])] == "test")
+            assert all(abs(found[name] - total * 0.2) <= 2 for name, total in Counter(p[key] for p in parts).items())
+
+
+def test_what_patterns_and_sources_say_is_not_drawn_by_episode() -> None:
+    splits = DrawnSplits(by="episode", patterns={"lab*": "train"})
+    assert drawn_episodes(splits, waiting(9, scene="lab 1")) == {}
+    assert drawn_episodes(splits, waiting(9, split="bank")) == {}
+    with pytest.raises(DataError, match=r"(?s)Too few episodes.*expected: more than 2.*got: 2"):
+        drawn_episodes(splits, waiting(2))

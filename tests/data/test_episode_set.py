@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.data.curating import files_of
 from worldline_core.data.episodes.episode import ARRAYS, EpisodeDescription
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
@@ -21,14 +22,6 @@ from worldline_core.data.video.frames import packed_images, unpacked_images
 from worldline_core.errors import DataError
 
 Make = Callable[..., tuple]
-
-
-def files_of(root: Path) -> dict[str, bytes]:
-    return {
-        str(p.relative_to(root)): p.read_bytes()
-        for p in sorted(root.rglob("*"))
-        if p.is_file() and "run" not in p.relative_to(root).parts
-    }
 
 
 def write(root: Path, samples: list[tuple]) -> EpisodeSet:
@@ -75,36 +68,30 @@ def test_bytes_depend_on_the_episodes_alone(tmp_path: Path, sample: Make) -> Non
 def test_a_killed_writer_continues_to_the_same_bytes(tmp_path: Path, sample: Make) -> None:
     samples = [sample(number) for number in range(3)]
     write(tmp_path / "undisturbed", samples)
-    killed = EpisodeSetWriter(tmp_path / "killed", video_crf=10)
-    killed.add(*samples[1])
-    half_written = tmp_path / "killed" / "run" / "episodes" / "parts" / ".abc.1"
-    half_written.mkdir()
-    (half_written / "head.mp4").write_bytes(b"half")
+    EpisodeSetWriter(tmp_path / "killed", video_crf=10).add(*samples[1])
+    parts = tmp_path / "killed/run/episodes/parts"
+    (parts / ".abc.1").mkdir()
+    (parts / ".abc.1/head.mp4").write_bytes(b"half")
     again = EpisodeSetWriter(tmp_path / "killed", video_crf=10)
     assert again.has("episode-001")
     assert not again.has("episode-000")
-    write(tmp_path / "killed", [samples[0], samples[2]])
+    # The work of a container with the same process ids is left alone.
+    others = parts / f".{part_name('episode-000')}.{os.getpid()}"
+    others.mkdir()
+    again.add(*samples[0])
+    assert others.is_dir()
+    write(tmp_path / "killed", [samples[2]])
     assert files_of(tmp_path / "killed") == files_of(tmp_path / "undisturbed")
     with pytest.raises(DataError, match="already holds a finished EpisodeSet"):
         EpisodeSetWriter(tmp_path / "killed")
 
 
-def test_the_work_of_a_container_with_the_same_process_ids_is_left_alone(tmp_path: Path, sample: Make) -> None:
-    writer = EpisodeSetWriter(tmp_path / "set", video_crf=10)
-    others = tmp_path / "set/run/episodes/parts" / f".{part_name('episode-000')}.{os.getpid()}"
-    others.mkdir()
-    writer.add(*sample(0))
-    assert others.is_dir()
-
-
 def test_segments_cut_every_array(tmp_path: Path, sample: Make) -> None:
     samples = [sample(number) for number in range(2)]
     stored = write(tmp_path / "curated", samples)
-    other = tmp_path / "filtered"
-    rows = read_index(tmp_path / "curated")
-    cut = replace(rows[1], start=2, stop=7, num_frames=5, video_frames=5, dataset="../curated/datasets/ur5e_pair")
-    write_index(other, [cut])
-    segment = EpisodeSet.open(other)
+    linked = {"start": 2, "stop": 7, "num_frames": 5, "video_frames": 5, "dataset": "../curated/datasets/ur5e_pair"}
+    write_index(tmp_path / "filtered", [replace(stored.rows[1], **linked)])
+    segment = EpisodeSet.open(tmp_path / "filtered")
     episode = segment.episode(0)
     assert episode.num_frames == 5
     assert np.array_equal(episode.state, samples[1][0].state[2:7])
@@ -118,14 +105,10 @@ def test_segments_cut_every_array(tmp_path: Path, sample: Make) -> None:
     assert np.array_equal(mask, samples[1][2]["head"][2:7])
     with pytest.raises(DataError, match="outside of the episode"):
         segment.frames(0, "head", [5])
-
-
-def test_a_set_moves_together_with_what_it_links_to(tmp_path: Path, sample: Make) -> None:
-    write(tmp_path / "a" / "curated", [sample(0)])
-    rows = read_index(tmp_path / "a" / "curated")
-    write_index(tmp_path / "a" / "filtered", [replace(rows[0], dataset="../curated/datasets/ur5e_pair")])
-    shutil.move(tmp_path / "a", tmp_path / "b")
-    assert EpisodeSet.open(tmp_path / "b" / "filtered").frames(0, "head").shape == (9, 32, 48, 3)
+    (tmp_path / "elsewhere").mkdir()
+    for name in ("curated", "filtered"):  # both together may be moved
+        shutil.move(tmp_path / name, tmp_path / "elsewhere" / name)
+    assert EpisodeSet.open(tmp_path / "elsewhere/filtered").frames(0, "head").shape == (5, 32, 48, 3)
 
 
 def test_foreign_index_rows_cannot_leave_the_folder(tmp_path: Path, sample: Make) -> None:
@@ -137,21 +120,24 @@ def test_foreign_index_rows_cannot_leave_the_folder(tmp_path: Path, sample: Make
             EpisodeSet.open(tmp_path / "set", allow_linked=False).episode(0)
 
 
-def test_states_without_images_are_kept_and_lerobot_rows_stay_true(tmp_path: Path, sample: Make) -> None:
+def test_states_without_images_are_kept_and_the_record_is_stored_whole(tmp_path: Path, sample: Make) -> None:
+    """Every field that the record declares comes back; a field that is added to it is stored without another line."""
     poses = np.tile(np.eye(4), (9, 2, 1, 1))
     poses[:, :, 0, 3] = np.arange(18).reshape(9, 2) / 7
-    gripper = np.linspace(0, 1, 18).reshape(9, 2)
-    episode, frames, _ = sample(0, T_base_ee=poses, gripper=gripper, video_frames=4)
+    episode, frames, _ = sample(
+        0, T_base_ee=poses, gripper=np.linspace(0, 1, 18).reshape(9, 2), video_frames=4, bank="b", candidate=3,
+        primary_view="left_wrist", conventions={"layout": "x", "n": 3},
+    )  # fmt: skip
     with EpisodeSetWriter(tmp_path / "set", video_crf=10) as writer:
         writer.add(episode, {view: images[:4] for view, images in frames.items()})
     stored = EpisodeSet.open(tmp_path / "set")
     read = stored.episode(0)
     assert (read.num_frames, read.video_frames, stored.rows[0].video_frames) == (9, 4, 4)
-    assert np.array_equal(read.state, episode.state)
-    assert read.T_base_ee is not None
-    assert read.gripper is not None
-    assert np.array_equal(read.T_base_ee, poses)
-    assert np.array_equal(read.gripper, gripper)
+    assert read.described() == episode.described()
+    assert set(ARRAYS) == {"state", "action", "T_base_ee", "gripper"} == set(read.arrays())
+    for name, values in episode.arrays().items():
+        assert getattr(read, name).dtype == ARRAYS[name].dtype
+        assert np.array_equal(getattr(read, name), values)
     assert stored.frames(0, "head").shape[0] == 4
     with pytest.raises(DataError, match="0 <= index < 4"):
         stored.frames(0, "head", [4])
@@ -197,39 +183,23 @@ def test_labels_of_more_than_a_gigabyte_are_read_image_by_image(tmp_path: Path, 
 def test_what_does_not_belong_together_is_refused(tmp_path: Path, sample: Make) -> None:
     writer = EpisodeSetWriter(tmp_path / "set")
     episode, frames, masks = sample(0)
-    with pytest.raises(DataError, match=r"(?s)Images and states differ in length.*expected: 9.*got: 8"):
-        writer.add(episode, {**frames, "head": frames["head"][:8]})
-    with pytest.raises(DataError, match="wrong size"):
-        writer.add(episode, {view: images[..., :2] for view, images in frames.items()})
-    with pytest.raises(DataError, match="Robot masks do not match"):
-        writer.add(episode, frames, {"head": masks["head"][:4]})
-    with pytest.raises(DataError, match="Labels of things do not match"):
-        writer.add(episode, frames, masks, thing_labels={"head": masks["head"][:4].astype(np.uint8)})
-    camera = episode.cameras["head"].resized(96, 64)
-    with pytest.raises(DataError, match="another image size"):
-        writer.add(replace(episode, cameras={**episode.cameras, "head": camera}), frames)
+    short = masks["head"][:4]
+    smaller = replace(episode, cameras={**episode.cameras, "head": episode.cameras["head"].resized(96, 64)})
+    for given, message in (
+        ((episode, {**frames, "head": frames["head"][:8]}), r"(?s)differ in length.*expected: 9.*got: 8"),
+        ((episode, {view: images[..., :2] for view, images in frames.items()}), "wrong size"),
+        ((episode, frames, {"head": short}), "Robot masks do not match"),
+        ((episode, frames, masks, None, {"head": short.astype(np.uint8)}), "Labels of things do not match"),
+        ((smaller, frames), "another image size"),
+    ):
+        with pytest.raises(DataError, match=message):
+            writer.add(*given)
     with pytest.raises(DataError, match="Action and state differ"):
         replace(episode, action=episode.action[:4])
     with pytest.raises(DataError, match="Unknown outcome"):
         replace(episode, outcome="maybe")
     with pytest.raises(DataError, match="No episode was kept"):
         writer.close()
-
-
-def test_the_record_of_an_episode_is_stored_whole(sample: Make, tmp_path: Path) -> None:
-    """Every field that the record declares comes back; a field that is added to it is stored without another line."""
-    episode, frames, _ = sample(
-        0, bank="b", candidate=3, primary_view="left_wrist", conventions={"layout": "x", "n": 3},
-        T_base_ee=np.tile(np.eye(4), (9, 2, 1, 1)), gripper=np.linspace(0, 1, 18).reshape(9, 2),
-    )  # fmt: skip
-    with EpisodeSetWriter(tmp_path / "set") as writer:
-        writer.add(episode, frames)
-    read = EpisodeSet.open(tmp_path / "set").episode(0)
-    assert read.described() == episode.described()
-    assert set(ARRAYS) == {"state", "action", "T_base_ee", "gripper"} == set(read.arrays())
-    for name, values in episode.arrays().items():
-        assert getattr(read, name).dtype == ARRAYS[name].dtype
-        assert np.array_equal(getattr(read, name), values)
 
 
 @pytest.mark.parametrize(

@@ -1,22 +1,26 @@
-"""Sources that hold nothing, and recordings of which a part is missing: all that is wrong is said at once."""
+"""Sources that hold nothing, or of which a part is missing: all that is wrong is said at once; sources whose folder is a URL."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import numpy as np
 import pytest
+import yaml
 
 from tests.data import published_robomind as robomind
 from tests.data import test_source_robotwin as robotwin
 from tests.data import test_source_unitree_h5 as unitree
-from tests.data.curating import run
-from tests.data.published_lerobot import FRAMES, write_droid
-from tests.data.test_lerobot_rows import DATA, edit
+from tests.data.curating import preset, run
+from tests.data.published_lerobot import FRAMES, HEIGHT, WIDTH, write_droid, write_robocoin
+from tests.data.test_lerobot import DATA, edit
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
+from worldline_core.store.artifact_files import digest_folder
 
 
 def videos(folder: Path, seed: int) -> dict[str, Any]:
@@ -77,13 +81,10 @@ def test_videos_of_a_camera_and_rows_of_the_table_are_missing(tmp_path: Path) ->
     edit(tmp_path / "raw" / DATA, lambda table: table.slice(0, 2 * FRAMES - 1))
     with pytest.raises(DataError, match="2 quarantined") as refused:
         run(tmp_path, source)
-    said = str(refused.value)
-    assert "the first, raw-000000 (missing_file)" in said
-    of_second = said[said.index("the first, raw-000001 (length_mismatch): 2 things are wrong") :]
-    assert f"expected: {FRAMES} rows" in of_second
-    assert "next step: copy the recording again, or drop it; videos one frame longer" in of_second
-    assert "missing_file: " in of_second
-    assert "observation.images.exterior_2_left" in of_second
+    first, second = str(refused.value).split("raw-000001 (length_mismatch): 2 things are wrong")
+    assert "raw-000000 (missing_file)" in first
+    for said in (f"expected: {FRAMES} rows", "missing_file: ", "observation.images.exterior_2_left"):
+        assert said in second
     counts, curated = run(tmp_path / "available", source, views="available")
     assert counts["reasons"] == {"length_mismatch": 1}
     assert curated.rows[0].views == ("head", "right_wrist")
@@ -125,10 +126,41 @@ def test_what_the_contract_refuses_is_said_at_once(tmp_path: Path) -> None:
     source = droid(tmp_path / "raw")
     for name in ("exterior_1_left", "wrist_left"):
         (tmp_path / f"raw/videos/observation.images.{name}/chunk-000/file-000.mp4").unlink()
-    source["embodiment"] = "so101"  # which has six state columns, not eight
-    with pytest.raises(DataError, match=r"2 quarantined \(2 length_mismatch\)") as refused:
-        run(tmp_path, source)
-    said = str(refused.value)
-    assert "3 things are wrong" in said
+    # so101 has six state columns, not eight.
+    with pytest.raises(DataError, match=r"(?s)2 length_mismatch.*3 things are wrong") as refused:
+        run(tmp_path, source | {"embodiment": "so101"})
     for fault in ("State has another size than the embodiment", "exterior_1_left", "wrist_left"):
-        assert fault in said
+        assert fault in str(refused.value)
+
+
+POSE = [[1.0, 0, 0, 0.1], [0, 0, 1.0, -0.4], [0, -1.0, 0, 1.3], [0, 0, 0, 1.0]]
+CAMERA = {"width": WIDTH, "height": HEIGHT, "K": [[60.0, 0, 63.5], [0, 60.0, 35.5], [0, 0, 1]], "T": POSE}
+
+
+def remote_robocoin(root: Path) -> dict[str, Any]:
+    write_robocoin(root / "one", episodes=2)
+    camera = {**CAMERA, "maps": "camera_to_base", "axes": "opencv"}
+    (root / "one/meta/calibration.yaml").write_text(yaml.safe_dump({"views": {"head": camera}}))
+    return preset("robocoin", root, calibration="meta/calibration.yaml")
+
+
+def remote_robomind(root: Path) -> dict[str, Any]:
+    robomind.write_franka(root)
+    (root / "instr.csv").write_text("task,instruction\nbread_in_basket,take the bread\n")
+    declared = {"layout": "h5_franka_3rgb", "fps": 10, "gripper_state": robomind.GRIPPER, "instructions": "instr.csv"}
+    return {"kind": "robomind", **declared}
+
+
+@pytest.mark.parametrize("make", [remote_robocoin, remote_robomind])
+@pytest.mark.usefixtures("reading_in_this_process")  # which alone has a file system in memory
+def test_a_source_in_an_object_store(tmp_path: Path, make: Callable[[Path], dict[str, Any]]) -> None:
+    root = tmp_path / "raw"
+    root.mkdir()
+    source, bucket = make(root), f"/{make.__name__}"
+    fsspec.filesystem("memory").put(f"{root}/", f"{bucket}/", recursive=True)
+    digests = set()
+    for number, path in enumerate((str(root), f"memory:/{bucket}")):
+        counts, curated = run(tmp_path / str(number), {**source, "path": path, "name": "same"})
+        assert counts["quarantined"] == 0
+        digests.add(digest_folder(curated.root))
+    assert len(digests) == 1

@@ -44,23 +44,19 @@ def test_one_spelling(raw: str, expected: str) -> None:
 
 
 def test_of_several_annotations_the_majority_counts() -> None:
-    texts = ["n/a", "Lift the cup.", "raise the mug", "lift the cup", ""]
-    assert one_annotation(texts) == "Lift the cup."
+    assert one_annotation(["n/a", "Lift the cup.", "raise the mug", "lift the cup", ""]) == "Lift the cup."
     assert one_annotation(["Raise it", "lift it"]) == "Raise it"
-    assert one_annotation(["n/a", " "]) == ""
-    assert one_annotation([]) == ""
+    assert one_annotation(["n/a", " "]) == one_annotation([]) == ""
 
 
 def test_the_raw_text_is_kept_where_it_differs(sample: Callable[..., tuple]) -> None:
-    episode = replace(sample(0)[0], instruction="Lift the block.", conventions={"layout": "x"})
-    changed = with_instruction(episode)
+    changed = with_instruction(replace(sample(0)[0], instruction="Lift the block.", conventions={"layout": "x"}))
     assert changed.instruction == "lift the block"
     assert changed.conventions == {"layout": "x", RAW_INSTRUCTION: "Lift the block."}
     assert with_instruction(changed) is changed
 
 
 def test_texts_that_tell_the_outcome_are_noticed() -> None:
-    for text in ("pick the cup (failed)", "successful grasp", "Failure: lift", "it succeeds", "unsuccessful lift"):
-        assert mentions_outcome(text), text
-    for text in ("lift the successor", "failsafe switch on", "pick the cup"):
-        assert not mentions_outcome(text), text
+    telling = "pick the cup (failed)", "successful grasp", "Failure: lift", "it succeeds", "unsuccessful lift"
+    assert all(map(mentions_outcome, telling))
+    assert not any(map(mentions_outcome, ("lift the successor", "failsafe switch on", "pick the cup")))

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from tests.data.curating import run
 from tests.data.published_lerobot import write_droid
-from tests.data.test_lerobot_rows import source
+from tests.data.test_lerobot import source
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError

@@ -11,19 +11,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
+from tests.data import curating
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ConfigError
-from worldline_core.filters.filter import filter_episodes
-from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 
-def run(tmp_path: Path, **source: Any) -> tuple[dict[str, Any], EpisodeSet]:
-    counts = curate(CurateConfig.model_validate({"sources": [source], "image_size": (48, 64)}), {}, tmp_path / "out")
-    assert counts["kept"] + counts["quarantined"] == counts["found"]
-    return counts, EpisodeSet.open(tmp_path / "out")
+def run(
+    tmp_path: Path, *, image_size: Any = (48, 64), trim: Any = None, **source: Any
+) -> tuple[dict[str, Any], EpisodeSet]:
+    return curating.run(tmp_path, source, image_size=(48, 64), trim=trim)
 
 
 def test_agibot_v1(tmp_path: Path, shared_data: Path) -> None:
@@ -74,16 +70,12 @@ def test_agibot_v2(tmp_path: Path, shared_data: Path) -> None:
     episode = curated.episode(0)
     assert episode.state.shape == (456, 16)
     assert np.abs(episode.state - episode.action)[:, :7].max() < 0.2  # the command is tracked
-    assert 0 <= episode.state[:, [7, 15]].min() <= episode.state[:, [7, 15]].max() <= 1
-    assert episode.state[0, 15] > 0.99
-    assert episode.state[:, 15].min() < 0.05
+    assert 0 <= episode.state[:, [7, 15]].min() < 0.05 < 0.99 < episode.state[0, 15] <= 1
     head = episode.cameras["head"]
     assert (head.width, head.height) == (64, 48)
     in_camera = np.linalg.inv(head.T_base_camera[0]) @ np.append(episode.T_base_ee[0, 0, :3, 3], 1)  # type: ignore[index]
     u, v = (head.K @ (in_camera[:3] / in_camera[2]))[:2]
-    assert in_camera[2] > 0
-    assert 0 < u < 64
-    assert 0 < v < 48
+    assert in_camera[2] > 0 and 0 < u < 64 and 0 < v < 48
 
 
 @pytest.mark.slow
@@ -97,27 +89,10 @@ def test_droid(tmp_path: Path, shared_data: Path) -> None:
     }
     assert {row.stage2_reason for row in curated.rows} == {"missing_calibration"}
     assert all(row.stage1_ok and row.fps == 4.0 for row in curated.rows)
-    uneven = ["droid-val-0003", "droid-val-0006"]
-    source = {"kind": "droid_annotation", "path": str(folder), "name": "droid", "include": uneven}
-    trimming = CurateConfig.model_validate({"sources": [source], "trim": "common", "image_size": (48, 64)})
-    counts = curate(trimming, {}, tmp_path / "trimmed")
+    uneven = {"kind": "droid_annotation", "name": "droid", "include": ["droid-val-0003", "droid-val-0006"]}
+    counts, trimmed = run(tmp_path / "trimmed", trim="common", path=str(folder), **uneven)
     assert (counts["kept"], counts["trimmed"]) == (2, 2)
-    trimmed = EpisodeSet.open(tmp_path / "trimmed")
     assert [trimmed.rows[trimmed.position(f"droid-val-{n}")].num_frames for n in ("0003", "0006")] == [205, 41]
-
-
-def test_unitree(tmp_path: Path, shared_data: Path) -> None:
-    counts, curated = run(
-        tmp_path,
-        kind="lerobot_v21",
-        path=str(shared_data / "lerobot_unitree_g1"),
-        embodiment="none",
-        angle_unit="rad",
-        views={"observation.images.cam_high": "head"},
-    )
-    assert (counts["found"], counts["kept"], counts["reasons"]) == (100, 2, {"missing_file": 98})
-    assert [row.num_frames for row in curated.rows] == [221, 277]
-    assert [row.stage2_reason for row in curated.rows] == ["missing_calibration", "missing_calibration"]
 
 
 @pytest.mark.slow
@@ -144,24 +119,20 @@ def test_unitree_with_its_arms_named(tmp_path: Path, shared_data: Path) -> None:
     root = shared_data / "lerobot_unitree_g1"
     order = ("ShoulderPitch", "ShoulderRoll", "ShoulderYaw", "Elbow", "WristRoll", "WristPitch", "WristYaw")
     arms = [
-        {
-            "name": side,
-            "state": {"joints": {"feature": "observation.state", "columns": [f"k{side.title()}{j}" for j in order]}},
-            "action": {"joints": {"feature": "action", "columns": [f"k{side.title()}{j}" for j in order]}},
+        {"name": side} | {
+            track: {"joints": {"feature": feature, "columns": [f"k{side.title()}{joint}" for joint in order]}}
+            for track, feature in (("state", "observation.state"), ("action", "action"))
         }
         for side in ("left", "right")
-    ]
+    ]  # fmt: skip
     counts, curated = run(
-        tmp_path,
-        kind="lerobot_v21",
-        path=str(root),
-        name="unitree",
-        embodiment="none",
-        angle_unit="rad",
-        views={"observation.images.cam_high": "head"},
-        arms=arms,
-    )
+        tmp_path, kind="lerobot_v21", path=str(root), name="unitree", embodiment="none", angle_unit="rad",
+        views={"observation.images.cam_high": "head"}, arms=arms,
+    )  # fmt: skip
     assert (counts["found"], counts["kept"], counts["reasons"]) == (100, 2, {"missing_file": 98})
+    assert [(row.num_frames, row.stage2_reason) for row in curated.rows] == [
+        (221, "missing_calibration"), (277, "missing_calibration"),
+    ]  # fmt: skip
     first = curated.episode(0)
     table = pq.read_table(root / "data/chunk-000/episode_000029.parquet", columns=["observation.state", "action"])
     raw = np.asarray(table["observation.state"].to_pylist())
@@ -170,20 +141,6 @@ def test_unitree_with_its_arms_named(tmp_path: Path, shared_data: Path) -> None:
     assert curated.rows[0].instruction == "pick up the yellow bottle on the table"
     # The commands lead the joints they are given to.
     assert np.abs(first.action - first.state).mean() < np.abs(first.action - first.state[::-1]).mean()
-
-
-@pytest.mark.slow
-def test_videos_of_droid_as_plain_videos_are_for_evaluation_alone(tmp_path: Path, shared_data: Path) -> None:
-    folder = shared_data / "droid_ctrl_world" / "droid_new_setup" / "videos"
-    counts, curated = run(tmp_path, kind="video_folder", path=str(folder), name="clips", suffixes=[".mp4"])
-    assert counts["found"] == 18
-    assert counts["kept"] + counts["reasons"].get("duplicate", 0) == 18
-    assert {row.stage2_reason for row in curated.rows} == {"missing_actions"}
-    by_scene = {row.scene for row in curated.rows}
-    assert len(by_scene) == 6  # the three cameras of one episode share its scene
-    source = {"kind": "video_folder", "path": str(folder), "name": "droid_videos", "split": "train"}
-    with pytest.raises(ConfigError, match="evaluation only were assigned to training"):
-        curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "second")
 
 
 def test_droid_with_the_self_calibration(tmp_path: Path, shared_data: Path) -> None:
@@ -199,44 +156,15 @@ def test_droid_with_the_self_calibration(tmp_path: Path, shared_data: Path) -> N
     tips = pose_from_euler_fixed_xyz(states[:, :3], states[:, 3:6]) @ np.array([0, 0, 0.155, 1.0])
     for number in (0, 1):
         camera = recorded[f"camera_{number}"]
-        entry = CameraEntry.model_validate(
-            {"width": width, "height": height, "maps": "camera_to_base", "axes": "opencv", "K": camera["K"], "T": camera["c2w_opencv"]}
-        )  # fmt: skip
+        size = {"width": width, "height": height, "maps": "camera_to_base", "axes": "opencv"}
+        entry = CameraEntry.model_validate({**size, "K": camera["K"], "T": camera["c2w_opencv"]})
         cameras = RecordedCameras()
         add_calibrated_view(
-            cameras,
-            "head",
-            entry,
-            image_size=(height // 2, width // 2),
-            num_frames=len(states),
-            read_feature=lambda name: np.zeros(0),
-            where="sample",
-        )
+            cameras, "head", entry, image_size=(height // 2, width // 2), num_frames=len(states),
+            read_feature=lambda name: np.zeros(0), where="sample",
+        )  # fmt: skip
         found = cameras.tracks["head"]
         seen = tips @ np.linalg.inv(found.T_base_camera[0]).T
-        pixels = seen[:, :3] @ found.K.T
-        pixels = pixels[:, :2] / pixels[:, 2:]
+        pixels = (seen[:, :3] / seen[:, 2:3] @ found.K.T)[:, :2]
         inside = (seen[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < [width // 2, height // 2]).all(axis=1)
         assert inside.mean() > 0.9
-
-
-@pytest.mark.slow
-def test_wrist_views_that_are_enlarged_are_as_sharp_as_before(tmp_path: Path, shared_data: Path) -> None:
-    name = "droid-droid_new_setup-val-0002"
-    source = {
-        "kind": "droid_annotation",
-        "path": str(shared_data / "droid_ctrl_world"),
-        "name": "droid",
-        "include": [name],
-    }
-    sharpness = {}
-    for size in (None, (480, 640)):
-        config = CurateConfig.model_validate({"sources": [source], "image_size": size, "video_preset": "ultrafast"})
-        out = tmp_path / str(size)
-        curate(config, {}, out / "set")
-        sharpness[size] = EpisodeSet.open(out / "set").thumbnails(0, "right_wrist").sharpness
-        filter_episodes(FilterConfig(required_views=("head",)), {"episodes": out / "set"}, out / "filtered")
-        found = pq.read_table(out / "filtered" / "findings.parquet", filters=[("detector", "=", "blur")])
-        assert found.column("cut_frames").to_pylist() == [0, 0, 0]
-        assert not (EpisodeSet.open(out / "filtered").quarantine())
-    assert sharpness[480, 640] == pytest.approx(sharpness[None], rel=0.25)

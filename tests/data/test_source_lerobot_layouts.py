@@ -90,7 +90,7 @@ LIMITS = [[-2.0, 2.0], [-1.0, 3.0]]
         ("range_m100_100", {"ranges": [[2.0, -2.0], [-1.0, 3.0]]}, lambda v: v / 100 * [-2, 2] + [0, 1]),
     ],
 )
-def test_columns_by_place_and_in_lerobots_own_units(
+def test_columns_by_place_in_lerobots_own_units(
     tmp_path: Path, unit: str, joints: dict[str, Any], expected: Any
 ) -> None:
     state = write_robocoin(tmp_path / "raw")
@@ -308,9 +308,7 @@ def test_droid_is_refused_for_training_whatever_it_is_called(tmp_path: Path, spl
 @pytest.mark.parametrize(
     ("changes", "robot"), [({"name": "my_droid_100"}, "franka"), ({}, "Droid"), ({"embodiment": "droid_franka"}, "x")]
 )
-def test_droid_is_known_by_its_name_its_robot_or_its_embodiment(
-    tmp_path: Path, changes: dict[str, Any], robot: str
-) -> None:
+def test_droid_is_known_by_name_robot_or_embodiment(tmp_path: Path, changes: dict[str, Any], robot: str) -> None:
     write_robocoin(tmp_path / "raw")
     info = tmp_path / "raw/meta/info.json"
     info.write_text(json.dumps({**json.loads(info.read_text()), "robot_type": robot}))

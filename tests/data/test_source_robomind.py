@@ -29,7 +29,6 @@ from tests.data.published_robomind import (
 )  # fmt: skip
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.sources.hdf5 import open_hdf5
-from worldline_core.data.sources.robomind import RobomindSource
 from worldline_core.errors import DataError
 
 
@@ -95,20 +94,6 @@ def test_version_2(tmp_path: Path) -> None:
     assert np.allclose(episode.state[:, 8:15], wave(8, 1)[:, :7], atol=1e-6)
     assert np.allclose(episode.action[:, :7], wave(8)[:, :7] + 0.05, atol=1e-6)
     assert np.allclose(episode.state[:, [7, 15]], np.linspace(1, 0, LENGTH)[:, None], atol=1e-6)
-
-
-def test_images_are_read_one_by_one(tmp_path: Path) -> None:
-    path = write_franka(tmp_path / "raw")
-    source = RobomindSource(CurateConfig.model_validate({"sources": [settings(tmp_path)]}).sources[0], tmp_path / "raw")  # type: ignore[arg-type]
-    loaded = source.load(source.episode_ids()[0])
-    assert loaded.images is not None
-    with h5py.File(path, "r") as file:
-        expected = cv2.imdecode(file["observations/rgb_images/camera_top"][0], cv2.IMREAD_COLOR)[..., ::-1]
-    images = loaded.each_image("head")
-    first = next(images)
-    assert np.array_equal(first, expected)
-    assert len(list(images)) == LENGTH - 1
-    assert np.array_equal(loaded.frames("head")[0], first)
 
 
 @pytest.mark.parametrize("channels", ["standard", "as_written"])
@@ -197,9 +182,7 @@ def test_a_dexterous_hand_is_no_gripper(tmp_path: Path) -> None:
         ("v2_ur", {"gripper_command": GRIPPER}, "channels"),
     ],
 )
-def test_what_the_release_does_not_say_must_be_declared(
-    tmp_path: Path, layout: str, changes: dict[str, Any], missing: str
-) -> None:
+def test_what_is_not_said_must_be_declared(tmp_path: Path, layout: str, changes: dict[str, Any], missing: str) -> None:
     with pytest.raises(ValidationError, match=rf"does not say it of {layout}, so declare {missing}"):
         CurateConfig.model_validate({"sources": [settings(tmp_path, layout, **changes)]})
 

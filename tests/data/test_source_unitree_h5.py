@@ -129,7 +129,7 @@ def test_another_order_of_columns_is_named(tmp_path: Path, declared: str, record
     ("track", "closed", "opened"),
     [("gripper_state", 0.0, 0.2), ("gripper_command", 0.5, 0.4), ("gripper_command", 20, 0)],
 )
-def test_a_gripper_outside_of_its_range_in_most_frames_is_refused(
+def test_a_gripper_mostly_outside_of_its_range_is_refused(
     tmp_path: Path, track: str, closed: float, opened: float
 ) -> None:
     path = write_hdf5(tmp_path)

@@ -1,4 +1,4 @@
-"""Plain videos with captions beside them, written here with PyAV alone, from the folder to a step of Stage I."""
+"""Plain videos with captions beside them, written here with PyAV alone, from the folder to the clips of Stage I."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import av
 import numpy as np
 import pytest
 
+from tests.data import curating
+from tests.data.curating import reasons, record, run
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.render_actions import render_actions
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.video_folder import caption_table
@@ -39,26 +39,15 @@ def pictures(seed: int, count: int = FRAMES, *, moving: bool = True) -> np.ndarr
     return frames
 
 
-def write_video(
-    path: Path, frames: np.ndarray, *, rate: int = RATE, times: list[int] | None = None, codec: str = "libx264"
-) -> None:
+def write_video(path: Path, frames: np.ndarray, times: list[int] | None = None) -> None:
     """With B frames, so that file order is not the order of presentation; `times` in ticks of 1/(10 rate)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w", format="mp4") as out:
-        stream = out.add_stream(codec, rate=rate, options={"bf": "2", "crf": "12"})
-        stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], "yuv420p"
-        stream.codec_context.time_base = Fraction(1, 10 * rate)
-        for n, frame in enumerate(frames):
-            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            picture.pts = 10 * n if times is None else times[n]
-            picture.time_base = stream.codec_context.time_base
-            out.mux(stream.encode(picture))
-        out.mux(stream.encode(None))
+    ticks = times or [10 * n for n in range(len(frames))]
+    options = {"bf": "2", "crf": "12"}
+    curating.write_video(path, frames, rate=RATE, options=options, times=ticks, tick=Fraction(1, 10 * RATE))
 
 
-def settings(root: Path, **changes: Any) -> CurateConfig:
-    source = {"kind": "video_folder", "path": str(root), "name": "web", "split": "train", **changes}
-    return CurateConfig.model_validate({"sources": [source]})
+def settings(root: Path) -> dict[str, Any]:
+    return {"kind": "video_folder", "path": str(root), "name": "web", "split": "train"}
 
 
 def test_videos_with_captions_beside_them_come_through(tmp_path: Path) -> None:
@@ -66,9 +55,8 @@ def test_videos_with_captions_beside_them_come_through(tmp_path: Path) -> None:
     write_video(root / "kitchen" / "one.mp4", pictures(1))
     (root / "kitchen" / "one.txt").write_text("  pour the\n tea ")
     write_video(root / "two.MP4", pictures(2, 20))
-    counts = curate(settings(root), {}, tmp_path / "out")
-    assert (counts["found"], counts["kept"], counts["splits"]) == (2, 2, {"train": 2})
-    curated = EpisodeSet.open(tmp_path / "out")
+    counts, curated = run(tmp_path, settings(root))
+    assert (counts["found"], counts["splits"]) == (2, {"train": 2})
     one, two = curated.rows
     assert (one.episode_id, one.scene, one.instruction) == ("web-kitchen-one", "web-kitchen", "pour the tea")
     assert (two.episode_id, two.scene, two.instruction) == ("web-two", "web", "")
@@ -80,16 +68,11 @@ def test_videos_with_captions_beside_them_come_through(tmp_path: Path) -> None:
     found = curated.frames(0, "head").astype(int)
     assert np.abs(found - pictures(1)).mean() < 6
     assert all(np.abs(found[n] - pictures(1)[n]).mean() < np.abs(found[n] - pictures(1)[n - 1]).mean() for n in (5, 20))
-
-
-def test_the_set_has_no_empty_columns_and_opens_in_lerobots_terms(tmp_path: Path) -> None:
-    write_video(tmp_path / "raw" / "one.mp4", pictures(1))
-    curate(settings(tmp_path / "raw"), {}, tmp_path / "out")
-    info = json.loads((tmp_path / "out/datasets/unspecified/meta/info.json").read_text())
-    assert not {"observation.state", "action"} & set(info["features"])
-    stats = json.loads((tmp_path / "out/datasets/unspecified/meta/stats.json").read_text())
-    assert not {"observation.state", "action"} & set(stats)
-    contract = json.loads((tmp_path / "out/datasets/unspecified/meta/worldline/contract.json").read_text())
+    # The set has no empty columns, and opens in LeRobot's terms.
+    meta = curated.root / "datasets/unspecified/meta"
+    features = json.loads((meta / "info.json").read_text())["features"]
+    assert not {"observation.state", "action"} & {*features, *json.loads((meta / "stats.json").read_text())}
+    contract = json.loads((meta / "worldline/contract.json").read_text())
     assert (contract["state_kind"], contract["action"]) == ("none", "none")
 
 
@@ -99,12 +82,16 @@ def test_lerobots_own_class_reads_a_set_without_states(tmp_path: Path, monkeypat
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
     write_video(tmp_path / "raw" / "one.mp4", pictures(1))
-    curate(settings(tmp_path / "raw"), {}, tmp_path / "out")
+    counts, _ = run(tmp_path, settings(tmp_path / "raw"))
+    assert counts["videos"]["copied"] == 1  # with its frames stored out of order
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    opened = LeRobotDataset("local/set", root=tmp_path / "out/datasets/unspecified", video_backend="pyav")
+    opened: Any = LeRobotDataset("local/set", root=tmp_path / "out/datasets/unspecified", video_backend="pyav")
     assert len(opened) == FRAMES
-    assert opened[7]["observation.images.head"].shape == (3, HEIGHT, WIDTH)
+    shown = curating.plain_frames(tmp_path / "raw" / "one.mp4")
+    for n in (0, 7, 14, FRAMES - 1):
+        pixels = (opened[n]["observation.images.head"].permute(1, 2, 0).numpy() * 255).round()
+        assert np.array_equal(pixels, shown[n])
 
 
 @pytest.mark.parametrize("suffix", [".jsonl", ".csv"])
@@ -151,7 +138,7 @@ def test_what_is_no_usable_video_is_quarantined_and_the_rest_goes_on(tmp_path: P
     write_video(root / "good.mp4", pictures(1))
     (root / "good.txt").write_text("push")
     write_video(root / "silent.mp4", pictures(4))
-    write_video(root / "late.mp4", pictures(2, 20), times=[10 * n + (40 if n > 9 else 0) for n in range(20)])
+    write_video(root / "late.mp4", pictures(2, 20), [10 * n + (40 if n > 9 else 0) for n in range(20)])
     (root / "late.txt").write_text("push")
     content = (root / "good.mp4").read_bytes()
     for name, cut in (("empty", b""), ("garbage", bytes(range(256)) * 8), ("cut", content[: len(content) // 2])):
@@ -161,25 +148,17 @@ def test_what_is_no_usable_video_is_quarantined_and_the_rest_goes_on(tmp_path: P
     (root / "strange.txt").write_bytes(b"\xff\xfe\xfa")
     (tmp_path / "secret.mp4").write_bytes(content)
     (root / "link.mp4").symlink_to(tmp_path / "secret.mp4")
-    counts = curate(settings(root), {}, tmp_path / "out")
-    assert (counts["found"], counts["kept"]) == (8, 2)
-    found = {row.episode_id.removeprefix("web-"): row.reason for row in EpisodeSet.open(tmp_path / "out").quarantine()}
+    # Paths that would share an id are told apart.
+    write_video(root / "a-b" / "c.mp4", pictures(5))
+    write_video(root / "a" / "b-c.mp4", pictures(6))
+    counts, curated = run(tmp_path, settings(root))
+    assert (counts["found"], counts["kept"], len({row.episode_id for row in curated.rows})) == (10, 4, 4)
+    found = {name.removeprefix("web-"): reason for name, reason in reasons(curated).items()}
     assert found.pop("garbage") in ("unreadable", "truncated_video")
     assert found == {
-        "late": "wrong_fps",
-        "empty": "truncated_video",
-        "cut": "truncated_video",
-        "strange": "unreadable",
+        "late": "wrong_fps", "empty": "truncated_video", "cut": "truncated_video", "strange": "unreadable",
         "link": "path_traversal",
-    }
-
-
-def test_paths_that_would_share_an_id_are_told_apart(tmp_path: Path) -> None:
-    write_video(tmp_path / "raw" / "a-b" / "c.mp4", pictures(1))
-    write_video(tmp_path / "raw" / "a" / "b-c.mp4", pictures(2))
-    counts = curate(settings(tmp_path / "raw"), {}, tmp_path / "out")
-    assert (counts["found"], counts["kept"]) == (2, 2)
-    assert len({row.episode_id for row in EpisodeSet.open(tmp_path / "out").rows}) == 2
+    }  # fmt: skip
 
 
 def test_frame_times_are_those_of_decoding(tmp_path: Path) -> None:
@@ -198,61 +177,37 @@ def test_a_state_without_columns_is_none_and_only_that() -> None:
             Episode(**about, state=values, action=values, state_kind=kind)
 
 
-def test_from_a_folder_of_videos_to_a_step_of_stage_1(tmp_path: Path, project_root: Path, sample: Any) -> None:
+def test_from_a_folder_of_videos_to_the_clips_of_stage_1(tmp_path: Path, project_root: Path, sample: Any) -> None:
     """Together with a robot's recording: Stage I takes both, Stage II and the action tracks the robot's alone."""
     import torch
 
-    from worldline_core.data.episodes.episode_set import EpisodeSetWriter
     from worldline_core.training.clip_config import EncodeLatentsConfig
     from worldline_core.training.clip_source import LatentStore, training_rows
     from worldline_core.training.encode_latents import encode_latents
-    from worldline_core.training.stage1 import train_stage1
-    from worldline_core.training.training_config import Stage1Config
 
     torch.set_num_threads(1)
     root, robot = tmp_path / "raw", tmp_path / "robot"
     write_video(root / "moving.mp4", pictures(1))
     (root / "moving.txt").write_text("push the red block")
     write_video(root / "still.mp4", pictures(2, moving=False))
-    with EpisodeSetWriter(robot) as writer:
-        writer.add(*sample(0, num_frames=FRAMES, height=HEIGHT, width=WIDTH))
-    config = settings(root)
-    both = CurateConfig(sources=(*config.sources, *_robot(robot)))
-    assert curate(both, {}, tmp_path / "set")["kept"] == 3
+    record(robot, [sample(0, num_frames=FRAMES, height=HEIGHT, width=WIDTH)])
+    counts, episodes = run(tmp_path, settings(root), {"kind": "episode_set", "path": str(robot)})
+    assert counts["kept"] == 3
 
-    counts = filter_episodes(FilterConfig(), {"episodes": tmp_path / "set"}, tmp_path / "filtered")
+    counts = filter_episodes(FilterConfig(), {"episodes": episodes.root}, tmp_path / "filtered")
     assert counts["reasons"].get("static") == 1
     rows = {row.episode_id: row for row in EpisodeSet.open(tmp_path / "filtered").rows}
     assert (rows["web-moving"].stage1_ok, rows["web-moving"].stage2_reason) == (True, "missing_actions")
 
-    rendered = render_actions(
-        RenderActionsConfig.model_validate({"previews": 0}), {"episodes": tmp_path / "set"}, tmp_path / "tracks"
-    )
+    rendered = render_actions(RenderActionsConfig(previews=0), {"episodes": episodes.root}, tmp_path / "tracks")
     assert (rendered["found"], rendered["kept"]) == (3, 1)
     assert rendered["quarantine_reasons"] == {"missing_actions": 2}
 
     tokenizer = project_root / "artifacts" / "shipped" / "models" / "tokenizer"
-    inputs = {"episodes": tmp_path / "set", "tokenizer": tokenizer}
+    inputs = {"episodes": episodes.root, "tokenizer": tokenizer}
     encode_latents(EncodeLatentsConfig(), inputs, tmp_path / "latents")
     store = LatentStore.open(tmp_path / "latents")
     assert store.row("web-moving").views == ("head",)
     assert len(store.row("episode-000").views) == 3
-    episodes = EpisodeSet.open(tmp_path / "set")
     assert {row.episode_id for row in training_rows(store, episodes, stage=2, views=("head",))} == {"episode-000"}
     assert len(training_rows(store, episodes, stage=1)) == 3
-
-    model = {
-        "latent_channels": store.latent_shape[0], "hidden_size": 24, "num_layers": 2, "num_heads": 2, "num_kv_heads": 1,
-        "head_dim": 12, "intermediate_size": 32, "rope_sections": [2, 2, 2], "vocab_size": 300,
-    }  # fmt: skip
-    stage1 = Stage1Config.model_validate(
-        {"model": model, "trainer": {"steps": 2, "batch_size": 3, "precision": "fp32"}, "clips": {"lengths": [9],
-         "view_weights": {"primary": 1}}}
-    )  # fmt: skip
-    metrics = train_stage1(stage1, {"episodes": tmp_path / "set", "latents": tmp_path / "latents"}, tmp_path / "stage1")
-    assert (metrics["steps"], metrics["clips"]) == (2, 6)
-    assert (tmp_path / "stage1" / "model.safetensors").is_file()
-
-
-def _robot(folder: Path) -> Any:
-    return CurateConfig.model_validate({"sources": [{"kind": "episode_set", "path": str(folder)}]}).sources

@@ -155,39 +155,29 @@ def with_exif(orientation: int, kind: str) -> bytes:
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG"])
-@pytest.mark.parametrize("orientation", MATRICES)
-def test_images_are_turned_as_exif_says(orientation: int, kind: str) -> None:
-    expected = as_shown(MATRICES[orientation])  # EXIF 2.32, 4.6.4: the same eight
-    content = with_exif(orientation, kind)
-    found = decode_image(content, "here")
-    assert off(found, expected) <= 4
-    assert np.array_equal(decode_image(content, "here", channels="bgr"), found[..., ::-1])
-    assert image_size(content, "here") == found.shape[:2] == large(expected).shape[:2]
-    if orientation == 1:
-        decode_image(content, "here", calibrated=True)
-        return
-    with pytest.raises(RejectedInputError, match=f"orientation {orientation}") as caught:
-        decode_image(content, "here", calibrated=True)
-    assert caught.value.reason == "missing_calibration"
-
-
-@pytest.mark.parametrize("value", [0, 9, 65535])
-def test_an_orientation_that_is_none_turns_nothing(value: int) -> None:
-    assert off(decode_image(with_exif(value, "JPEG"), "here", calibrated=True), STORED) <= 4
-
-
-def png(image: np.ndarray) -> bytes:
-    return bytes(cv2.imencode(".png", image)[1])
+def test_images_are_turned_as_exif_says(kind: str) -> None:
+    for orientation, matrix in MATRICES.items():
+        expected = as_shown(matrix)  # EXIF 2.32, 4.6.4: the same eight
+        content = with_exif(orientation, kind)
+        found = decode_image(content, "here")
+        assert off(found, expected) <= 4
+        assert np.array_equal(decode_image(content, "here", channels="bgr"), found[..., ::-1])
+        assert image_size(content, "here") == found.shape[:2] == large(expected).shape[:2]
+        if orientation > 1:
+            with pytest.raises(RejectedInputError, match=f"orientation {orientation}") as caught:
+                decode_image(content, "here", calibrated=True)
+            assert caught.value.reason == "missing_calibration"
+    for value in (0, 1, 9, 65535):  # turn nothing
+        assert off(decode_image(with_exif(value, kind), "here", calibrated=True), STORED) <= 4
 
 
 def test_images_of_depth_are_no_pictures() -> None:
     depth = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 50
     with pytest.raises(RejectedInputError, match="depth, not colour") as caught:
-        decode_image(png(depth), "here")
+        decode_image(bytes(cv2.imencode(".png", depth)[1]), "here")
     assert caught.value.reason == "not_colour"
-    colour = np.stack([depth, depth, depth], axis=-1)
-    assert decode_image(png(colour), "here").shape == (24, 32, 3)  # 16 bits of colour are colour
-    assert decode_image(png((depth >> 8).astype(np.uint8)), "here").shape == (24, 32, 3)  # a grey camera
+    for colour in (np.stack([depth] * 3, axis=-1), (depth >> 8).astype(np.uint8)):  # of 16 bits, of a grey camera
+        assert decode_image(bytes(cv2.imencode(".png", colour)[1]), "here").shape == (24, 32, 3)
 
 
 @pytest.mark.parametrize(
@@ -209,27 +199,20 @@ def test_a_video_of_depth_is_no_video(tmp_path: Path, codec: str, pixel_format: 
         next(read_clip(VideoClip(path, 3, RATE)))
 
 
-@pytest.mark.parametrize(
-    "said",
-    [
-        {"info": {"video.is_depth_map": True}},
-        {"info": {"is_depth_map": True}},
-        {"video_info": {"video.is_depth_map": True}},
-        {"is_depth_map": True},
-    ],
-)
-def test_a_depth_video_of_lerobot_is_refused_by_name(tmp_path: Path, said: dict[str, Any]) -> None:
-    for name in ("one", "two"):
-        write_robocoin(tmp_path / "raw" / name)
-    path = tmp_path / "raw/two/meta/info.json"
+def test_depth_videos_of_lerobot_are_refused_by_name(tmp_path: Path) -> None:
     source = preset("robocoin", tmp_path / "raw")
     key = next(iter(source["views"]))
-    info = json.loads(path.read_text())
-    info["features"][key].update(said)
-    path.write_text(json.dumps(info))
-    assert run(tmp_path, source)[0]["reasons"]["not_colour"] == 1
+    named, plain = {"video.is_depth_map": True}, {"is_depth_map": True}
+    for name, said in enumerate(({}, {"info": named}, {"info": plain}, {"video_info": named}, plain)):
+        write_robocoin(tmp_path / f"raw/{name}")
+        path = tmp_path / f"raw/{name}/meta/info.json"
+        info = json.loads(path.read_text())
+        info["features"][key].update(said)
+        path.write_text(json.dumps(info))
+    counts, _ = run(tmp_path, source)
+    assert (counts["kept"], counts["reasons"]) == (1, {"not_colour": 4})
     with pytest.raises(DataError, match=f"(?s)depth, not colour.*{key}"):
-        run(tmp_path / "alone", {**source, "path": str(tmp_path / "raw/two"), "collection": False})
+        run(tmp_path / "alone", {**source, "path": str(tmp_path / "raw/2"), "collection": False})
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from worldline_core.filters.filter_config import FilterConfig
 
 Make = Callable[..., tuple]
 FRAMES = 40
+Copied = tuple[dict[str, Any], dict[str, Any], EpisodeSet]
 
 
 def recordings(folder: Path, count: int) -> dict[str, Any]:
@@ -49,7 +50,7 @@ def one(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def copied(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict[str, Any], EpisodeSet]:
+def copied(tmp_path_factory: pytest.TempPathFactory) -> Copied:
     """The source of two recordings, the counts of their curation, and the set."""
     folder = tmp_path_factory.mktemp("two")
     source = recordings(folder, 2)
@@ -57,7 +58,7 @@ def copied(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], di
 
 
 @pytest.fixture
-def curated(tmp_path: Path, copied: tuple[dict[str, Any], dict[str, Any], EpisodeSet]) -> EpisodeSet:
+def curated(tmp_path: Path, copied: Copied) -> EpisodeSet:
     """A copy of that set, to be changed."""
     return EpisodeSet.open(shutil.copytree(copied[2].root, tmp_path / "curated"))
 
@@ -66,9 +67,7 @@ def cached_thumbnails(episodes: EpisodeSet) -> Path:
     return next((episodes.root / "run/thumbnails").rglob("*head*/*/file-000.npz"))
 
 
-def test_curation_copies_the_packets_and_counts_them(
-    tmp_path: Path, copied: tuple[dict[str, Any], dict[str, Any], EpisodeSet]
-) -> None:
+def test_curation_copies_the_packets_and_counts_them(tmp_path: Path, copied: Copied) -> None:
     source, counts, after = copied
     assert counts["videos"] == {"copied": 6, "encoded": 0}
     before = EpisodeSet.open(source["path"])
@@ -89,9 +88,7 @@ def test_curation_copies_the_packets_and_counts_them(
 @pytest.mark.parametrize(
     "changes", [{"video_mode": "encode"}, {"image_size": [64, 96]}, {"fps": 4}, {"stride": 2}], ids=str
 )
-def test_what_changes_the_picture_or_asks_for_it_is_encoded(
-    tmp_path: Path, one: dict[str, Any], changes: dict[str, Any]
-) -> None:
+def test_what_changes_the_picture_is_encoded(tmp_path: Path, one: dict[str, Any], changes: dict[str, Any]) -> None:
     counts, after = run(tmp_path, one, video_crf=2, **changes)
     assert counts["videos"] == {"copied": 0, "encoded": 3}
     step = 2 if "fps" in changes or "stride" in changes else 1
@@ -223,30 +220,6 @@ def test_too_few_or_too_many_images_are_refused(tmp_path: Path, sample: Make) ->
         assert caught.value.reason == "length_mismatch"
     with pytest.raises(RejectedInputError, match=r"no pictures|differ in length"):
         store_view(RecordedView(lambda: iter(()), 3), tmp_path / "v.mp4", 8.0, VideoSettings())
-
-
-def test_images_come_one_at_a_time(sample: Make, tmp_path: Path) -> None:
-    episode, frames, _ = sample(0, num_frames=30)
-    alive = 0
-
-    class Counted(np.ndarray):
-        most = 0
-
-        def __del__(self) -> None:
-            nonlocal alive
-            alive -= 1
-
-    def images():
-        nonlocal alive
-        for image in frames["head"]:
-            alive += 1
-            Counted.most = max(Counted.most, alive)
-            yield image.copy().view(Counted)
-
-    settings = VideoSettings(preset="ultrafast")
-    _, thumbnails, _ = store_view(RecordedView(images, 30), tmp_path / "v.mp4", episode.fps, settings)
-    assert len(thumbnails) == 30
-    assert Counted.most <= 8  # a few views into the same picture; never a whole view
 
 
 def test_a_source_without_clips_gives_its_images_one_by_one(sample: Make) -> None:

@@ -9,17 +9,19 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, unquote, urlsplit
+from urllib.parse import unquote, urlsplit
 
 import pytest
 
-LFS_FROM_BYTES = 4096
+LFS_FROM_BYTES = 2048
 
 
 @dataclass
@@ -57,6 +59,15 @@ def blob_oid(content: bytes) -> str:
     return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()  # noqa: S324 - git's name of a blob
 
 
+def name_of(content: bytes, lfs: bool) -> str:
+    return hashlib.sha256(content).hexdigest() if lfs else blob_oid(content)
+
+
+def files_of(folder: Path, *, lfs: bool = False) -> dict[str, tuple[bytes, bool]]:
+    """What a repository holds of a folder."""
+    return {p.relative_to(folder).as_posix(): (p.read_bytes(), lfs) for p in folder.rglob("*") if p.is_file()}
+
+
 def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -66,14 +77,10 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
             del format, args
 
         def answer(self, content: Any = None, status: int = 200, headers: dict[str, str] | None = None) -> None:
-            data = (
-                content if isinstance(content, bytes) else json.dumps(content if content is not None else {}).encode()
-            )
+            data = content if isinstance(content, bytes) else json.dumps({} if content is None else content).encode()
             self.send_response(status)
-            for name, value in (headers or {}).items():
+            for name, value in {"Content-Length": str(len(data)), **(headers or {})}.items():
                 self.send_header(name, value)
-            if "Content-Length" not in (headers or {}):
-                self.send_header("Content-Length", str(len(data)))
             self.end_headers()
             if self.command != "HEAD":
                 self.wfile.write(data)
@@ -92,8 +99,7 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
 
         def serve(self) -> None:
             body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
-            parts = urlsplit(self.path)
-            path = unquote(parts.path)
+            path = unquote(urlsplit(self.path).path)
             hub.requests.append((self.command, path))
             if self.headers.get("authorization"):
                 hub.tokens.add(self.headers["authorization"].removeprefix("Bearer "))
@@ -118,17 +124,14 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
             name, rest = self.repository(path)
             if name not in hub.repositories:
                 return self.missing("RepoNotFound")
-            return self.inside(hub.repositories[name], name, rest, body, parse_qs(parts.query))
+            return self.inside(hub.repositories[name], name, rest, body)
 
         do_GET = do_HEAD = do_POST = do_PUT = serve  # noqa: N815
 
         def repository(self, path: str) -> tuple[str, str]:
             """ORG/NAME, and what comes after it."""
-            pieces = (
-                path.removeprefix("/api").removeprefix("/datasets").removeprefix("/models").lstrip("/").split("/", 2)
-            )
-            pieces += [""] * (3 - len(pieces))
-            return f"{pieces[0]}/{pieces[1].removesuffix('.git')}", pieces[2]
+            owner, name, *rest = [*re.sub("^(/api)?(/datasets|/models)?/", "", path).split("/", 2), "", ""]
+            return f"{owner}/{name.removesuffix('.git')}", rest[0]
 
         def create(self, wanted: dict[str, Any]) -> None:
             assert wanted["type"] == "dataset"
@@ -137,9 +140,8 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
                 return self.answer({"error": "exists", "url": f"{hub.url}/datasets/{name}"}, 409)
             if wanted["name"] == "forbidden":
                 return self.answer({"error": "no rights"}, 403)
-            hub.repositories[name] = Repository(
-                private=bool(wanted.get("private")) or wanted.get("visibility") == "private"
-            )
+            private = bool(wanted.get("private")) or wanted.get("visibility") == "private"
+            hub.repositories[name] = Repository(private)
             return self.answer({"url": f"{hub.url}/datasets/{name}", "name": name})
 
         def put_object(self, oid: str, body: bytes) -> None:
@@ -147,21 +149,14 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
             hub.objects[oid] = body
             self.answer({})
 
-        def inside(
-            self, repository: Repository, name: str, rest: str, body: bytes, query: dict[str, list[str]]
-        ) -> None:
+        def inside(self, repository: Repository, name: str, rest: str, body: bytes) -> None:
             head, _, tail = rest.partition("/")
             if head in ("", "revision"):
-                info = {
-                    "id": name,
-                    "sha": repository.commits[-1],
-                    "private": repository.private,
-                    "siblings": [{"rfilename": path} for path in repository.files],
-                }
+                listed = [{"rfilename": path} for path in repository.files]
+                info = {"id": name, "sha": repository.commits[-1], "private": repository.private, "siblings": listed}
                 return self.answer(info)
             if head == "preupload":
-                listed = json.loads(body)["files"]
-                return self.answer({"files": [self.mode(repository, each) for each in listed]})
+                return self.answer({"files": [self.mode(repository, each) for each in json.loads(body)["files"]]})
             if head == "info":
                 return self.batch(json.loads(body))
             if head == "commit":
@@ -174,40 +169,27 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
             return self.resolve(repository, tail.partition("/")[2])
 
         def mode(self, repository: Repository, each: dict[str, Any]) -> dict[str, Any]:
-            found = repository.files.get(each["path"])
-            oid = (
-                None if found is None else blob_oid(found[0]) if not found[1] else hashlib.sha256(found[0]).hexdigest()
-            )
-            large = each["size"] >= LFS_FROM_BYTES
-            return {
-                "path": each["path"],
-                "uploadMode": "lfs" if large else "regular",
-                "shouldIgnore": False,
-                "oid": oid,
-            }
+            oid = name_of(*repository.files[each["path"]]) if each["path"] in repository.files else None
+            mode = "lfs" if each["size"] >= LFS_FROM_BYTES else "regular"
+            return {"path": each["path"], "uploadMode": mode, "shouldIgnore": False, "oid": oid}
 
         def batch(self, wanted: dict[str, Any]) -> None:
-            objects = []
             for each in wanted["objects"]:
-                known = each["oid"] in hub.objects
-                actions = {
-                    "upload": {"href": f"{hub.url}/lfs/{each['oid']}"},
-                    "verify": {"href": f"{hub.url}/lfs/verify"},
-                }
-                objects.append({**each, **({} if known else {"actions": actions})})
-            self.answer({"transfer": "basic", "objects": objects})
+                if each["oid"] not in hub.objects:
+                    places = {"upload": f"{hub.url}/lfs/{each['oid']}", "verify": f"{hub.url}/lfs/verify"}
+                    each["actions"] = {action: {"href": place} for action, place in places.items()}
+            self.answer({"transfer": "basic", "objects": wanted["objects"]})
 
         def commit(self, repository: Repository, name: str, body: bytes) -> None:
             changed = dict(repository.files)
-            for line in body.splitlines():
-                item = json.loads(line)
-                value = item["value"]
-                if item["key"] == "file":
-                    changed[value["path"]] = base64.b64decode(value["content"]), False
-                elif item["key"] == "lfsFile":
-                    changed[value["path"]] = hub.objects[value["oid"]], True
-                elif item["key"] == "deletedFile":
-                    del changed[value["path"]]
+            for item in map(json.loads, body.splitlines()):
+                match item["key"], item["value"]:
+                    case "file", value:
+                        changed[value["path"]] = base64.b64decode(value["content"]), False
+                    case "lfsFile", value:
+                        changed[value["path"]] = hub.objects[value["oid"]], True
+                    case "deletedFile", value:
+                        del changed[value["path"]]
             repository.files = changed
             repository.commits.append(hashlib.sha1(body + repository.commits[-1].encode()).hexdigest())  # noqa: S324
             oid = repository.commits[-1]
@@ -223,12 +205,14 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
             if path not in repository.files:
                 return self.missing("EntryNotFound")
             content, lfs = repository.files[path]
-            etag = hashlib.sha256(content).hexdigest() if lfs else blob_oid(content)
-            headers = {"ETag": f'"{etag}"', "X-Repo-Commit": repository.commits[-1], "Accept-Ranges": "bytes"}
+            headers = {
+                "ETag": f'"{name_of(content, lfs)}"',
+                "X-Repo-Commit": repository.commits[-1],
+                "Accept-Ranges": "bytes",
+            }
             if self.command == "HEAD":
-                return self.answer(
-                    b"", 200, {**headers, "Content-Length": str(len(content)), "X-Linked-Size": str(len(content))}
-                )
+                sizes = dict.fromkeys(("Content-Length", "X-Linked-Size"), str(len(content)))
+                return self.answer(b"", 200, headers | sizes)
             ranged = self.headers.get("Range")
             if ranged:
                 first = int(ranged.removeprefix("bytes=").split("-")[0])

@@ -1,17 +1,10 @@
-"""A model of one's own, trained by the pipeline's tasks: loaded by its folder, served, driven and published."""
+"""A model of one's own, trained by the pipeline's tasks: loaded by its folder, driven and published."""
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
-import numpy as np
 import pytest
 
 from flows.command_line import main
@@ -30,16 +23,9 @@ SMALL = (
     "curate.sources=[{kind: episode_set, path: artifacts/shipped/recordings, name: shipped, include: ["
     "ur5e_silver-test-s1-00000, ur5e_silver-train-s1-00000, ur5e_silver-train-s1-00001]}]",
 )  # fmt: skip
-WANTED = [
-    "curate",
-    "filter",
-    "render_actions",
-    "train_tokenizer",
-    "encode_latents",
-    "train_stage1",
-    "train_stage2",
-    "distill",
-]
+WANTED = (
+    "curate", "filter", "render_actions", "train_tokenizer", "encode_latents", "train_stage1", "train_stage2", "distill",
+)  # fmt: skip
 EPISODE = "ur5e_silver-test-s1-00000"
 
 
@@ -65,26 +51,24 @@ def only(store: Path, step: str) -> Path:
 def test_a_folder_of_the_store_finds_its_tokenizer(store: Path, tmp_path: Path) -> None:
     own = only(store, "distill")
     for folder in (own, own / "teacher_forcing", only(store, "train_stage2")):
-        world = WorldLine.from_pretrained(folder)
-        assert world.info.kind in ("causal", "stage2")
+        assert WorldLine.from_pretrained(folder).info.kind in ("causal", "stage2")
     moved = tmp_path / "moved"
     shutil.copytree(store, moved, ignore=shutil.ignore_patterns("encode_latents"))
     WorldLine.from_pretrained(only(moved, "train_stage2"))  # without the artifact that names the tokenizer
     shutil.rmtree(moved / "train_tokenizer")
-    with pytest.raises(
-        CheckpointError, match=r"(?s)tokenizer is not here.*tokenizer [0-9a-f]{16} at.*tokenizer=\.\.\."
-    ):
+    with pytest.raises(CheckpointError, match=r"(?s)tokenizer [0-9a-f]{16} at.*tokenizer=\.\.\."):
         WorldLine.from_pretrained(only(moved, "distill"))
 
 
 def test_a_published_model_carries_its_tokenizer(store: Path, tmp_path: Path) -> None:
-    main(["export", str(only(store, "distill")), "--format", "model", "--output", str(tmp_path)])
-    there, here = WorldLine.from_pretrained(tmp_path / "model"), WorldLine.from_pretrained(only(store, "distill"))
+    own, options = only(store, "distill"), ["--format", "model", "--output"]
+    main(["export", str(own), *options, str(tmp_path)])
+    there, here = WorldLine.from_pretrained(tmp_path / "model"), WorldLine.from_pretrained(own)
     assert there.info == here.info
     assert "WorldLine causal" in (tmp_path / "model" / "README.md").read_text()
     with pytest.raises(SystemExit):
-        main(["export", str(only(store, "train_stage1")), "--format", "model", "--output", str(tmp_path / "other")])
-    WorldLine.from_pretrained(only(store, "distill"), tokenizer=tmp_path / "model" / "tokenizer")
+        main(["export", str(only(store, "train_stage1")), *options, str(tmp_path / "other")])
+    WorldLine.from_pretrained(own, tokenizer=tmp_path / "model" / "tokenizer")
 
 
 def test_an_own_model_is_a_gymnasium_environment(store: Path) -> None:
@@ -95,38 +79,3 @@ def test_an_own_model_is_a_gymnasium_environment(store: Path) -> None:
     first, _ = environment.reset(seed=0)
     seen = environment.step(environment.action_space.sample())[0]
     assert first.keys() == seen.keys()
-
-
-@contextlib.contextmanager
-def command(verb: str, *settings: str) -> Iterator[str]:
-    """The address of a server that a console command starts."""
-    given = [part for text in ("port=0", *settings) for part in ("--set", text)]
-    with subprocess.Popen(
-        [sys.executable, "-m", "flows.command_line", verb, *given], stdout=subprocess.PIPE, text=True
-    ) as process:
-        try:
-            address = process.stdout.readline().strip().rpartition(" at ")[2].removesuffix("/v1")
-            deadline = time.monotonic() + 30
-            while time.monotonic() < deadline:  # the line comes before the first connection is taken
-                with contextlib.suppress(httpx.TransportError):
-                    httpx.get(f"{address.replace('ws', 'http')}/healthz")
-                    break
-                time.sleep(0.05)
-            yield address
-        finally:
-            process.terminate()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", ["serve", "play"])
-def test_an_own_model_is_served(store: Path, verb: str) -> None:
-    pytest.importorskip("msgpack")
-    pytest.importorskip("uvicorn")
-    from worldline_core.serving.client import SimulatorClient
-
-    with command(verb, f"model={only(store, 'distill')}") as address, SimulatorClient(address) as client:
-        simulation = client.start(EPISODE, seeds=[1])
-        controls = np.repeat(simulation.state[:, None], simulation.frames_per_step, 1)
-        (frames,) = simulation.step(controls)
-        assert frames["head"].shape == (simulation.frames_per_step, 64, 96, 3)
-        assert "<html" in httpx.get(f"{address.replace('ws', 'http')}/play").text

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from flows.command_line import main
-from tests.hub.conftest import Hub, Repository
+from tests.hub.conftest import Hub, Repository, files_of
 from worldline_core import WorldLine
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
@@ -27,8 +27,7 @@ def folder(tmp_path: Path, make_model: Callable[..., Any], make_contract: Callab
 
 
 def publish(hub: Hub, folder: Path, name: str = "ORG/NAME") -> Repository:
-    files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    hub.repositories[name] = Repository(private=True, files={path: (content, False) for path, content in files.items()})
+    hub.repositories[name] = Repository(private=True, files=files_of(folder))
     return hub.repositories[name]
 
 
@@ -62,38 +61,31 @@ def test_the_hub_gives_the_same_model_and_nothing_that_could_run(hub: Hub, folde
         WorldLine.from_pretrained("ORG/NAME")
 
 
-def test_a_repository_with_its_tokenizer_predicts(hub: Hub, project_root: Path, tmp_path: Path) -> None:
+def test_a_repository_with_its_tokenizer_predicts(hub: Hub, project_root: Path) -> None:
     models = project_root / "artifacts" / "shipped" / "models"
-    (tmp_path / "repository").mkdir()
-    for name in ("checkpoint.json", "model.safetensors"):
-        (tmp_path / "repository" / name).symlink_to(models / "causal" / name)
-    (tmp_path / "repository" / "tokenizer").symlink_to(models / "tokenizer", target_is_directory=True)
-    files = [
-        path for name in (".", "tokenizer") for path in (tmp_path / "repository" / name).iterdir() if path.is_file()
-    ]
-    names = {path.relative_to(tmp_path / "repository").as_posix(): (path.read_bytes(), True) for path in files}
-    hub.repositories["ORG/NAME"] = Repository(private=False, files=names)
+    causal = {
+        name: ((models / "causal" / name).read_bytes(), True) for name in ("checkpoint.json", "model.safetensors")
+    }
+    tokenizer = {f"tokenizer/{name}": file for name, file in files_of(models / "tokenizer", lfs=True).items()}
+    hub.repositories["ORG/NAME"] = Repository(private=False, files=causal | tokenizer)
     world, here = WorldLine.from_pretrained("ORG/NAME"), WorldLine.from_pretrained(models / "causal")
     assert (world.info, world.causal) == (here.info, here.causal)
 
 
-def test_without_the_hub_it_is_said_what_to_do(
+def test_without_the_hub_the_cache_serves(
     hub: Hub, folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     publish(hub, folder)
-    with pytest.raises(
-        UnavailableError, match=r"(?s)hub does not give this model.*ORG/OTHER.*next step: check the name"
-    ):
+    with pytest.raises(UnavailableError, match=r"(?s)ORG/OTHER.*check the name"):
         pretrained_folder("ORG/OTHER")
     pretrained_folder("ORG/NAME")
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
     pretrained_folder("ORG/NAME")  # of the local cache
-    with pytest.raises(UnavailableError, match=r"(?s)hub does not give this model.*ORG/UNSEEN.*offline"):
+    with pytest.raises(UnavailableError, match=r"(?s)ORG/UNSEEN.*offline"):
         pretrained_folder("ORG/UNSEEN")
-    with pytest.raises(CheckpointError, match="No model here"):
-        pretrained_folder(tmp_path / "nothing")
-    with pytest.raises(CheckpointError, match="No model here"):
-        pretrained_folder("three/part/name")
+    for name in (tmp_path / "nothing", "three/part/name"):
+        with pytest.raises(CheckpointError, match="No model here"):
+            pretrained_folder(name)
 
 
 def test_a_damaged_repository_is_refused(hub: Hub, folder: Path) -> None:

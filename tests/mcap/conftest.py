@@ -6,17 +6,20 @@ head camera hangs on a static transform, the wrist camera on a moving one, 0.1 m
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from mcap_ros2.writer import Writer
+
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.sources.open import open_source
 
 HEIGHT, WIDTH = 12, 16
 START_NS = 1_700_000_000_000_000_000
@@ -85,6 +88,10 @@ def png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
+def header(time_ns: int, frame: str = "") -> dict[str, Any]:
+    return {"stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}, "frame_id": frame}
+
+
 @dataclass(frozen=True)
 class Sent:
     """One message: what it says, the time it states (None: none), and when the recorder wrote it."""
@@ -103,21 +110,22 @@ class Recording:
     sent: list[Sent] = field(default_factory=list)
 
     def add(
-        self,
-        topic: str,
-        schema: str,
-        seconds: float,
-        message: dict[str, Any],
-        *,
-        headed: bool = True,
-        frame: str = "",
+        self, topic: str, schema: str, seconds: float, message: dict[str, Any], *, headed: bool = True, frame: str = "",
         delay_s: float = 0.002,
-    ) -> None:
+    ) -> None:  # fmt: skip
         time_ns = START_NS + round(seconds * 1e9)
         if headed:
-            stamp = {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
-            message = {"header": {"stamp": stamp, "frame_id": frame}, **message}
+            message = {"header": header(time_ns, frame), **message}
         self.sent.append(Sent(topic, schema, message, time_ns if headed else None, time_ns + round(delay_s * 1e9)))
+
+    def transforms(self, seconds: float, *listed: dict[str, Any], topic: str = "/tf_static") -> None:
+        self.add(topic, "tf2_msgs/msg/TFMessage", seconds, {"transforms": list(listed)}, headed=False)
+
+    def rewrite(self, topic: str, number: slice | None = None, **values: Any) -> None:
+        """Other values in all messages of a topic, or in some."""
+        mine = [i for i, sent in enumerate(self.sent) if sent.topic == topic]
+        for i in mine[number or slice(None)]:
+            self.sent[i] = replace(self.sent[i], message={**self.sent[i].message, **values})
 
     def change(self, topic: str, change: Callable[[list[Sent]], Iterable[Sent]]) -> None:
         """Replace the messages of a topic, in place of the first of them."""
@@ -146,15 +154,13 @@ def shifted(sent: Sent, seconds: float, at_ns: int | None = None) -> Sent:
     """The message with another header time; the log time stays."""
     assert sent.time_ns is not None
     time_ns = (sent.time_ns if at_ns is None else at_ns) + round(seconds * 1e9)
-    stamp = {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
-    header = {**sent.message["header"], "stamp": stamp}
-    return replace(sent, message={**sent.message, "header": header}, time_ns=time_ns)
+    stamped = header(time_ns, sent.message["header"]["frame_id"])
+    return replace(sent, message={**sent.message, "header": stamped}, time_ns=time_ns)
 
 
 def transform(parent: str, child: str, seconds: float, place: Any, quaternion: Any) -> dict[str, Any]:
-    time_ns = START_NS + round(seconds * 1e9)
     return {
-        "header": {"stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}, "frame_id": parent},
+        "header": header(START_NS + round(seconds * 1e9), parent),
         "child_frame_id": child,
         "transform": {
             "translation": dict(zip("xyz", map(float, place), strict=True)),
@@ -176,74 +182,67 @@ def robot(seconds: float = 3.0, *, camera_fps: float = 30.0, jitter_s: float = 0
     """A recording of the robot: two cameras, joints at 100 Hz, commands at 50 Hz, transforms at 50 Hz."""
     rng = np.random.default_rng(seed)
     recording = Recording()
-    recording.add("/tf_static", "tf2_msgs/msg/TFMessage", 0.0, {"transforms": [
+    recording.transforms(
+        0.0,
         transform("base_link", "head_optical_frame", 0.0, [1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0]),
         transform("wrist", "wrist_optical_frame", 0.0, [0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]),
-    ]}, headed=False)  # fmt: skip
+    )
     for view in ("head", "wrist"):
-        recording.add(
-            f"/{view}/camera_info", "sensor_msgs/msg/CameraInfo", 0.0, camera_info(), frame=f"{view}_optical_frame"
-        )
+        frame, topic = f"{view}_optical_frame", f"/{view}/image/compressed"
+        recording.add(f"/{view}/camera_info", "sensor_msgs/msg/CameraInfo", 0.0, camera_info(), frame=frame)
         for number in range(int(seconds * camera_fps)):
             time = number / camera_fps + rng.uniform(-jitter_s, jitter_s)
             message = {"format": "png", "data": png(picture(number))}
-            topic = f"/{view}/image/compressed"
-            recording.add(
-                topic, "sensor_msgs/msg/CompressedImage", time, message, frame=f"{view}_optical_frame", delay_s=0.02
-            )
+            recording.add(topic, "sensor_msgs/msg/CompressedImage", time, message, frame=frame, delay_s=0.02)
     for number in range(int(seconds * 100)):
         time = number / 100 + rng.uniform(-jitter_s, jitter_s)
-        message = {
-            "name": ["finger", "b", "a"],
-            "position": [float(finger(time)), *joints(time)[::-1].tolist()],
-            "velocity": [],
-            "effort": [],
-        }
+        position = [float(finger(time)), *joints(time)[::-1].tolist()]
+        message = {"name": ["finger", "b", "a"], "position": position, "velocity": [], "effort": []}
         recording.add("/joint_states", "sensor_msgs/msg/JointState", time, message)
     for number in range(int(seconds * 50)):
         time = number / 50
-        layout = {"dim": [], "data_offset": 0}
         values = [*(joints(time) + 0.01).tolist(), float(finger(time))]
-        recording.add(
-            "/command", "std_msgs/msg/Float64MultiArray", time, {"layout": layout, "data": values}, headed=False
-        )
+        command = {"layout": {"dim": [], "data_offset": 0}, "data": values}
+        recording.add("/command", "std_msgs/msg/Float64MultiArray", time, command, headed=False)
         moving = time + rng.uniform(-jitter_s, jitter_s)
-        message = {"transforms": [transform("base_link", "wrist", moving, *wrist(moving))]}
-        recording.add("/tf", "tf2_msgs/msg/TFMessage", moving, message, headed=False)
+        recording.transforms(moving, transform("base_link", "wrist", moving, *wrist(moving)), topic="/tf")
     return recording.in_log_order()
 
 
 def declared(path: Path, **changes: Any) -> dict[str, Any]:
     """The source's configuration for `robot`."""
     opening = {"closed": 0.0, "open": 0.04}
+    state = {
+        "joints": {"topic": "/joint_states", "names": ["a", "b"]},
+        "gripper": {"topic": "/joint_states", "names": ["finger"], "range": opening},
+    }
+    command = {
+        "joints": {"topic": "/command", "columns": [0, 1]},
+        "gripper": {"topic": "/command", "columns": [2], "range": opening},
+    }
     return {
-        "kind": "mcap_topics",
-        "path": str(path),
-        "name": "toy",
-        "embodiment": "none",
-        "fps": 30,
+        "kind": "mcap_topics", "path": str(path), "name": "toy", "embodiment": "none", "fps": 30,
         "views": {
             "head": {"image": "/head/image/compressed", "calibration": "/head/camera_info"},
             "right_wrist": {"image": "/wrist/image/compressed", "calibration": "/wrist/camera_info"},
         },
-        "arms": [
-            {
-                "name": "right",
-                "state": {
-                    "joints": {"topic": "/joint_states", "names": ["a", "b"]},
-                    "gripper": {"topic": "/joint_states", "names": ["finger"], "range": opening},
-                },
-                "command": {
-                    "joints": {"topic": "/command", "columns": [0, 1]},
-                    "gripper": {"topic": "/command", "columns": [2], "range": opening},
-                },
-            }
-        ],
-        **changes,
-    }
+        "arms": [{"name": "right", "state": state, "command": command}], **changes,
+    }  # fmt: skip
 
 
-@pytest.fixture(scope="session")
-def toy() -> ModuleType:
-    """This module, whose functions the tests use."""
-    return sys.modules[__name__]
+def source(declared: dict[str, Any]) -> EpisodeSource:
+    config = CurateConfig.model_validate({"sources": [declared]}).sources[0]
+    return open_source(config, config.path)
+
+
+def load(declared: dict[str, Any], episode: str = "toy-a") -> LoadedEpisode:
+    return source(declared).load(episode)
+
+
+def rejection(declared: dict[str, Any], episode: str = "toy-a") -> RejectedInputError:
+    """Why an episode, or one of its views, is refused."""
+    with pytest.raises(RejectedInputError, match=r"\S") as caught:
+        loaded = load(declared, episode)
+        for view in loaded.views:
+            loaded.frames(view)
+    return caught.value

@@ -13,59 +13,15 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as RawWriter
 
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode_index import read_quarantine
-from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.open import open_source
-
-
-def source(declared: dict[str, Any]) -> EpisodeSource:
-    config = CurateConfig.model_validate({"sources": [declared]}).sources[0]
-    return open_source(config, config.path)
-
-
-def load(declared: dict[str, Any], episode: str = "toy-a") -> LoadedEpisode:
-    return source(declared).load(episode)
-
-
-def rejection(declared: dict[str, Any], episode: str = "toy-a") -> RejectedInputError:
-    with pytest.raises(RejectedInputError, match=r"\S") as caught:
-        load(declared, episode)
-    return caught.value
-
-
-def test_damaged_files_are_quarantined_and_the_others_are_not(tmp_path: Path, toy: Any) -> None:
-    raw = tmp_path / "raw"
-    content = toy.robot().write(raw / "good.mcap").read_bytes()
-    (raw / "cut.mcap").write_bytes(content[: len(content) // 2])
-    (raw / "empty.mcap").write_bytes(b"")
-    (raw / "text.mcap").write_bytes(b"no mcap at all" * 50)
-    flipped = bytearray(content)
-    flipped[300] ^= 0xFF  # inside of a compressed chunk
-    (raw / "flipped.mcap").write_bytes(flipped)
-    with (raw / "silent.mcap").open("wb") as stream:
-        writer = RawWriter(stream)
-        writer.start()
-        writer.finish()
-    declared = toy.declared(raw)
-    counts = curate(CurateConfig.model_validate({"sources": [declared]}), {}, tmp_path / "out")
-    assert (counts["found"], counts["kept"]) == (6, 1)
-    reasons = {row.episode_id: row.reason for row in read_quarantine(tmp_path / "out")}
-    assert reasons == {
-        "toy-cut": "unreadable",
-        "toy-empty": "unreadable",
-        "toy-text": "unreadable",
-        "toy-flipped": "unreadable",
-        "toy-silent": "missing_topic",
-    }
+from tests.data.curating import run
+from tests.mcap import conftest as toy
+from tests.mcap.conftest import load, rejection, source
 
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
-def test_wrong_checksums_are_found(tmp_path: Path, toy: Any, compression: CompressionType) -> None:
-    path = toy.robot().write(tmp_path / "a.mcap", compression=compression)
-    assert load(toy.declared(tmp_path)).episode.num_frames == 90
+def test_wrong_checksums_are_found(tmp_path: Path, compression: CompressionType) -> None:
+    path = toy.robot(1.0).write(tmp_path / "a.mcap", compression=compression)
+    assert load(toy.declared(tmp_path)).episode.num_frames == 30
     with path.open("rb") as stream:
         chunk = make_reader(stream).get_summary().chunk_indexes[3]  # type: ignore[union-attr]
     content = bytearray(path.read_bytes())
@@ -74,14 +30,12 @@ def test_wrong_checksums_are_found(tmp_path: Path, toy: Any, compression: Compre
     assert rejection(toy.declared(tmp_path)).reason == "unreadable"
 
 
-def test_files_without_chunks_or_summary_are_read(tmp_path: Path, toy: Any) -> None:
-    expected = None
+def test_files_without_chunks_or_summary_are_read(tmp_path: Path) -> None:
+    path = toy.robot(1.0).write(tmp_path / "source.mcap").rename(tmp_path / "source")
+    states = []
     for options in (
-        {},
-        {"use_chunking": False},
-        {"use_summary_offsets": False, "use_statistics": False, "repeat_channels": False},
-    ):
-        path = toy.robot().write(tmp_path / "source.mcap")
+        {}, {"use_chunking": False}, {"use_summary_offsets": False, "use_statistics": False, "repeat_channels": False},
+    ):  # fmt: skip
         with path.open("rb") as stream, (tmp_path / "a.mcap").open("wb") as target:
             writer = RawWriter(target, chunk_size=4096, **options)
             writer.start()
@@ -93,31 +47,27 @@ def test_files_without_chunks_or_summary_are_read(tmp_path: Path, toy: Any) -> N
                     channels[channel.id] = writer.register_channel(channel.topic, "cdr", schemas[schema.id])
                 writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
             writer.finish()
-        path.unlink()
         loaded = load(toy.declared(tmp_path))
-        expected = loaded if expected is None else expected
-        assert np.array_equal(loaded.episode.state, expected.episode.state)
-        assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(90))
+        states.append(loaded.episode.state.tobytes())
+        assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(30))
+    assert len(set(states)) == 1
 
 
-def write_split(
-    toy: Any, folder: Path, listed: str = "relative_file_paths: [run_0.mcap, run_1.mcap, run_2.mcap]"
-) -> Path:
+def write_split(folder: Path, listed: str) -> None:
     """The robot's recording as rosbag2 splits it: what is sent once, such as /tf_static, is in the first part only."""
     sent = toy.robot().sent
     for number, part in enumerate((sent[:200], sent[200:500], sent[500:])):
         # Channels and schemas are numbered as they first appear, so differently in each part.
         toy.Recording(part if number else [*part[::-1]]).write(folder / f"run_{number}.mcap")
     (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  version: 5\n  {listed}\n")
-    return folder
 
 
 @pytest.mark.parametrize("place", ["bags/run", "."])
 @pytest.mark.parametrize("prefix", ["", "run/"])
-def test_a_split_bag_is_one_recording(tmp_path: Path, toy: Any, place: str, prefix: str) -> None:
+def test_a_split_bag_is_one_recording(tmp_path: Path, place: str, prefix: str) -> None:
     toy.robot().write(tmp_path / "whole" / "a.mcap")
     root = tmp_path / "split"
-    write_split(toy, root / place, f"relative_file_paths: [{', '.join(f'{prefix}run_{n}.mcap' for n in range(3))}]")
+    write_split(root / place, f"relative_file_paths: [{', '.join(f'{prefix}run_{n}.mcap' for n in range(3))}]")
     toy.robot(1.0).write(root / place / "other.mcap")  # the list does not name it
     opened, whole = source(toy.declared(root)), load(toy.declared(tmp_path / "whole"))
     name = "toy-bags/run" if place != "." else "toy-split"
@@ -144,10 +94,8 @@ def test_a_split_bag_is_one_recording(tmp_path: Path, toy: Any, place: str, pref
         ("files: []", "unreadable", "relative_file_paths"),
     ],
 )
-def test_lists_of_parts_that_cannot_be_used_are_named(
-    tmp_path: Path, toy: Any, listed: str, reason: str, named: str
-) -> None:
-    write_split(toy, tmp_path / "bag", listed)
+def test_lists_of_parts_that_cannot_be_used_are_named(tmp_path: Path, listed: str, reason: str, named: str) -> None:
+    write_split(tmp_path / "bag", listed)
     error = rejection(toy.declared(tmp_path), "toy-bag")
     assert error.reason == reason
     assert named in str(error)
@@ -163,17 +111,13 @@ def test_lists_of_parts_that_cannot_be_used_are_named(
         ("a.bag", b"#ROSBAG V2.0\n", "rosbags-convert"),
     ],
 )
-def test_other_bags_are_named_with_their_next_step(
-    tmp_path: Path, toy: Any, name: str, begins: bytes, next_step: str
-) -> None:
+def test_other_bags_are_named_with_their_next_step(tmp_path: Path, name: str, begins: bytes, next_step: str) -> None:
     (tmp_path / name).write_bytes(begins.ljust(200, b"\0"))
     error = rejection(toy.declared(tmp_path), f"toy-{name.removesuffix('.mcap')}")
     assert (error.reason, next_step in str(error.next_step)) == ("unreadable", True)
 
 
-def test_missing_topics_are_named_beside_those_there_are_and_those_of_images_cost_their_view(
-    tmp_path: Path, toy: Any
-) -> None:
+def test_missing_topics_are_named_beside_those_there_are_and_those_of_images_cost_their_view(tmp_path: Path) -> None:
     toy.robot().write(tmp_path / "a.mcap")
     declared = toy.declared(tmp_path, primary_view="head")
     declared["views"]["head"]["image"] = "/top/image"
@@ -190,39 +134,30 @@ def test_missing_topics_are_named_beside_those_there_are_and_those_of_images_cos
     assert rejection(declared).expected == "/none"
 
 
-def test_pictures_alone_need_no_arms(tmp_path: Path, toy: Any) -> None:
-    toy.robot().write(tmp_path / "a.mcap")
+def test_pictures_alone_need_no_arms(tmp_path: Path) -> None:
+    toy.robot(0.5).write(tmp_path / "a.mcap")
     declared = toy.declared(tmp_path)
-    with_arms = load(declared)
+    cameras = set(load(declared).episode.cameras)
     del declared["arms"]
     episode = load(declared).episode
     assert (episode.state_kind, episode.state.shape[1], episode.commanded) == ("none", 0, False)
-    assert set(episode.cameras) == set(with_arms.episode.cameras)
+    assert set(episode.cameras) == cameras
 
 
-def test_schemas_that_are_not_understood_or_do_not_fit(tmp_path: Path, toy: Any) -> None:
-    recording = toy.robot()
+def test_schemas_that_do_not_fit_and_joints_that_no_message_has(tmp_path: Path) -> None:
+    recording = toy.robot(0.5)
     recording.add("/imu", "sensor_msgs/msg/Imu", 0.1, {})
     recording.write(tmp_path / "a.mcap")
-    for topic, what in (("/imu", "not understood"), ("/head/camera_info", "another kind")):
-        declared = toy.declared(tmp_path)
-        declared["views"]["head"] = {"image": topic}
-        error = rejection(declared)
-        assert error.reason == "unknown_schema"
-        assert what in error.what
-        assert topic in str(error.where)
-
-
-def test_joints_that_no_message_has(tmp_path: Path, toy: Any) -> None:
-    toy.robot().write(tmp_path / "a.mcap")
     declared = toy.declared(tmp_path)
-    joints = declared["arms"][0]["state"]["joints"]
-    joints["names"] = ["a", "elbow"]
+    for topic, what in (("/imu", "not understood"), ("/head/camera_info", "another kind")):
+        error = rejection(declared | {"views": {"head": {"image": topic}}})
+        assert (error.reason, what in error.what, topic in str(error.where)) == ("unknown_schema", True, True)
+    declared["arms"][0]["state"]["joints"]["names"] = ["a", "elbow"]
     error = rejection(declared)
     assert (error.reason, error.expected, error.got) == ("missing_column", "a, elbow", "a, b, finger")
 
 
-def test_drivers_that_share_a_topic(tmp_path: Path, toy: Any) -> None:
+def test_drivers_that_share_a_topic(tmp_path: Path) -> None:
     """Arm and gripper publish their own joints on one topic, at their own rates."""
     recording = toy.robot()
 
@@ -241,33 +176,27 @@ def test_drivers_that_share_a_topic(tmp_path: Path, toy: Any) -> None:
     assert np.abs(episode.state[:, 2] - toy.finger(time) / 0.04).max() < 1e-4
 
 
-def test_frames_that_do_not_hang_together(tmp_path: Path, toy: Any) -> None:
-    toy.robot().write(tmp_path / "a.mcap")
-    error = rejection(toy.declared(tmp_path, base_frame="torso"))
-    assert error.reason == "missing_calibration"
-    assert "base_link -> wrist" in str(error.got)
-    recording = toy.robot()
-    twice = toy.transform("wrist", "head_optical_frame", 0.0, [0, 0, 0], [0, 0, 0, 1])
-    recording.add("/tf_static", "tf2_msgs/msg/TFMessage", 0.1, {"transforms": [twice]}, headed=False)
-    recording.write(tmp_path / "a.mcap")
-    error = rejection(toy.declared(tmp_path))
+def test_frames_that_do_not_hang_together_and_a_calibration_that_changes(tmp_path: Path) -> None:
+    def with_transform(*transform: Any) -> Any:
+        recording = toy.robot(0.5)
+        recording.transforms(0.1, toy.transform(*transform))
+        recording.write(tmp_path / "a.mcap")
+        return rejection(toy.declared(tmp_path))
+
+    error = with_transform("wrist", "head_optical_frame", 0.0, [0, 0, 0], [0, 0, 0, 1])
     assert (error.reason, error.what) == ("invalid_extrinsics", "A frame has two parents")
-    recording = toy.robot()
-    nothing = toy.transform("wrist", "wrist_optical_frame", 0.0, [0, 0, 0], [0, 0, 0, 0])
-    recording.add("/tf_static", "tf2_msgs/msg/TFMessage", 0.1, {"transforms": [nothing]}, headed=False)
+    assert "without direction" in with_transform("wrist", "wrist_optical_frame", 0.0, [0, 0, 0], [0, 0, 0, 0]).what
+    recording = toy.robot(0.5)
     recording.write(tmp_path / "a.mcap")
-    assert "without direction" in rejection(toy.declared(tmp_path)).what
-
-
-def test_a_calibration_that_changes(tmp_path: Path, toy: Any) -> None:
-    recording = toy.robot()
+    error = rejection(toy.declared(tmp_path, base_frame="torso"))
+    assert (error.reason, "base_link -> wrist" in str(error.got)) == ("missing_calibration", True)
     other = toy.camera_info(k=[25.0, 0, 7.5, 0, 25.0, 5.5, 0, 0, 1.0])
-    recording.add("/head/camera_info", "sensor_msgs/msg/CameraInfo", 1.0, other, frame="head_optical_frame")
+    recording.add("/head/camera_info", "sensor_msgs/msg/CameraInfo", 0.2, other, frame="head_optical_frame")
     recording.write(tmp_path / "a.mcap")
     assert rejection(toy.declared(tmp_path)).reason == "changing_calibration"
 
 
-def test_time_ranges_cut_a_long_file(tmp_path: Path, toy: Any) -> None:
+def test_time_ranges_cut_a_long_file(tmp_path: Path) -> None:
     """The calibration and the static transforms were sent before; images are read around the range only."""
     toy.robot(6.0).write(tmp_path / "long" / "a.mcap")
     ranges = [
@@ -290,7 +219,7 @@ def test_time_ranges_cut_a_long_file(tmp_path: Path, toy: Any) -> None:
         source(toy.declared(tmp_path, episodes={"by": "ranges", "ranges": [{"name": "x", "start_s": 2, "stop_s": 1}]}))
 
 
-def test_markers_bound_episodes(tmp_path: Path, toy: Any) -> None:
+def test_markers_bound_episodes(tmp_path: Path) -> None:
     recording = toy.robot(8.0)
     texts = {
         0.5: "start: pick the cup", 1.5: "operator coughs", 2.5: "stop: success",
@@ -300,16 +229,11 @@ def test_markers_bound_episodes(tmp_path: Path, toy: Any) -> None:
         recording.add("/episode", "std_msgs/msg/String", time, {"data": text}, headed=False, delay_s=0.002)
     recording.in_log_order().write(tmp_path / "raw" / "a.mcap")
     declared = toy.declared(tmp_path / "raw", episodes={"by": "markers", "topic": "/episode"})
-    counts = curate(CurateConfig.model_validate({"sources": [declared]}), {}, tmp_path / "out")
+    counts, _ = run(tmp_path, declared)
     assert (counts["found"], counts["kept"], counts["reasons"]) == (5, 2, {"missing_marker": 3})
-    opened = source(declared)
-    first, second = (opened.load(f"toy-a-000{number}").episode for number in (0, 2))
-    assert (first.instruction, first.outcome, second.instruction, second.outcome) == (
-        "pick the cup",
-        "success",
-        "put it down",
-        "failure",
-    )
+    first, second = (load(declared, f"toy-a-000{number}").episode for number in (0, 2))
+    assert (first.instruction, first.outcome) == ("pick the cup", "success")
+    assert (second.instruction, second.outcome) == ("put it down", "failure")
     assert first.num_frames == pytest.approx(60, abs=1)
     assert second.num_frames == pytest.approx(45, abs=1)
     for episode in ("toy-a-0001", "toy-a-0003", "toy-a-0004"):
@@ -317,13 +241,6 @@ def test_markers_bound_episodes(tmp_path: Path, toy: Any) -> None:
     elsewhere = toy.declared(tmp_path / "raw", episodes={"by": "markers", "topic": "/marks"})
     assert source(elsewhere).episode_ids() == ["toy-a"]
     assert rejection(elsewhere).reason == "missing_topic"
-
-
-def test_a_link_out_of_the_folder_is_refused(tmp_path: Path, toy: Any) -> None:
-    toy.robot(1.0).write(tmp_path / "elsewhere" / "a.mcap")
-    (tmp_path / "raw").mkdir()
-    (tmp_path / "raw" / "a.mcap").symlink_to(tmp_path / "elsewhere" / "a.mcap")
-    assert rejection(toy.declared(tmp_path / "raw")).reason == "path_traversal"
 
 
 @pytest.mark.parametrize(
@@ -337,6 +254,6 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path: Path, toy: Any) -> None:
         ({"episodes": {"by": "markers", "topic": "/x", "start": "("}}, "valid regular expression"),
     ],
 )
-def test_the_configuration_is_strict(tmp_path: Path, toy: Any, changes: dict[str, Any], message: str) -> None:
+def test_the_configuration_is_strict(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         source(toy.declared(tmp_path, **changes))

@@ -69,18 +69,17 @@ def test_the_last_artifact_of_a_call_has_a_link_by_name(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "latest").iterdir()) == ["count.a", "count.b"]
 
 
-@pytest.mark.parametrize("change", ["config", "version", "step", "input"])
-def test_key_depends_on_everything_that_matters(tmp_path: Path, change: str) -> None:
-    store = ArtifactStore(tmp_path)
-    base = store.key("count", 1, CountConfig(), {"a": "x"})
-    other = {
-        "config": store.key("count", 1, CountConfig(upto=6), {"a": "x"}),
-        "version": store.key("count", 2, CountConfig(), {"a": "x"}),
-        "step": store.key("recount", 1, CountConfig(), {"a": "x"}),
-        "input": store.key("count", 1, CountConfig(), {"a": "y"}),
-    }[change]
-    assert base != other
-    assert base == store.key("count", 1, CountConfig(), {"a": "x"})
+def test_key_depends_on_everything_that_matters(tmp_path: Path) -> None:
+    key = ArtifactStore(tmp_path).key
+    base = "count", 1, CountConfig(), {"a": "x"}
+    others = (
+        ("recount", *base[1:]),
+        ("count", 2, *base[2:]),
+        (*base[:2], CountConfig(upto=6), base[3]),
+        (*base[:3], {"a": "y"}),
+    )
+    assert len({key(*each) for each in (base, *others)}) == 5
+    assert key(*base) == key("count", 1, CountConfig(), {"a": "x"})
 
 
 class JudgedConfig(CountConfig):
@@ -117,10 +116,6 @@ def test_weights_count_with_their_content_and_are_read_once(tmp_path: Path, monk
     alone = store.key("judge", 1, file, {})
     (blobs / "1f").write_bytes(b"three")
     assert store.key("judge", 1, file, {}) != alone
-    # Without weights the key is what it was when configurations had none.
-    made = {"upto": 5, "seed": 7, "weights": None}
-    plain = digest_value({"step": "judge", "version": 1, "config": made, "inputs": {}})[:16]
-    assert store.key("judge", 1, JudgedConfig(), {}) == plain
 
 
 def test_steps_name_the_weights_and_tokenizers_that_they_read(tmp_path: Path) -> None:
@@ -154,6 +149,8 @@ def test_failed_step_leaves_no_artifact_and_continues(tmp_path: Path) -> None:
 
     def fail_halfway(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
         count(CountConfig(upto=2), inputs, output)
+        (output / "videos").mkdir()
+        (output / "videos" / ".head.123.tmp.mp4").write_bytes(b"half")  # does not reach the artifact
         raise DataError("stopped", where="halfway")
 
     with pytest.raises(DataError, match="stopped"):
@@ -190,15 +187,11 @@ def test_killed_run_continues_to_the_same_digest(tmp_path: Path) -> None:
     assert process.pid is not None
     os.kill(process.pid, signal.SIGKILL)
     process.join()
-    partial = list((tmp_path / "killed" / "slow").glob("*.partial"))
-    assert len(partial) == 1
+    assert len(list((tmp_path / "killed" / "slow").glob("*.partial"))) == 1
     _run_slow(tmp_path / "killed")
     _run_slow(tmp_path / "undisturbed")
-    digests = [
-        json.loads(next((tmp_path / name / "slow").glob("*/manifest.json")).read_text())["digest"]
-        for name in ("killed", "undisturbed")
-    ]
-    assert digests[0] == digests[1]
+    manifests = [next((tmp_path / name / "slow").glob("*/manifest.json")) for name in ("killed", "undisturbed")]
+    assert len({json.loads(manifest.read_text())["digest"] for manifest in manifests}) == 1
     assert not list((tmp_path / "killed" / "slow").glob("*.partial"))
 
 
@@ -237,11 +230,7 @@ def test_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
 
 def test_arrays_come_back_as_they_were_however_their_memory_lies(tmp_path: Path) -> None:
     array = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
-    arrays = {
-        "transposed": array.transpose(2, 0, 1),
-        "every second": array[:, :, ::2],
-        "one": np.float32(7).reshape(()),
-    }
+    arrays = {"transposed": array.transpose(2, 0, 1), "every second": array[:, :, ::2], "one": np.array(7, np.float32)}
     write_arrays_atomic(tmp_path / "x.safetensors", arrays, {"unit": "m"})
     with safe_open(tmp_path / "x.safetensors", framework="numpy") as file:
         assert file.metadata() == {"unit": "m"}
@@ -250,13 +239,9 @@ def test_arrays_come_back_as_they_were_however_their_memory_lies(tmp_path: Path)
 
 
 def test_atomic_write_leaves_nothing_behind_on_error(tmp_path: Path) -> None:
-    def fail_halfway() -> None:
-        with atomic_path(tmp_path / "x.txt") as temporary:
-            temporary.write_text("half")
-            raise ConfigError("no space")
-
-    with pytest.raises(ConfigError, match="no space"):
-        fail_halfway()
+    with pytest.raises(ConfigError, match="no space"), atomic_path(tmp_path / "x.txt") as temporary:
+        temporary.write_text("half")
+        raise ConfigError("no space")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -269,15 +254,6 @@ def test_json_is_canonical(tmp_path: Path) -> None:
         write_json_atomic(tmp_path / "c.json", {"a": float("nan")})
 
 
-def test_what_a_kill_left_unfinished_does_not_reach_the_artifact(tmp_path: Path) -> None:
-    store = ArtifactStore(tmp_path / "killed")
-    partial = store.root / "count" / f"{store.key('count', 1, CountConfig(), {})}.partial"
-    (partial / "videos").mkdir(parents=True)
-    (partial / "videos" / ".head.123.tmp.mp4").write_bytes(b"half")
-    killed = store.run("count", 1, count, CountConfig(), {})
-    assert killed.digest == ArtifactStore(tmp_path / "other").run("count", 1, count, CountConfig(), {}).digest
-
-
 def test_two_commands_do_not_write_into_one_folder(tmp_path: Path) -> None:
     from worldline_core.exports.export import export
     from worldline_core.shipped import shipped_folder
@@ -287,27 +263,23 @@ def test_two_commands_do_not_write_into_one_folder(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["run"]
 
 
-def linked(step: Path, key: str) -> None:
-    (step.parent.parent / key).mkdir()
-    step.parent.mkdir()
-    step.symlink_to(step.parent.parent / key, target_is_directory=True)
+def put(path: Path) -> None:
+    path.parent.mkdir(parents=True)
+    path.write_text("")
 
 
-def in_step(make: Callable[[Path, str], object]) -> Callable[[Path, str], None]:
-    def change(step: Path, key: str) -> None:
-        step.mkdir(parents=True)
-        make(step, key)
-
-    return change
+def link(path: Path, target: Path) -> None:
+    path.parent.mkdir(parents=True)
+    path.symlink_to(target, target_is_directory=True)
 
 
-ODD = {
-    "a lock that is a folder": in_step(lambda step, key: (step / f".{key}.lock").mkdir()),
-    "unfinished work that is a file": in_step(lambda step, key: (step / f"{key}.partial").write_text("")),
-    "an artifact that is a file": in_step(lambda step, key: (step / key).write_text("")),
-    "a link to itself": in_step(lambda step, key: (step / key).symlink_to(step / key)),
-    "a step that is a file": lambda step, key: (step.parent.mkdir(), step.write_text(key)),
-    "a step that is a link": linked,
+ODD: dict[str, Callable[[Path, str], object]] = {
+    "a lock that is a folder": lambda step, key: (step / f".{key}.lock").mkdir(parents=True),
+    "unfinished work that is a file": lambda step, key: put(step / f"{key}.partial"),
+    "an artifact that is a file": lambda step, key: put(step / key),
+    "a link to itself": lambda step, key: link(step / key, step / key),
+    "a step that is a file": lambda step, key: put(step),
+    "a step that is a link": lambda step, key: link(step, step.parents[1]),
 }
 
 
@@ -332,9 +304,7 @@ def test_missing_rights_of_a_store_end_in_one_message_but_those_of_a_source_do_n
         store.run("count", 1, lambda *_: refuse(tmp_path / "recording.mp4"), CountConfig(), {})
 
 
-def test_digests_of_weights_that_another_process_notes_meanwhile_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_digests_that_another_process_notes_meanwhile_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     configs = {name: JudgedConfig(weights=tmp_path / name) for name in ("one", "two")}
     for name in configs:
         (tmp_path / name).write_text(name)

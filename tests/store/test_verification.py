@@ -1,4 +1,4 @@
-"""Files of finished artifacts that changed after they were written are named before a step reads them."""
+"""Changed files of finished artifacts are named before a step reads them; whatever changes in other inputs means new work."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store import artifact_files
 from worldline_core.store.artifact_files import VerifyMode, check_artifacts, find_damage, folder_files, write_manifest
 from worldline_core.store.store import Artifact, ArtifactStore
+
+Capsys, Run = pytest.CaptureFixture[str], dict[str, Path]
 
 
 class WriteConfig(StrictModel):
@@ -67,7 +69,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> dict[st
 
 
 @pytest.mark.parametrize("kind", ["curate", "filter"])
-def test_a_flipped_byte_is_named_before_it_is_used(run: dict[str, Path], kind: str, tmp_path: Path) -> None:
+def test_a_flipped_byte_is_named_before_it_is_used(run: Run, kind: str, tmp_path: Path) -> None:
     folder = run[kind]
     for path in [*folder_files(folder), folder / "manifest.json"]:
         size = path.stat().st_size
@@ -80,12 +82,6 @@ def test_a_flipped_byte_is_named_before_it_is_used(run: dict[str, Path], kind: s
     assert not next_step(tmp_path, folder).cached
 
 
-def test_the_videos_that_a_filtered_set_shares_are_compared_too(run: dict[str, Path], tmp_path: Path) -> None:
-    video = next(run["curate"].rglob("*.mp4"))
-    with flipped(video, video.stat().st_size // 2, 3), pytest.raises(ArtifactError, match=rf"{video.name}: sha256"):
-        next_step(tmp_path, run["filter"])
-
-
 READERS = [
     "inspect {set}", "inspect {set} --episode x", "card {set}", "push {set} {out}", "export {set} --format lerobot --output {out}",
     "export {set} --format mcap --episode x --output {out}", "calibrate check --artifact {set} --output {out}", "compare {set} {set}",
@@ -94,9 +90,7 @@ READERS = [
 
 @pytest.mark.parametrize("command", READERS)
 @pytest.mark.parametrize("kind", ["curate", "filter"])
-def test_no_command_reads_a_flipped_byte(
-    run: dict[str, Path], tmp_path: Path, command: str, kind: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_command_reads_a_flipped_byte(run: Run, tmp_path: Path, command: str, kind: str, capsys: Capsys) -> None:
     video = next(run["curate"].rglob("*.mp4"))
     artifact_files._digests.clear()
     with flipped(video, video.stat().st_size // 2, 3), pytest.raises(SystemExit, match=r"[12]"):
@@ -106,17 +100,19 @@ def test_no_command_reads_a_flipped_byte(
 
 
 @pytest.mark.parametrize("kind", ["curate", "filter"])
-def test_no_simulation_starts_from_a_flipped_byte(run: dict[str, Path], kind: str) -> None:
+def test_no_step_and_no_simulation_starts_from_a_flipped_byte(run: Run, kind: str, tmp_path: Path) -> None:
+    """A filtered set shares the videos of the curated one."""
     video = next(run["curate"].rglob("*.mp4"))
-    artifact_files._digests.clear()
-    with flipped(video, video.stat().st_size // 2, 3), pytest.raises(ArtifactError, match=rf"{video.name}: sha256"):
-        RecordedStarts(run[kind], view_sets=[("head",)], fps=8)
+    with flipped(video, video.stat().st_size // 2, 3):
+        with pytest.raises(ArtifactError, match=rf"{video.name}: sha256"):
+            next_step(tmp_path, run[kind])
+        artifact_files._digests.clear()
+        with pytest.raises(ArtifactError, match=rf"{video.name}: sha256"):
+            RecordedStarts(run[kind], view_sets=[("head",)], fps=8)
 
 
 @pytest.mark.parametrize("command", ["card {set}", "export {set} --format model --output {out}", "inspect {set}"])
-def test_no_command_reads_a_damaged_model(
-    project_root: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_command_reads_a_damaged_model(project_root: Path, tmp_path: Path, command: str, capsys: Capsys) -> None:
     copy = shutil.copytree(project_root / "artifacts/shipped/models/causal", tmp_path / "model")
     weights = next(copy.glob("*.safetensors"))
     with flipped(weights, weights.stat().st_size - 1, 3):
@@ -168,9 +164,7 @@ def test_a_process_reads_each_file_once(artifact: Path, tmp_path: Path, monkeypa
     assert not read
 
 
-def test_verify_names_damaged_files_and_how_to_rebuild(
-    artifact: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_verify_names_damaged_files_and_how_to_rebuild(artifact: Path, tmp_path: Path, capsys: Capsys) -> None:
     other = next_step(tmp_path, artifact).path
     command = ["verify", "--artifacts", str(tmp_path)]
     with pytest.raises(SystemExit, match="0"):
@@ -199,3 +193,61 @@ def test_shipped_files_are_those_of_their_manifests(project_root: Path) -> None:
     folders = [shipped / "recordings", shipped / "banks", *sorted((shipped / "models").iterdir())]
     damaged = [folder for folder, damage in check_artifacts(folders).items() if damage]
     assert not damaged, "changed on purpose? python -m tools.state_files FOLDER..."
+
+
+def copy(config: StrictModel, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    for path in inputs["source"].rglob("*.txt"):
+        (output / path.name).write_bytes(path.read_bytes())
+    return {}
+
+
+def read(store: Path, source: Path, mode: VerifyMode = "full") -> Artifact:
+    """A step that reads a folder, in a process that has read nothing yet."""
+    artifact_files._digests.clear()
+    return ArtifactStore(store, mode).run("copy", 1, copy, StrictModel(), {"source": source})
+
+
+FOREIGN = ['{"episodes": 3}', '{"digest": "0123", "files": {}}', "[1, 2]", "no JSON", ""]
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    for name in ("a.txt", "run/b.txt", "run/deep/c.txt"):
+        (tmp_path / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "source" / name).write_text(name)
+    return tmp_path / "source"
+
+
+@pytest.mark.parametrize("manifest", FOREIGN)
+def test_a_source_with_its_own_manifest_is_read_again_when_it_changes(
+    tmp_path: Path, source: Path, manifest: str
+) -> None:
+    (source / "manifest.json").write_text(manifest)
+    keys = {read(tmp_path / "store", source).key}
+    assert read(tmp_path / "store", source).cached
+    changed = ("a.txt", "run/b.txt", "run/deep/c.txt", "manifest.json")
+    for name in changed:
+        (source / name).write_text('{"another": "content"}')
+        keys.add(read(tmp_path / "store", source).key)
+    gone = ("a.txt", "run/deep/c.txt", "run")
+    for name in gone:
+        shutil.rmtree(source / name) if (source / name).is_dir() else (source / name).unlink()
+        keys.add(read(tmp_path / "store", source).key)
+    assert len(keys) == 1 + len(changed) + len(gone)
+
+
+@pytest.mark.parametrize("mode", ["full", "fast"])
+@pytest.mark.parametrize("damage", ["change", "remove", "add"])
+def test_recordings_are_compared_with_our_manifest(tmp_path: Path, source: Path, mode: VerifyMode, damage: str) -> None:
+    write_manifest(source, {"step": "record_episodes"})
+    read(tmp_path / "store", source)
+    path = source / ("new.txt" if damage == "add" else "a.txt")
+    path.unlink() if damage == "remove" else path.write_text("A.txt")
+    if damage != "remove":
+        later = (source / "manifest.json").stat().st_mtime_ns + 10**9
+        os.utime(path, ns=(later, later))
+    with pytest.raises(ArtifactError, match=f"{path.name}: "):
+        read(tmp_path / "store", source, mode)
+    # What the owner meant becomes another input once the manifest is gone, as the message says.
+    (source / "manifest.json").unlink()
+    assert not read(tmp_path / "store", source, mode).cached

@@ -33,8 +33,8 @@ def work(config: WorkConfig, inputs: Mapping[str, Path], output: Path) -> dict[s
     return {}
 
 
-def process(root: Path, rank: int, *, distributed: bool, results: Queue[Any], port: int = 29500) -> None:
-    os.environ.update(WORLD_SIZE="2", RANK=str(rank), MASTER_PORT=str(port))
+def process(root: Path, rank: int, *, distributed: bool, results: Queue[Any]) -> None:
+    os.environ.update(WORLD_SIZE="2", RANK=str(rank), MASTER_PORT="29500")
     artifact = ArtifactStore(root).run("work", 1, work, WorkConfig(seconds=1.0), {}, distributed=distributed)
     results.put((rank, str(artifact.path), artifact.digest, artifact.cached))
     results.close()
@@ -47,10 +47,9 @@ def launch(root: Path, *, distributed: bool) -> list[tuple[int, str, str, bool]]
     results: Queue[Any] = CONTEXT.Queue()
     options = {"distributed": distributed, "results": results}
     # The helper comes first: it has to wait for the owner to begin.
-    processes = []
-    for rank in (1, 0):
-        processes.append(CONTEXT.Process(target=process, args=(root, rank), kwargs=options))
-        processes[-1].start()
+    processes = [CONTEXT.Process(target=process, args=(root, rank), kwargs=options) for rank in (1, 0)]
+    for one in processes:
+        one.start()
         time.sleep(0.3)
     found = [results.get(timeout=30) for _ in processes]
     for one in processes:
@@ -68,18 +67,15 @@ def test_one_process_owns_the_artifact(tmp_path: Path, distributed: bool) -> Non
     took_part = sorted(path.name for path in (folder / "run").iterdir())
     assert took_part == ([".writers", "rank-0", "rank-1"] if distributed else ["rank-0"])
     assert (folder / "content").read_text() == "made"
-    assert sorted(path.suffix for path in folder.parent.iterdir() if path.is_file()) == [
-        ".lock"
-    ]  # no announcement is left
-    again = launch(tmp_path, distributed=distributed)
-    assert [cached for *_, cached in again] == [True, True]
+    assert [path.suffix for path in folder.parent.iterdir() if path.is_file()] == [".lock"]  # no announcement is left
+    assert [cached for *_, cached in launch(tmp_path, distributed=distributed)] == [True, True]
 
 
 def straggle(folder: Path, begun: Any) -> None:
     """A worker of a command that was killed: it does not know yet."""
     with helper_lock(folder):
         begun.set()
-        time.sleep(1.0)
+        time.sleep(0.4)
         (folder / "late").write_text("by a worker whose command is gone")
 
 

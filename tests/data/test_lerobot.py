@@ -1,4 +1,4 @@
-"""LeRobot datasets that are good but unusual: images in the tables, grouped names, byte order marks, the Hub's cache."""
+"""LeRobot datasets whose metadata contradict their files, and datasets that are good but unusual."""
 
 from __future__ import annotations
 
@@ -6,30 +6,178 @@ import io
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from tests.data.curating import reasons, run, write_video
+from tests.data.curating import reasons, run
 from tests.data.published_lerobot import FRAMES, picture, wave, write_droid, write_robocoin
-from tests.data.test_lerobot_rows import DATA, EPISODES, edit, listed, source
-from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.lerobot import flat_names
-from worldline_core.data.video.clip import VideoClip, decode_video
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.artifact_files import digest_folder
 
+DATA = "data/chunk-000/file-000.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+VIDEO = "videos/observation.images.exterior_1_left"
+RATE = 15
 HEAD = "observation.images.cam_high_rgb"
+
+
+def source(root: Path, **changes: Any) -> dict[str, Any]:
+    columns = {"feature": "observation.state", "columns": ["joint_*"]}
+    return {
+        "kind": "lerobot_v3", "path": str(root), "embodiment": "none", "angle_unit": "rad", "split": "test",
+        "views": {"observation.images.exterior_1_left": "head"},
+        "arms": [{"name": "right", "state": {"joints": columns}}], **changes,
+    }  # fmt: skip
 
 
 def v21(root: Path, **changes: Any) -> dict[str, Any]:
     return source(root, **{"kind": "lerobot_v21", "arms": None, "views": {HEAD: "head"}, **changes})
+
+
+def edit(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    pq.write_table(change(pq.read_table(path)), path)
+
+
+def with_values(table: pa.Table, **columns: Any) -> pa.Table:
+    for name, values in columns.items():
+        at = table.column_names.index(name)
+        table = table.set_column(at, name, pa.array(values))
+    return table
+
+
+def listed(**columns: Any) -> Callable[[pa.Table], pa.Table]:
+    named = {name.replace("__", "/"): values for name, values in columns.items()}
+    return lambda table: with_values(table, **named)
+
+
+def assert_paired(curated: EpisodeSet) -> None:
+    """The states and the pictures of every episode are those that were written under its number."""
+    for position, row in enumerate(curated.rows):
+        if not row.episode_id.startswith("raw-"):
+            continue
+        number = int(row.episode_id.rsplit("-", 1)[1])
+        assert np.allclose(curated.episode(position).state, wave(8, number)[:, :7], atol=1e-6)
+        for frame in (0, FRAMES - 1):
+            shown = curated.frames(position, "head", [frame])[0].astype(int)
+            assert np.abs(shown - picture(number + 1, frame)).mean() < 6  # its camera has the seeds 1 and 2
+
+
+def without_first(table: pa.Table) -> pa.Table:
+    return table.filter(pa.array(np.asarray(table["episode_index"]) != 0))
+
+
+def second_first(table: pa.Table) -> pa.Table:
+    return pa.concat_tables([table.slice(FRAMES), table.slice(0, FRAMES)])
+
+
+def shuffled(table: pa.Table) -> pa.Table:
+    return table.take(pa.array(np.random.default_rng(0).permutation(len(table))))
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "found"), [(DATA, second_first, 2), (DATA, shuffled, 2), (EPISODES, without_first, 1)]
+)
+def test_rows_are_found_by_their_numbers(tmp_path: Path, file: str, change: Any, found: int) -> None:
+    write_droid(tmp_path / "raw")
+    edit(tmp_path / "raw" / file, change)
+    counts, curated = run(tmp_path, source(tmp_path / "raw"))
+    assert (counts["found"], counts["kept"]) == (found, found)
+    assert_paired(curated)
+
+
+@pytest.mark.parametrize(
+    "stale", [{"data__file_index": [0, 7]}, {"data__file_index": [1, 0]}, {"data__chunk_index": [3, 3]}]
+)
+def test_a_stale_data_file_is_searched_for(tmp_path: Path, stale: dict[str, Any]) -> None:
+    write_droid(tmp_path / "raw")
+    path = tmp_path / "raw" / DATA
+    table = pq.read_table(path)
+    pq.write_table(table.slice(0, FRAMES), path)
+    pq.write_table(table.slice(FRAMES), path.with_name("file-001.parquet"))
+    edit(tmp_path / "raw" / EPISODES, listed(**stale))
+    counts, curated = run(tmp_path, source(tmp_path / "raw"))
+    assert counts["kept"] == 2
+    assert_paired(curated)
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "said"),
+    [
+        (EPISODES, listed(dataset_from_index=[0, 0], dataset_to_index=[FRAMES, FRAMES]), "expected: index 0"),
+        (EPISODES, listed(dataset_from_index=[FRAMES, 0], dataset_to_index=[2 * FRAMES, FRAMES]), "index 12"),
+        (EPISODES, listed(dataset_to_index=[FRAMES, 2 * FRAMES - 1]), "dataset_to_index"),
+        (DATA, listed(episode_index=[1] * FRAMES + [0] * FRAMES), "contradict"),
+        (DATA, listed(index=[0] * 2 * FRAMES), "index"),
+        (DATA, listed(frame_index=np.r_[1 : FRAMES + 1, 0:FRAMES]), "frame_index 0 in its row 0"),
+        (DATA, listed(timestamp=np.r_[0:FRAMES, 3 : FRAMES + 3] / RATE), "timestamp 0 in its first row"),
+    ],
+)
+def test_rows_that_contradict_the_episode_list_are_refused(tmp_path: Path, file: str, change: Any, said: str) -> None:
+    write_droid(tmp_path / "raw")
+    edit(tmp_path / "raw" / file, change)
+    write_robocoin(tmp_path / "good")  # whose episode is kept
+    counts, curated = run(tmp_path, source(tmp_path / "raw"), v21(tmp_path / "good"))
+    assert set(counts["reasons"]) == {"length_mismatch"}
+    assert said in curated.quarantine()[0].detail
+    assert_paired(curated)
+
+
+def test_a_file_of_another_episode_is_refused_in_v21(tmp_path: Path) -> None:
+    write_robocoin(tmp_path / "raw", episodes=3)
+    first, second, third = (tmp_path / f"raw/data/chunk-000/episode_{i:06d}.parquet" for i in range(3))
+    contents = second.read_bytes(), first.read_bytes()
+    for path, content in zip((first, second), contents, strict=True):
+        path.write_bytes(content)
+    edit(third, lambda table: table.take(pa.array([1, 0, *range(2, FRAMES)])))
+    with pytest.raises(DataError, match=r"(?s)3 quarantined.*expected: episode_index 0.*got: episode_index 1"):
+        run(tmp_path, v21(tmp_path / "raw"))
+
+
+def window(start: tuple[float, float], stop: tuple[float, float]) -> Callable[[pa.Table], pa.Table]:
+    times = {f"{VIDEO}/from_timestamp": np.divide(start, RATE), f"{VIDEO}/to_timestamp": np.divide(stop, RATE)}
+    return lambda table: with_values(table, **times)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason", "said"),
+    [
+        (window((0, 11), (12, 24)), "length_mismatch", "got: 13 frames"),
+        (window((0, 13), (12, 24)), "length_mismatch", "got: 11 frames"),
+        (window((0, 12), (12, 20)), "length_mismatch", "got: 8 frames"),
+        (window((0, 12.4), (12, 24.4)), "wrong_fps", "start of the window"),
+        (window((0, 11.7), (12, 23.7)), "wrong_fps", "0.30 of a frame late"),
+        (window((0, 13), (12, 25)), "truncated_video", "11 frames"),
+    ],
+)
+def test_a_video_window_that_does_not_fit_is_named(tmp_path: Path, change: Any, reason: str, said: str) -> None:
+    write_droid(tmp_path / "raw")
+    edit(tmp_path / "raw" / EPISODES, change)
+    counts, curated = run(tmp_path, source(tmp_path / "raw"))
+    assert_paired(curated)
+    detail = curated.quarantine()[0].detail
+    assert (counts["kept"], counts["reasons"]) == (1, {reason: 1}), detail
+    assert said in detail
+
+
+def test_windows_that_share_pictures_and_a_rate_that_the_video_leaves_are_refused(tmp_path: Path) -> None:
+    write_droid(tmp_path / "raw")
+    whole = (tmp_path / "raw" / EPISODES).read_bytes()
+    edit(tmp_path / "raw" / EPISODES, window((1, 12), (13, 24)))
+    with pytest.raises(DataError, match=r"(?s)2 quarantined.*windows of two episodes overlap.*and episode 1"):
+        run(tmp_path, source(tmp_path / "raw"))
+    (tmp_path / "raw" / EPISODES).write_bytes(whole)
+    info = tmp_path / "raw/meta/info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": 16}))
+    with pytest.raises(DataError, match=r"(?s)2 quarantined.*fps"):
+        run(tmp_path / "second", source(tmp_path / "raw"))
 
 
 def png(image: np.ndarray, kind: str = "PNG") -> bytes:
@@ -145,12 +293,16 @@ def test_a_line_that_is_no_episode_is_one_message(tmp_path: Path, line: str) -> 
         run(tmp_path, v21(tmp_path / "raw"))
 
 
-@pytest.mark.parametrize("index", [float("nan"), None, 1e300, -1.0, 0.5])
-def test_a_task_index_that_is_no_index_costs_its_episode(tmp_path: Path, index: float | None) -> None:
+@pytest.mark.parametrize(
+    "tasks",
+    [*([index] * FRAMES for index in (7.0, -1.0, float("nan"), None, 1e300, 0.5)), [0] * (FRAMES - 1) + [2]],
+)
+def test_a_task_that_is_not_listed_costs_its_episode(tmp_path: Path, tasks: list[Any]) -> None:
     write_droid(tmp_path / "raw")
-    edit(tmp_path / "raw" / DATA, listed(task_index=[index] * FRAMES + [0.0] * FRAMES))
-    counts, _ = run(tmp_path, source(tmp_path / "raw"))
+    edit(tmp_path / "raw" / DATA, listed(task_index=[0 if tasks[0] == 0 else 0.0] * FRAMES + tasks))
+    counts, curated = run(tmp_path, source(tmp_path / "raw"))
     assert (counts["kept"], set(counts["reasons"]) <= {"missing_column", "nan_state"}) == (1, True)
+    assert curated.rows[0].instruction == "put the pen in the cup"
 
 
 def test_lengths_in_version_3_may_be_floats_but_no_fractions(tmp_path: Path) -> None:
@@ -252,78 +404,3 @@ def test_all_missing_files_of_version_3_are_said_at_once(tmp_path: Path, info: b
     said = r"(?s)tasks\.parquet.*meta/episodes.*data/.*videos/observation\.images\.exterior_1_left"
     with pytest.raises(DataError, match=said if info else said.replace("(?s)", r"(?s)info\.json.*")):
         run(tmp_path, source(tmp_path / "raw"))
-
-
-@pytest.fixture
-def lerobot_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    return LeRobotDataset
-
-
-def pixels(item: Any, key: str) -> np.ndarray:
-    return (item[key].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)  # importing LeRobot alone takes minutes on a busy machine
-def test_images_and_stale_file_numbers_as_lerobots_own_class_writes_and_reads_them(
-    tmp_path: Path, lerobot_class: Any
-) -> None:
-    key, root = "observation.images.front", tmp_path / "raw"
-    vector = {"dtype": "float32", "shape": (7,), "names": [f"joint_{i}" for i in range(7)]}
-    image = {"dtype": "image", "shape": (72, 128, 3), "names": ["height", "width", "channels"]}
-    features = {key: image, "observation.state": vector, "action": vector}
-    written = lerobot_class.create("local/raw", 15, features, root=root, use_videos=False)
-    for number in range(2):
-        for frame in range(FRAMES):
-            state = wave(7, number)[frame].astype(np.float32)
-            written.add_frame(
-                {key: picture(number, frame), "observation.state": state, "action": state, "task": f"task {number}"}
-            )
-        written.save_episode()
-    written.finalize()
-    for path in (root / "meta/episodes").rglob("*.parquet"):
-        edit(path, listed(data__file_index=[5, 6]))
-    opened = lerobot_class("local/raw", root=root)
-    counts, curated = run(tmp_path, source(root, views={key: "head"}))
-    assert counts["kept"] == 2
-    for number, frame in ((0, 0), (0, FRAMES - 1), (1, 0), (1, 5)):
-        item = opened[number * FRAMES + frame]
-        assert np.array_equal(curated.episode(number).state[frame], item["observation.state"].numpy())
-        assert curated.rows[number].instruction == item["task"]
-        assert np.abs(curated.frames(number, "head", [frame])[0].astype(int) - pixels(item, key)).mean() < 6
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_lerobots_own_class_reads_what_is_written_here(tmp_path: Path, sample: Any, lerobot_class: Any) -> None:
-    with EpisodeSetWriter(tmp_path / "set") as writer:
-        for number in range(3):
-            writer.add(*sample(number, num_frames=5 + number))
-    stored = EpisodeSet.open(tmp_path / "set")
-    opened = lerobot_class("local/set", root=tmp_path / "set/datasets/ur5e_pair", video_backend="pyav")
-    assert (opened.num_episodes, len(opened), opened.fps) == (3, 5 + 6 + 7, 8)
-    assert opened.meta.stats["observation.state"]["mean"].shape == (14,)
-    for position, (episode, frame) in {0: (0, 0), 4: (0, 4), 5: (1, 0), 12: (2, 1), 17: (2, 6)}.items():
-        item = opened[position]
-        assert (int(item["episode_index"]), int(item["frame_index"])) == (episode, frame)
-        assert np.array_equal(item["observation.state"].numpy(), stored.episode(episode).state[frame])
-        assert np.array_equal(item["action"].numpy(), stored.episode(episode).action[frame])
-        assert item["task"] == stored.rows[episode].instruction
-        for view in stored.rows[episode].views:
-            assert np.array_equal(pixels(item, f"observation.images.{view}"), stored.frames(episode, view, [frame])[0])
-    # Videos copied as they were recorded, with frames stored out of order, one file an episode.
-    shown = {}
-    with EpisodeSetWriter(tmp_path / "copied") as writer:
-        for number in range(2):
-            episode, frames, _ = sample(number, num_frames=15)
-            path = write_video(tmp_path / f"{number}.mp4", frames["head"], options={"bf": "3"})
-            shown[number] = decode_video(path)
-            recorded = RecordedView(lambda: iter(()), 15, VideoClip.whole_file(path, 15, 8.0))
-            writer.add(replace(episode, cameras={"head": episode.cameras["head"]}), {"head": recorded})
-    copied = lerobot_class("local/copied", root=tmp_path / "copied/datasets/ur5e_pair", video_backend="pyav")
-    for position in (0, 1, 7, 14, 15, 22, 29):
-        assert np.array_equal(pixels(copied[position], "observation.images.head"), shown[position // 15][position % 15])
