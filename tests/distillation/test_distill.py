@@ -1,11 +1,8 @@
-"""The whole distill step on random weights and latents: its result, its resumption after kills, its refusals."""
-
-from __future__ import annotations
+"""The whole distill step on random weights: its result, its resumption after kills, its refusals; from frames, and without a view."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, partialmethod
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -13,8 +10,13 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from tests.distillation.conftest import write_inputs  # pyright: ignore[reportMissingImports]
+from flows.pipeline import chain
+from tasks.execution.chain import outline
+from tests.distillation.conftest import SIGMA, trainer, write_inputs
+from tests.rollout.conftest import SIZE, mixed_views, small_model
+from tests.training.conftest import FRAME_INPUT, write_tokenizer
 from worldline_core.actions.episode_tracks import ActionTracks, write_index
+from worldline_core.config import load_config
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.distillation import teacher_trajectories
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
@@ -28,55 +30,30 @@ from worldline_core.distillation.teacher_trajectories import (
     write_trajectories,
 )
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
-from worldline_core.errors import ArtifactError, CheckpointError, DataError
-from worldline_core.model.block_causal_attention import KVCache
+from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
+from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TrainedClips
+from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rollout.rollout import long_rollout
 from worldline_core.rollout.worldline import WorldLine
-from worldline_core.store.artifact_files import digest_file, folder_files
+from worldline_core.store.artifact_files import digest_folder, read_json_lines
+from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch
-from worldline_core.training.clip_source import LatentStore
+from worldline_core.training.clip_source import FrameSource, LatentStore
+from worldline_core.training.encode_latents import encode_latents
 
 
-def trainer(steps: int, **changes: object) -> dict[str, object]:
-    return {
-        "steps": steps,
-        "batch_size": 2,
-        "precision": "fp32",
-        "log_every": 6,
-        "validation_batches": 1,
-        "save_every_seconds": 3600,
-        "save_every_steps": 2,
-        "optimizer": {"learning_rate": 1e-3, "warmup_steps": 2},
-        **changes,
-    }
-
-
-def config() -> DistillConfig:
-    return DistillConfig.model_validate(
-        {
-            "clips": {"lengths": [17]},
-            "block_size": 2,
-            "teacher_forcing": {
-                "trainer": trainer(3),
-                "history_noise": 0.1,
-                "view_weights": {"joint": 1.0, "head": 1.0},
-                "single_view_factor": 2,
-            },
-            "trajectory_regression": {
-                "trainer": trainer(3),
-                "trajectories": {"clips": 4, "clips_per_shard": 2, "substeps": [1, 1, 1, 2]},
-            },
-            "distribution_matching": {"trainer": trainer(12)},
-        }
-    )
-
-
-def digests(folder: Path) -> dict[str, str]:
-    return {path.relative_to(folder).as_posix(): digest_file(path) for path in folder_files(folder)}
+def config(**changes):
+    forcing = {"history_noise": 0.1, "view_weights": {"joint": 1.0, "head": 1.0}, "single_view_factor": 2}
+    trajectories = {"clips": 4, "clips_per_shard": 2, "substeps": [1, 1, 1, 2]}
+    return DistillConfig.model_validate({
+        "clips": {"lengths": [17]}, "block_size": 2, "teacher_forcing": {"trainer": trainer(3), **forcing},
+        "trajectory_regression": {"trainer": trainer(3), "trajectories": trajectories},
+        "distribution_matching": {"trainer": trainer(12)}, **changes,
+    })  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -89,74 +66,67 @@ class Finished:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory, make_model: Callable, make_contract: Callable) -> Finished:
+def finished(tmp_path_factory, make_model, make_contract):
     inputs = write_inputs(tmp_path_factory.mktemp("inputs"), make_model, make_contract)
     output = tmp_path_factory.mktemp("finished") / "out"
     return Finished(inputs, output, distill(config(), inputs, output))
 
 
-def test_three_steps_give_a_causal_checkpoint(finished: Finished) -> None:
-    inputs, output, counts = finished.inputs, finished.output, finished.counts
+def test_three_steps_give_a_causal_checkpoint(finished, monkeypatch):
+    output, counts = finished.output, finished.counts
     model, info = load_checkpoint(output, expect_kind="causal")
-    assert info.metadata["distillation"] == "distribution_matching"
-    assert info.contract == read_checkpoint_info(inputs["stage2"]).contract
+    start, before = load_checkpoint(finished.inputs["stage2"])
+    assert (info.metadata["distillation"], info.contract) == ("distribution_matching", before.contract)
     assert info.causal == config().spec
     assert info.causal.sigmas == pytest.approx([1, 15 / 16, 5 / 6, 5 / 8, 0])
     assert counts["lpips"] == info.metadata["lpips"] == "off: no LPIPS weights configured"
     assert counts["episodes"] == 2
     json.dumps(counts, allow_nan=False)
-    start, _ = load_checkpoint(inputs["stage2"])
-    changed = [not torch.equal(a, b) for a, b in zip(model.parameters(), start.parameters(), strict=True)]
-    assert all(changed)
+    assert not any(torch.equal(a, b) for a, b in zip(model.parameters(), start.parameters(), strict=True))
     for step in ("teacher_forcing", "trajectory_regression", "distribution_matching"):
-        rows = [json.loads(line) for line in (output / step / "metrics.jsonl").read_text().splitlines()]
+        rows = read_json_lines(output / step / "metrics.jsonl")
         assert rows[-1]["validation/rollout_error"] > 0
         assert f"{step}/validation/rollout_error" in counts
         if step != "distribution_matching":
             load_checkpoint(output / step, expect_kind="causal")
-    losses = [row for row in rows if "fake_score" in row]
-    assert {"distribution_matching", "robot", "robot_motion", "anchor", "boundary"} <= set(losses[-1])
+    # Scaled by their share of the iterations: the mean over a cycle is the mean of the updates that report them.
+    weights = {
+        "fake_score": 5, "distribution_matching": 1, "anchor": 0.005, "boundary": 0.05, "robot": 0.005, "robot_motion": 0.1,
+    }  # fmt: skip
+    assert rows[0]["loss"] == pytest.approx(
+        sum(rows[0][name] * weight for name, weight in weights.items()) / 6, rel=1e-4
+    )
     index = json.loads((output / "trajectory_regression" / "trajectories.json").read_text())
     assert len(index["shards"]) == 2
+    monkeypatch.setattr("worldline_core.distillation.distill.train", None)  # a finished run is read, not repeated
+    assert distill(config(), finished.inputs, output) == counts
 
 
-def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_result(
-    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_result(inputs, tmp_path, monkeypatch):
     """Blocks of two latent frames, no recent block, nodes of two steps: distilled, saved, rolled out and timed so."""
-    small = DistillConfig.model_validate(
-        config().model_dump()
-        | {
-            "window": {"sink_blocks": 1, "recent_blocks": 0},
-            "sigmas": (1.0, 0.6, 0.0),
-            "trajectory_regression": {
-                "trainer": trainer(2),
-                "trajectories": {"clips": 2, "clips_per_shard": 2, "substeps": [1, 2]},
-            },
-        }
-    )
-    passes: list[tuple[int, int, float]] = []
-    forward = WorldModel.forward_block
+    trajectories = {"clips": 2, "clips_per_shard": 2, "substeps": [1, 2]}
+    regression = {"trainer": trainer(2), "trajectories": trajectories}
+    window = {"sink_blocks": 1, "recent_blocks": 0}
+    small = config(window=window, sigmas=(1.0, 0.6, 0.0), trajectory_regression=regression)
+    passes, forward = [], WorldModel.forward_block
 
-    def watch(model: WorldModel, noisy: torch.Tensor, sigma: float, cache: KVCache, **rest: object) -> torch.Tensor:
+    def watch(model, noisy, sigma, cache, **rest):
         passes.append((noisy.shape[3], cache.frames, float(sigma)))
-        return forward(model, noisy, sigma, cache, **rest)  # type: ignore[arg-type]
+        return forward(model, noisy, sigma, cache, **rest)
 
     monkeypatch.setattr(WorldModel, "forward_block", watch)
     distill(small, inputs, tmp_path / "out")
-    assert {(size, held) for size, held, _ in passes} == {(2, 1)}
     # The nodes, and the sub-step of the teacher between 0.6 and 0.
-    between = substep_sigmas(0.6, 0.0, 2)[1]
-    assert {sigma for _, _, sigma in passes} == {1.0, 0.6, between}
+    levels = (1.0, 0.6, substep_sigmas(0.6, 0.0, 2)[1])
+    assert set(passes) == {(2, 1, level) for level in levels}
     for folder in (tmp_path / "out" / "teacher_forcing", tmp_path / "out"):
         model, info = load_checkpoint(folder)
-        assert info.causal == small.spec
-        assert info.causal.recent_blocks == 0
+        assert info.causal == small.spec and info.causal.recent_blocks == 0
 
     class Codec:
         latent_channels, spatial_compression, temporal_compression = 4, 8, 4
 
-    world = WorldLine(model, info, Codec(), bfloat16=False)  # type: ignore[arg-type]
+    world = WorldLine(model, info, Codec(), bfloat16=False)
     assert (world.steps, world.frames_per_unit) == (2, 8)
     passes.clear()
     first, maps = torch.randn(1, 3, 4, 4, 4), torch.randn(1, 3, 9, 5, 4, 4)
@@ -165,72 +135,61 @@ def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_
     assert set(passes) == {(2, 1, 1.0), (2, 1, 0.6)}
 
 
-def test_the_head_alone_is_distilled_and_said(inputs: dict[str, Path], tmp_path: Path) -> None:
+def test_the_head_alone_is_distilled_and_said(inputs, tmp_path):
     model, info = load_checkpoint(inputs["stage2"])
     head = TrainedClips(view_sets=(("head",),), strides=(1,))
     save_checkpoint(tmp_path / "head", model, kind="stage2", action_contract=info.contract, trained=head)
-    given = inputs | {"stage2": tmp_path / "head"}
-    alone = config().model_copy(update={"views": ["head"]})
-    for settings, model in ((config(), given), (alone, inputs)):
+    given, alone = inputs | {"stage2": tmp_path / "head"}, config().model_copy(update={"views": ["head"]})
+    for settings, wrong in ((config(), given), (alone, inputs)):
         with pytest.raises(DataError, match=r"(?s)not trained on these views together.*distill\.views"):
-            distill(settings, model, tmp_path / "refused")
+            distill(settings, wrong, tmp_path / "refused")
     distill(alone, given, tmp_path / "out")
-    assert read_checkpoint_info(tmp_path / "out").trained == head
-    assert read_checkpoint_info(tmp_path / "out").views == ("head",)
+    found = read_checkpoint_info(tmp_path / "out")
+    assert (found.trained, found.views) == (head, ("head",))
 
 
-def test_a_causal_model_goes_on_beside_its_teacher(finished: Finished, tmp_path: Path, make_model: Callable) -> None:
+def test_a_causal_model_goes_on_beside_its_teacher(finished, tmp_path, make_model):
     given = finished.inputs | {"causal": finished.output}
     other = config().model_copy(update={"sigmas": (1.0, 0.9, 0.8, 0.6, 0.0)})
     distill(other, given, tmp_path / "out")
     before, after = read_checkpoint_info(finished.output), read_checkpoint_info(tmp_path / "out" / "teacher_forcing")
     assert after.metadata["start"] == {"kind": "causal", "weights_sha256": before.weights_sha256}
     assert after.causal == other.spec != before.causal
-    wider = make_model(0, intermediate_size=40)
-    save_checkpoint(tmp_path / "wide", wider, kind="causal", action_contract=before.contract, causal=before.causal)
-    with pytest.raises(
-        CheckpointError, match=r"(?s)Stage II model of its own form.*wide: intermediate_size.*got: .*40"
-    ):
-        distill(config(), given | {"causal": tmp_path / "wide"}, tmp_path / "no")
     meant = before.contract.model_copy(update={"fps": 5.0})
-    save_checkpoint(tmp_path / "rate", make_model(0), kind="causal", action_contract=meant, causal=before.causal)
-    with pytest.raises(CheckpointError, match=r"(?s)contract differs.*fps.*expected: .*5\.0.*got: .*8\.0"):
-        distill(config(), given | {"causal": tmp_path / "rate"}, tmp_path / "no")
-    save_checkpoint(tmp_path / "two", make_model(0), kind="stage2", action_contract=before.contract)
-    with pytest.raises(CheckpointError, match=r"(?s)wrong kind.*causal.*stage2"):
-        distill(config(), given | {"causal": tmp_path / "two"}, tmp_path / "no")
+    for kind, changes, contract, message in (
+        (
+            "causal",
+            {"intermediate_size": 40},
+            before.contract,
+            "Stage II model of its own form.*intermediate_size.*got: .*40",
+        ),
+        ("causal", {}, meant, r"contract differs.*fps.*expected: .*5\.0.*got: .*8\.0"),
+        ("stage2", {}, before.contract, "wrong kind.*causal.*stage2"),
+    ):
+        model, causal = make_model(0, **changes), before.causal if kind == "causal" else None
+        save_checkpoint(tmp_path / "wrong", model, kind=kind, action_contract=contract, causal=causal)
+        with pytest.raises(CheckpointError, match=f"(?s){message}"):
+            distill(config(), given | {"causal": tmp_path / "wrong"}, tmp_path / "no")
 
 
-def test_blocks_learn_from_generated_history_and_stage2_as_well(finished: Finished, tmp_path: Path) -> None:
-    plain = config().model_dump(mode="json")
-    plain["teacher_forcing"] |= {"history": "generated", "history_noise": 0.0, "teacher_share": 0.5}
-    distill(DistillConfig.model_validate(plain), finished.inputs, tmp_path)
+def test_blocks_learn_from_generated_history_and_stage2_as_well(finished, tmp_path):
+    forcing = {"trainer": trainer(3), "history": "generated", "teacher_share": 0.5}
+    distill(config(teacher_forcing=forcing), finished.inputs, tmp_path)
     before, after = (load_checkpoint(root / "teacher_forcing")[0] for root in (finished.output, tmp_path))
     assert not torch.equal(next(before.parameters()), next(after.parameters()))
-    rows = [json.loads(line) for line in (tmp_path / "teacher_forcing/metrics.jsonl").read_text().splitlines()]
-    assert rows[-1]["validation/rollout_error"] > 0
-
-
-def test_a_finished_run_is_read_not_repeated(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*args: object, **kwargs: object) -> None:
-        raise RuntimeError("trained again")
-
-    monkeypatch.setattr("worldline_core.distillation.distill.train", refuse)
-    assert distill(config(), finished.inputs, finished.output) == finished.counts
+    assert read_json_lines(tmp_path / "teacher_forcing/metrics.jsonl")[-1]["validation/rollout_error"] > 0
 
 
 class KilledError(Exception):
     pass
 
 
-def killing(function: Callable, at_call: int) -> Callable:
+def killing(function, at_call):
     """The function, but its call number `at_call` raises, as a kill at this moment would end it."""
-    calls = 0
+    calls = iter(range(1, 1000))
 
-    def wrapped(*args: object, **kwargs: object) -> object:
-        nonlocal calls
-        calls += 1
-        if calls == at_call:
+    def wrapped(*args, **kwargs):
+        if next(calls) == at_call:
             raise KilledError("killed")
         return function(*args, **kwargs)
 
@@ -238,26 +197,20 @@ def killing(function: Callable, at_call: int) -> Callable:
 
 
 @pytest.mark.slow
-def test_a_run_killed_anywhere_ends_with_the_same_bytes(
-    finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    settings, inputs, whole = config(), finished.inputs, finished.output
-    kills = [
-        (TeacherForcingObjective, "loss", 3),
-        (teacher_trajectories, "write_bytes_atomic", 2),
-        (TrajectoryObjective, "loss", 3),
-        (DistributionMatchingObjective, "loss", 8),
-    ]
-    for owner, name, call in kills:
+def test_a_run_killed_anywhere_ends_with_the_same_bytes(finished, tmp_path, monkeypatch):
+    for owner, name, call in (
+        (TeacherForcingObjective, "loss", 3), (teacher_trajectories, "write_bytes_atomic", 2),
+        (TrajectoryObjective, "loss", 3), (DistributionMatchingObjective, "loss", 8),
+    ):  # fmt: skip
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, killing(getattr(owner, name), call))
             with pytest.raises(KilledError, match="killed"):
-                distill(settings, inputs, tmp_path / "killed")
-    distill(settings, inputs, tmp_path / "killed")
-    assert digests(tmp_path / "killed") == digests(whole)
+                distill(config(), finished.inputs, tmp_path)
+    distill(config(), finished.inputs, tmp_path)
+    assert digest_folder(tmp_path) == digest_folder(finished.output)
 
 
-def test_exit_steps_do_not_depend_on_the_rank_and_cover_the_schedule(make_model: Callable) -> None:
+def test_exit_steps_do_not_depend_on_the_rank_and_cover_the_schedule(make_model):
     model = make_model(0)
     objective = DistributionMatchingObjective(model, make_model(1), make_model(2), config(), None)
     steps = [objective.exit_step(step) for step in range(60)]
@@ -265,42 +218,21 @@ def test_exit_steps_do_not_depend_on_the_rank_and_cover_the_schedule(make_model:
     assert set(steps) == {0, 1, 2, 3}
 
 
-def test_an_iteration_changes_one_of_the_two_models(finished: Finished) -> None:
-    rows = (finished.output / "distribution_matching" / "metrics.jsonl").read_text().splitlines()
-    first = json.loads(rows[0])
-    # Scaled by their share of the iterations: the mean over a cycle is the mean of the updates that report them.
-    assert first["loss"] == pytest.approx(
-        (
-            5 * first["fake_score"]
-            + first["distribution_matching"]
-            + 0.005 * first["anchor"]
-            + 0.05 * first["boundary"]
-            + 0.005 * first["robot"]
-            + 0.1 * first["robot_motion"]
-        )
-        / 6,
-        rel=1e-4,
-    )
-
-
-def test_masks_follow_the_robot_and_skip_views_without_calibration(inputs: dict[str, Path]) -> None:
-    views = ("head", "left_wrist", "right_wrist")
-    tracks = ActionTracks.open(inputs["tracks"])
-    loader = ClipLoader(LatentStore.open(inputs["latents"]), views=views, tracks=tracks)
-    masks = robot_masks(loader, [Clip("a", 0, 17, 1), Clip("b", 4, 17, 1)], views)
+def test_masks_follow_the_robot_and_skip_views_without_calibration(finished):
+    tracks = ActionTracks.open(finished.inputs["tracks"])
+    loader = ClipLoader(LatentStore.open(finished.inputs["latents"]), views=VIEWS, tracks=tracks)
+    masks = robot_masks(loader, [Clip("episode-001", 0, 17, 1), Clip("episode-002", 4, 17, 1)], VIEWS)
     assert masks.shape == (2, 3, 5, 4, 4)
     assert set(masks.unique().tolist()) == {0.0, 1.0}
     assert not bool(masks[:, 2].any())
-    columns = torch.arange(4.0)
-    centre = [(masks[0, 0, t].amax(0) * columns).sum() / masks[0, 0, t].amax(0).sum() for t in (0, 4)]
-    assert centre[1] > centre[0]
+    columns = [masks[0, 0, t].amax(0) for t in (0, 4)]
+    begin, end = ((column * torch.arange(4.0)).sum() / column.sum() for column in columns)
+    assert end > begin
 
 
 @pytest.mark.slow
-def test_controls_of_whole_intervals_reach_every_step(
-    inputs: dict[str, Path], tmp_path: Path, make_model: Callable[..., WorldModel], make_contract: Callable
-) -> None:
-    contract = make_contract(sigma_px_ref=40.0)
+def test_controls_of_whole_intervals_reach_every_step(inputs, tmp_path, make_model, make_contract):
+    contract = make_contract(sigma_px_ref=SIGMA, tokenizer="synthetic")
     save_checkpoint(inputs["stage2"], make_model(0, action_frames=4), kind="stage2", action_contract=contract)
     distill(config(), inputs, tmp_path / "out")
     model, info = load_checkpoint(tmp_path / "out", expect_kind="causal")
@@ -315,66 +247,211 @@ def test_controls_of_whole_intervals_reach_every_step(
             r"lengths \[17\]: clips are one observed frame and whole blocks",
         ),
         ({"clips": {"view_weights": {"head": 1.0}}}, "hold all views"),
+        ({"distribution_matching": {"sigma_range": [0.9, 0.1]}}, "must rise"),
+        ({"sigmas": [1.0, 0.5, 0.0]}, r"one number per interval of sigmas is needed, 2"),
+        ({"sigmas": [0.5, 1.0, 0.0]}, "must fall from at most 1 to 0"),
+        ({"teacher_forcing": {"history": "generated", "history_noise": 0.1}}, "history_noise is of recorded blocks"),
+        (
+            {"clips": {"lengths": [33]}, "window": {"anchor_blocks": 4}},
+            "anchor_blocks 4: the longest clip has 2 blocks",
+        ),
     ],
 )
-def test_clips_are_whole_blocks_of_all_views(values: dict[str, object], message: str) -> None:
+def test_settings_that_contradict_each_other_are_refused(values, message):
     with pytest.raises(ValidationError, match=message):
         DistillConfig.model_validate(values)
 
 
-def test_only_a_stage2_checkpoint_of_the_same_latents_is_distilled(inputs: dict[str, Path], tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="wrong kind"):
-        distill(config(), {**inputs, "stage2": inputs["stage1"]}, tmp_path / "out")
-    description = json.loads((inputs["latents"] / "store.json").read_text())
-    (inputs["latents"] / "store.json").write_text(json.dumps({**description, "tokenizer": "other"}))
-    with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*tokenizer.*0123.*other"):
-        distill(config(), inputs, tmp_path / "out2")
+def changed_json(path, change):
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
 
 
-def test_tracks_of_another_width_are_refused(inputs: dict[str, Path], tmp_path: Path) -> None:
-    write_index(inputs["tracks"], pq.read_table(inputs["tracks"] / "index.parquet").to_pylist(), sigma_px_ref=10.0)
-    with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*tracks: sigma_px_ref.*40\.0.*10\.0"):
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda inputs: inputs.update(stage2=inputs["stage1"]), "wrong kind"),
+        (
+            lambda inputs: changed_json(inputs["latents"] / "store.json", lambda found: found | {"tokenizer": "other"}),
+            "action contract differs.*tokenizer.*synthetic.*other",
+        ),
+        (
+            lambda inputs: write_index(
+                inputs["tracks"], pq.read_table(inputs["tracks"] / "index.parquet").to_pylist(), sigma_px_ref=10.0
+            ),
+            r"action contract differs.*tracks: sigma_px_ref.*40\.0.*10\.0",
+        ),
+        (
+            lambda inputs: changed_json(
+                inputs["stage2"] / "checkpoint.json",
+                lambda found: found | {"action_contract": found["action_contract"] | {"controls": "state"}},
+            ),
+            "contract differs.*episode episode-.*: controls.*expected: .*state.*got: .*action",
+        ),
+    ],
+    ids=["a Stage I checkpoint", "other latents", "tracks of another width", "measured joints, tracks of commands"],
+)
+def test_inputs_of_another_meaning_are_refused_before_the_first_step(inputs, tmp_path, change, message):
+    change(inputs)
+    with pytest.raises(CheckpointError, match=f"(?s){message}"):
         distill(config(), inputs, tmp_path / "out")
 
 
-def test_controls_of_another_meaning_are_refused_before_the_first_step(inputs: dict[str, Path], tmp_path: Path) -> None:
-    """A Stage II model of measured joints, tracks of commands."""
-    path = inputs["stage2"] / "checkpoint.json"
-    content = json.loads(path.read_text())
-    path.write_text(json.dumps(content | {"action_contract": content["action_contract"] | {"controls": "state"}}))
-    with pytest.raises(
-        CheckpointError, match=r"(?s)contract differs.*episode a: controls.*expected: .*state.*got: .*action"
-    ):
-        distill(config(), inputs, tmp_path / "out")
-
-
-def test_noise_levels_of_the_wrong_order_are_refused() -> None:
-    with pytest.raises(ValidationError, match="must rise"):
-        DistillConfig.model_validate({"distribution_matching": {"sigma_range": [0.9, 0.1]}})
-    with pytest.raises(ValidationError, match=r"one number per interval of sigmas is needed, 2"):
-        DistillConfig.model_validate({"sigmas": [1.0, 0.5, 0.0]})
-    with pytest.raises(ValidationError, match="must fall from at most 1 to 0"):
-        DistillConfig.model_validate({"sigmas": [0.5, 1.0, 0.0]})
-
-
-def test_trajectories_are_read_as_written_and_refused_when_other(tmp_path: Path) -> None:
+def test_trajectories_are_read_as_written_and_refused_when_other(tmp_path):
     nodes = torch.randn(2, 5, 3, 4, 4, 2, 2, generator=torch.Generator().manual_seed(0))
-    mask = torch.ones(2, 3, 5, 2, 2)
 
-    def make(number: int) -> tuple[ClipBatch, dict[str, torch.Tensor]]:
+    def make(number):
         clips = (Clip("a", number, 17, 1), Clip("b", number, 17, 1, ("head",)))
-        return ClipBatch(clips, VIEWS), {"nodes": nodes + number, "mask": mask}
+        return ClipBatch(clips, VIEWS), {"nodes": nodes + number, "mask": torch.ones(2, 3, 5, 2, 2)}
 
     with pytest.raises(ArtifactError, match="Not a folder of finished"):
         TrajectoryStore.open(tmp_path)
     write_trajectories(tmp_path, 2, make, {"seed": 1})
     store = TrajectoryStore.open(tmp_path)
-    assert len(store) == 4
+    assert store.views == [VIEWS] * len(store) == [VIEWS] * 4
     assert store.clips([3, 0]) == (Clip("b", 1, 17, 1, ("head",)), Clip("a", 0, 17, 1))
-    assert store.views == [VIEWS] * 4
     torch.testing.assert_close(store.read("nodes", [3, 0]), torch.stack((nodes[1] + 1, nodes[0])), rtol=2e-3, atol=2e-3)
     assert store.read("mask", [1]).dtype == torch.float32
     with pytest.raises(ArtifactError, match=r"(?s)lacks a tensor.*shard-00000.*latents"):
         store.read("latents", [1])
     with pytest.raises(ArtifactError, match="other settings"):
         write_trajectories(tmp_path, 2, make, {"seed": 2})
+
+
+HEAD, RIGHT = ("head",), ("head", "right_wrist")
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory, make_contract):
+    """Recordings of three sets of views, each a split of its own, their latents, and a Stage II model of random weights."""
+    root = tmp_path_factory.mktemp("missing_views")
+    made, _ = mixed_views(root, {"three": "train", "two": "validation", "one": "test"})
+    tokenizer = load_tokenizer(root / "tokenizer")
+    contract = make_contract(grid_size=(4, 6), tokenizer=tokenizer.encoder_digest[:16], sigma_px_ref=40.0)
+    trained = TrainedClips(view_sets=(VIEWS, RIGHT, HEAD), strides=(1,))
+    save_checkpoint(root / "stage2", small_model(), kind="stage2", action_contract=contract, trained=trained)
+    return {**made, "stage2": root / "stage2"}
+
+
+def views_config(kind, splits, **clips):
+    trainer = {"batch_size": 1, "precision": "fp32", "log_every": 6, "validation_batches": 1}
+    source = {"kind": kind} | ({"image_size": SIZE} if kind == "frames" else {})
+    return DistillConfig.model_validate(
+        {
+            "input": source, "clips": {"lengths": [17], **clips}, "splits": splits,
+            "validation_splits": splits[-1:], "block_size": 2,
+            "teacher_forcing": {"trainer": {**trainer, "steps": 16}},
+            "trajectory_regression": {
+                "trainer": {**trainer, "steps": 16},
+                "trajectories": {"clips": 16, "clips_per_shard": 1, "substeps": [1, 1, 1, 1]},
+            },
+            "distribution_matching": {"trainer": {**trainer, "steps": 18}},
+        }
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["latents", "frames"])
+@pytest.mark.slow
+def test_every_step_sees_every_set_of_views(mixed, tmp_path, monkeypatch, kind):
+    seen = {}
+
+    def watched(self, batch, *rest, loss):
+        seen.setdefault(type(self).__name__, []).append(batch)
+        return loss(self, batch, *rest)
+
+    for objective in (TeacherForcingObjective, TrajectoryObjective, DistributionMatchingObjective):
+        monkeypatch.setattr(objective, "loss", partialmethod(watched, loss=objective.loss))
+    counts = distill(views_config(kind, ["train", "validation", "test"]), mixed, tmp_path)
+    assert counts["kept"] == 6
+    assert len(seen) == 3
+    for batches in seen.values():
+        assert {batch.views for batch in batches} == {VIEWS, RIGHT, HEAD}
+        for batch in batches:
+            assert batch.latents.shape[1] == len(batch.views)
+            assert batch.clips[0].episode_id[:3] == ("one", "two", "thr")[len(batch.views) - 1]
+    for batch in seen["TrajectoryObjective"]:
+        assert batch.nodes.shape[2] == batch.mask.shape[1] == len(batch.views)  # type: ignore[attr-defined]
+    assert read_checkpoint_info(tmp_path).view_sets == (VIEWS, RIGHT, HEAD)
+    assert "validation/rollout_error" in " ".join(counts)
+
+
+@pytest.mark.slow
+def test_subsets_of_complete_recordings_are_distilled_and_known(mixed, tmp_path):
+    model, info = load_checkpoint(mixed["stage2"])
+    sets = (VIEWS, ("head", "left_wrist"), RIGHT, HEAD)
+    trained = TrainedClips(view_sets=sets, strides=(1,))
+    save_checkpoint(tmp_path / "all", model, kind="stage2", action_contract=info.contract, trained=trained)
+    made = mixed | {"stage2": tmp_path / "all"}
+    weights = {"joint": 0.4, "subset": 0.6}
+    distill(views_config("latents", ["train"], view_weights=weights), made, tmp_path / "out")
+    assert read_checkpoint_info(tmp_path / "out").view_sets == sets
+    store = TrajectoryStore.open(tmp_path / "out" / "run" / "trajectories")
+    assert len(set(store.views)) > 2
+    with pytest.raises(DataError, match=r"(?s)not trained on these views together.*expected: head \+ left_wrist \+"):
+        distill(views_config("latents", ["train"], view_weights=weights), mixed, tmp_path / "refused")
+
+
+def test_a_model_that_saw_no_left_wrist_says_so(mixed, tmp_path):
+    distill(views_config("latents", ["validation"]), mixed, tmp_path)
+    assert read_checkpoint_info(tmp_path).trained == TrainedClips(view_sets=(RIGHT,), strides=(1,))
+
+
+@pytest.fixture
+def recorded(inputs, tmp_path, make_model, make_contract):
+    """The recordings with a tokenizer, its latents, and a Stage II model of them."""
+    folders = inputs | {name: tmp_path / "own" / name for name in ("tokenizer", "latents", "stage2")}
+    folders["tokenizer"].mkdir(parents=True)
+    write_tokenizer(folders["tokenizer"])
+    encode_latents(EncodeLatentsConfig(image_size=(32, 32)), folders, folders["latents"])
+    tokenizer = json.loads((folders["latents"] / "store.json").read_text())["tokenizer"]
+    contract = make_contract(sigma_px_ref=SIGMA, tokenizer=tokenizer)
+    save_checkpoint(folders["stage2"], make_model(0), kind="stage2", action_contract=contract)
+    return folders
+
+
+def online(**changes):
+    return config(input={**FRAME_INPUT, **changes})
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("forked_loaders")
+def test_frames_on_the_way_are_as_good_as_cached_latents(recorded, tmp_path, monkeypatch):
+    distill(config(), recorded, tmp_path / "cached")
+    inputs = {name: folder for name, folder in recorded.items() if name != "latents"}
+    encoded, inner = [], FrameSource.latents
+
+    def latents(self, read, device):
+        encoded.append(len(read))
+        return inner(self, read, device)
+
+    monkeypatch.setattr(FrameSource, "latents", latents)
+    distill(online(), inputs, tmp_path / "online")
+    monkeypatch.undo()
+    for step in ("teacher_forcing", "trajectory_regression", "."):
+        cached, found = (load_checkpoint(tmp_path / kind / step)[0].state_dict() for kind in ("cached", "online"))
+        for name, value in cached.items():
+            torch.testing.assert_close(found[name], value, rtol=1e-3, atol=2e-4, msg=f"{step}: {name}")
+    # Three steps of teacher forcing, two shards of trajectories, and one held-out batch after each of the three steps.
+    assert len(encoded) == 3 + 2 + 3
+    assert read_checkpoint_info(tmp_path / "online").metadata["input"]["kind"] == "frames"
+    assert "input" not in read_checkpoint_info(tmp_path / "cached").metadata
+    distill(online(workers=1), inputs, tmp_path / "ahead")
+    weights = [(tmp_path / kind / "model.safetensors").read_bytes() for kind in ("online", "ahead")]
+    assert weights[0] == weights[1]
+
+
+def test_what_cannot_be_read_stops_the_run(recorded, tmp_path):
+    inputs = {name: folder for name, folder in recorded.items() if name != "latents"}
+    with pytest.raises(ConfigError, match=r"(?s)need the input latents.*--input latents=FOLDER"):
+        distill(config(), inputs, tmp_path / "cached")
+    video = next((recorded["episodes"] / "datasets").rglob("*head*/**/*.mp4"))
+    video.write_bytes(video.read_bytes()[:200])
+    with pytest.raises(DataError, match=r"(?s)cannot be read.*input\.on_unreadable"):
+        distill(online(), inputs, tmp_path / "strict")
+
+
+def test_latents_are_encoded_before_where_a_step_reads_them_alone():
+    frames = "{kind: frames, image_size: [64, 96]}"
+    overrides = [f"{step}.input={frames}" for step in ("train_stage1", "train_stage2")]
+    for last, cached in (([], True), ([f"distill.input={frames}"], False)):
+        calls = outline(chain, load_config(PipelineConfig, preset="smoke", overrides=[*overrides, *last]))
+        assert ("encode_latents" in calls) is ("latents" in calls["distill"].inputs) is cached

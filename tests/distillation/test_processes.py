@@ -1,7 +1,5 @@
 """`tasks.distill` under torchrun: two processes, one artifact; the same bytes after a kill."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -12,40 +10,22 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.distillation.conftest import trainer
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.store.artifact_files import digest_folder
 
-
-def trainer(steps: int) -> dict[str, object]:
-    return {
-        "steps": steps,
-        "batch_size": 1,
-        "precision": "fp32",
-        "log_every": 6,
-        "validation_batches": 0,
-        "save_every_seconds": 3600,
-        "save_every_steps": 1,
-        "optimizer": {"learning_rate": 1e-3, "warmup_steps": 2},
-    }
-
-
+ALONE = {"batch_size": 1, "validation_batches": 0, "save_every_steps": 1}
+TRAJECTORIES = {"clips": 2, "clips_per_shard": 2, "substeps": [1, 1, 1, 1]}
 CONFIG = {
-    "distill": {
-        "clips": {"lengths": [17]},
-        "block_size": 2,
-        "teacher_forcing": {"trainer": trainer(3)},
-        "trajectory_regression": {
-            "trainer": trainer(3),
-            "trajectories": {"clips": 2, "clips_per_shard": 2, "substeps": [1, 1, 1, 1]},
-        },
-        "distribution_matching": {"trainer": trainer(12)},
-    }
-}
+    "clips": {"lengths": [17]}, "block_size": 2, "teacher_forcing": {"trainer": trainer(3, **ALONE)},
+    "trajectory_regression": {"trainer": trainer(3, **ALONE), "trajectories": TRAJECTORIES},
+    "distribution_matching": {"trainer": trainer(12, **ALONE)},
+}  # fmt: skip
 
 
-def start(project: Path, inputs: dict[str, Path], artifacts: Path, log: Path) -> subprocess.Popen[bytes]:
+def start(project, inputs, artifacts, log):
     config = artifacts.parent / "distill.yaml"
-    config.write_text(yaml.safe_dump(CONFIG))
+    config.write_text(yaml.safe_dump({"distill": CONFIG}))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
                "tasks.distill", "--config", str(config), "--artifacts", str(artifacts)]  # fmt: skip
     for name in ("latents", "tracks", "episodes", "stage2", "tokenizer"):
@@ -55,12 +35,12 @@ def start(project: Path, inputs: dict[str, Path], artifacts: Path, log: Path) ->
         return subprocess.Popen(command, cwd=project, env=environment, stdout=stream, stderr=subprocess.STDOUT)
 
 
-def finish(process: subprocess.Popen[bytes], log: Path, seconds: float = 400) -> str:
+def finish(process, log, seconds=400):
     assert process.wait(timeout=seconds) == 0, log.read_text()[-3000:]
     return log.read_text()
 
 
-def kill_once_there(process: subprocess.Popen[bytes], folder: Path, pattern: str, seconds: float = 300) -> None:
+def kill_once_there(process, folder, pattern, seconds=300):
     """Kill torchrun alone, as soon as a file that fits the pattern is there: its processes end with it."""
     until = time.monotonic() + seconds
     while not any(folder.glob(pattern)):
@@ -78,11 +58,11 @@ def kill_once_there(process: subprocess.Popen[bytes], folder: Path, pattern: str
         time.sleep(0.1)
 
 
-def children(process: int) -> list[int]:
+def children(process):
     return [int(child) for child in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
 
 
-def is_running(process: int) -> bool:
+def is_running(process):
     try:
         return not Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2].startswith("Z")
     except FileNotFoundError:
@@ -90,9 +70,7 @@ def is_running(process: int) -> bool:
 
 
 @pytest.mark.slow
-def test_two_processes_distill_one_artifact_and_go_on_after_a_kill(
-    inputs: dict[str, Path], project_root: Path, tmp_path: Path
-) -> None:
+def test_two_processes_distill_one_artifact_and_go_on_after_a_kill(inputs, project_root, tmp_path):
     whole, parts, log = tmp_path / "whole" / "artifacts", tmp_path / "parts" / "artifacts", tmp_path / "log"
     for folder in (whole, parts):
         folder.mkdir(parents=True)

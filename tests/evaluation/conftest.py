@@ -1,21 +1,21 @@
 """A small world with known outcomes: a dark gripper over a grey table, a red cube, three views."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.rollout.conftest import held_out  # noqa: F401 - a fixture
+from tests.training.conftest import build_episode, build_tracks, killed_after  # noqa: F401 - a fixture
 from worldline_core.actions.episode_tracks import write_index, write_shard
-from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
+from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig, VideoEvaluationConfig
+from worldline_core.evaluation.video.evaluate_video import evaluate_video
 from worldline_core.rollout.rollout_set import RolloutSetWriter
 
+VIDEO = VideoEvaluationConfig(segmenters=("colour",), resamples=100)
+POLICY = PolicyEvaluationConfig(segmenter="colour", splits=("test",), resamples=100)
 NUM_FRAMES = 17
 HEIGHT, WIDTH = 48, 72
 FPS = 8.0
@@ -29,7 +29,7 @@ class SmallWorld:
     outcomes: dict[str, str]
 
 
-def make_film(success: bool, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+def make_film(success, seed):
     """Frames by view, exact head masks, tool points of one attempt to lift the red cube."""
     generator = np.random.default_rng(seed)
     column = int(generator.integers(20, 50))
@@ -54,34 +54,17 @@ def make_film(success: bool, seed: int) -> tuple[dict[str, np.ndarray], np.ndarr
     return {"head": head, "left_wrist": np.full_like(wrist, 100), "right_wrist": wrist}, masks, points
 
 
-def _tracks(episode_id: str, points: np.ndarray, path: np.ndarray) -> Any:
-    views = len(VIEWS)
-    uv = np.zeros((NUM_FRAMES, views, 1, 2))
-    uv[:, 0] = points
-    valid = np.zeros((NUM_FRAMES, views, 1), dtype=bool)
-    valid[:, 0] = True
+def _tracks(episode_id, points, path):
+    uv, valid = np.zeros((NUM_FRAMES, 3, 1, 2)), np.zeros((NUM_FRAMES, 3, 1), dtype=bool)
+    uv[:, 0], valid[:, 0] = points, True
     poses = np.tile(np.eye(4), (NUM_FRAMES, 1, 1, 1))
     poses[:, 0, 2, 3] = path
-    return SimpleNamespace(
-        episode_id=episode_id, embodiment="box_arm", num_frames=NUM_FRAMES, views=VIEWS, arms=("right",),
-        image_size=(HEIGHT, WIDTH), controls="action", camera_motion=("static",) * views, uv=uv, valid=valid,
-        depth=np.ones((NUM_FRAMES, views, 1)), rot6d=np.zeros((NUM_FRAMES, views, 1, 6)),
-        gripper=np.zeros((NUM_FRAMES, views, 1)), T_base_tool=poses,
-        T_base_camera=np.tile(np.eye(4), (NUM_FRAMES, views, 1, 1)), K=np.tile(np.eye(3), (views, 1, 1)),
-        capsules=np.zeros((NUM_FRAMES, 1, 2, 3)), capsule_radii=np.ones(1),
-    )  # fmt: skip
+    gripper = np.zeros((NUM_FRAMES, 3, 1))
+    moved = {"uv": uv, "valid": valid, "T_base_tool": poses, "gripper": gripper}
+    return build_tracks(episode_id, NUM_FRAMES, embodiment="box_arm", image_size=(HEIGHT, WIDTH), **moved)
 
 
-def _write(
-    root: Path,
-    cases: dict[str, bool],
-    *,
-    split: str,
-    bank: str | None,
-    sources: dict[str, str] | None = None,
-    training: int = 0,
-    late: tuple[str, ...] = (),
-) -> SmallWorld:
+def _write(root, cases, *, split, bank, sources=None, training=0, late=()):
     """With ``training`` further recordings that nobody predicted; the robot of those that are ``late`` stands still at first."""
     episodes, tracks = root / "episodes", root / "tracks"
     methods = {"good": root / "good", "copy": root / "copy"}
@@ -92,12 +75,11 @@ def _write(
         for number, (episode_id, success) in enumerate({**cases, **learned}.items()):
             frames, masks, points = make_film(success, seed=0 if bank else number)
             state = np.zeros((NUM_FRAMES, 2), dtype=np.float32)
-            episode = Episode(
-                episode_id=episode_id, source=(sources or {}).get(episode_id, "test"), embodiment="box_arm", scene=f"scene_{number % 2}",
-                task_family="lift", instruction="lift the red cube",
-                outcome="unknown" if bank else ("success" if success else "failure"), split="train" if episode_id in learned else split, fps=FPS,
-                state=state, action=state, timestamps=np.arange(NUM_FRAMES) / FPS, bank=bank,
-                candidate=number if bank else None,
+            outcome = "success" if success else "failure"
+            episode = build_episode(
+                episode_id, state, source=(sources or {}).get(episode_id, "test"), embodiment="box_arm",
+                scene=f"scene_{number % 2}", outcome="unknown" if bank else outcome, bank=bank,
+                split="train" if episode_id in learned else split, candidate=number if bank else None,
             )  # fmt: skip
             cube = (frames["head"] == (220, 20, 20)).all(axis=-1).astype(np.uint8)
             writer.add(episode, frames, {"head": masks}, thing_labels={"head": cube})
@@ -120,14 +102,14 @@ def _write(
 
 
 @pytest.fixture(scope="session")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
+def recordings(tmp_path_factory):
     """Two successes and two failures of the test split."""
     cases = {"ep-0": True, "ep-1": False, "ep-2": True, "ep-3": False}
     return _write(tmp_path_factory.mktemp("recordings"), cases, split="test", bank=None)
 
 
 @pytest.fixture(scope="session")
-def policies(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
+def policies(tmp_path_factory):
     """Three policies, which succeed in three, two and none of three attempts."""
     cases = {f"{name}-{start}": start < wins for name, wins in (("a", 3), ("b", 2), ("c", 0)) for start in range(3)}
     root = tmp_path_factory.mktemp("policies")
@@ -135,14 +117,14 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
 
 
 @pytest.fixture(scope="session")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
+def trained(tmp_path_factory):
     """Two attempts beside the recordings that the model knows; the second one begins later than any of these."""
     root = tmp_path_factory.mktemp("trained")
     return _write(root, {"prompt": True, "late": True}, split="test", bank=None, training=20, late=("late",))
 
 
 @pytest.fixture(scope="session")
-def oddly_named(tmp_path_factory: pytest.TempPathFactory) -> tuple[SmallWorld, SmallWorld]:
+def oddly_named(tmp_path_factory):
     """Recordings and a bank whose names lead out of every folder, or are longer than a file's name may be."""
     cases = {"../../../../outside": True, "/tmp/outside": False, "x" * 400: True, "x" * 399 + "y": False}
     root = tmp_path_factory.mktemp("oddly named")
@@ -151,13 +133,15 @@ def oddly_named(tmp_path_factory: pytest.TempPathFactory) -> tuple[SmallWorld, S
 
 
 @pytest.fixture(scope="session")
-def bank(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
+def bank(tmp_path_factory):
     """One bank of six candidates, the fifth one alone succeeds; labels are sealed nowhere yet."""
     cases = {f"cand-{number}": number == 4 for number in range(6)}
     return _write(tmp_path_factory.mktemp("bank"), cases, split="bank", bank="bank-0")
 
 
-@pytest.fixture
-def film() -> Callable[[bool, int], tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]]:
-    """Makes frames by view, exact head masks and tool points of a successful or a failed lift."""
-    return make_film
+@pytest.fixture(scope="session")
+def evaluated(recordings, tmp_path_factory):
+    """An evaluation of videos that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    assert evaluate_video(VIDEO, recordings.inputs, folder)["methods"] == ["copy", "good"]
+    return folder

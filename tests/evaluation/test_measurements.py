@@ -1,11 +1,14 @@
-"""Coloured things in crisp pictures and in faded ones, as predicted videos show them."""
-
-from __future__ import annotations
+"""What is found in pictures: coloured things, in crisp and in faded ones, and the robot by each segmenter."""
 
 import numpy as np
 import pytest
+import torch
 
 from tests.evaluation.conftest import make_film  # pyright: ignore[reportMissingImports]
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import ArtifactError, DataError, UnavailableError
+from worldline_core.evaluation.evaluation_config import SegmenterConfig
+from worldline_core.evaluation.metrics import frame_iou
 from worldline_core.evaluation.policy.evidence import establishes_success, route
 from worldline_core.evaluation.policy.measured_judge import (
     LATE_COUNT,
@@ -16,6 +19,7 @@ from worldline_core.evaluation.policy.measured_judge import (
     measure_press,
     measure_push,
 )
+from worldline_core.evaluation.segmenters import learned
 from worldline_core.evaluation.segmenters.coloured_things import (
     ColouredThing,
     OwnColour,
@@ -24,30 +28,32 @@ from worldline_core.evaluation.segmenters.coloured_things import (
     named_things,
     own_colour,
 )
-from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter
+from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter, Sam3Segmenter, open_segmenter
+from worldline_core.rehearsal.outside_models import write_sam3
+from worldline_core.store.artifact_files import digest_folder
 
 CUBE = ColouredThing("red", "cube")
 
 
-def faded(frames: np.ndarray, share: float) -> np.ndarray:
+def faded(frames, share):
     """The first frame as it is, the others mixed with grey: ``share`` of the colour is left."""
     out = frames.astype(np.float32)
     out[1:] = share * out[1:] + (1 - share) * 110.0
     return out.round().astype(np.uint8)
 
 
-def lift_score(success: bool, share: float) -> float:
+def lift_score(success, share):
     frames, masks, _ = make_film(success, seed=3)
     shown = {view: faded(video, share) for view, video in frames.items()}
     return measure_lift(shown, CUBE, masks[-LATE_COUNT:]).score()
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6, 0.45])
-def test_a_lifted_cube_ranks_first_even_where_it_has_faded(share: float) -> None:
+def test_a_lifted_cube_ranks_first_even_where_it_has_faded(share):
     assert lift_score(True, share) > lift_score(False, share) + 0.3
 
 
-def test_what_has_faded_is_lost_to_the_colour_word_but_not_to_its_own_colour() -> None:
+def test_what_has_faded_is_lost_to_the_colour_word_but_not_to_its_own_colour():
     frames, _, _ = make_film(False, seed=3)
     pale = faded(frames["head"], 0.45)
     own = own_colour(pale, "red")
@@ -57,28 +63,18 @@ def test_what_has_faded_is_lost_to_the_colour_word_but_not_to_its_own_colour() -
     assert areas[-1] == pytest.approx(areas[0], rel=0.2)
 
 
-@pytest.mark.parametrize("other", [(20, 20, 220), (20, 200, 20), (120, 120, 120), (230, 130, 20)])
-def test_other_hues_and_grey_are_not_the_thing(other: tuple[int, int, int]) -> None:
+def test_a_thing_is_known_by_its_own_colour_alone():
     own = OwnColour(np.array([220, 20, 20], np.float32), 0.2)
-    assert likeness(np.full((1, 4, 4, 3), other, np.uint8), own).max() == 0
-
-
-def test_a_thing_that_is_not_seen_early_has_no_colour_of_its_own() -> None:
-    frames, _, _ = make_film(True, seed=1)
+    for other in ((20, 20, 220), (20, 200, 20), (120, 120, 120), (230, 130, 20)):
+        assert likeness(np.full((1, 4, 4, 3), other, np.uint8), own).max() == 0
     assert named_things("lift the green cube") == (ColouredThing("green", "cube"),)
-    assert own_colour(frames["head"], "green") is None
-
-
-def test_a_table_with_a_tint_of_the_hue_is_not_the_thing() -> None:
+    assert own_colour(make_film(True, seed=1)[0]["head"], "green") is None  # it is not seen early
     frames = np.full((9, 48, 72, 3), (172, 140, 110), np.uint8)  # orange, but pale
     frames[:, 20:27, 30:37] = (235, 130, 20)
-    own = own_colour(frames, "orange")
-    assert own is not None
-    share = likeness(frames, own)
-    assert share[0].sum() == pytest.approx(49, rel=0.02)
+    assert likeness(frames, own_colour(frames, "orange"))[0].sum() == pytest.approx(49, rel=0.02)
 
 
-def painted(*boxes: tuple[slice, slice]) -> np.ndarray:
+def painted(*boxes):
     """A frame of a grey table with red boxes."""
     frame = np.full((48, 72, 3), 120, np.uint8)
     for box in boxes:
@@ -86,7 +82,7 @@ def painted(*boxes: tuple[slice, slice]) -> np.ndarray:
     return frame
 
 
-def test_a_button_that_lights_up_is_pressed_though_something_hides_a_part_of_it() -> None:
+def test_a_button_that_lights_up_is_pressed_though_something_hides_a_part_of_it():
     cap, plate = (slice(20, 27), slice(30, 37)), (slice(18, 30), slice(27, 40))
     pressed = np.stack([painted(cap)] * 5 + [painted(plate)] * 3)
     pressed[-2, 18:24] = 120
@@ -94,31 +90,139 @@ def test_a_button_that_lights_up_is_pressed_though_something_hides_a_part_of_it(
     instruction = "press the red button"
     for frames, growth, done in ((pressed, 156 / 49, True), (left, 1.0, False)):
         measured = measure(ColourSegmenter(), instruction, route(instruction), {"head": frames}, None)
-        assert isinstance(measured, PressMeasurement)
         assert measured.growth == pytest.approx(growth, rel=0.02)
-        assert establishes_success(facts(measured, instruction, "state_change")) is done
-        assert (measured.score() > 0.5) is done
-
-
-def test_a_button_that_is_never_seen_proves_nothing() -> None:
-    measured = measure_press({"head": np.stack([painted()] * 8)}, ColouredThing("red", "button"))
-    assert measured == PressMeasurement(None)
-    assert not establishes_success(facts(measured, "press the red button", "state_change"))
+        assert establishes_success(facts(measured, instruction, "state_change")) is (measured.score() > 0.5) is done
+    unseen = measure_press({"head": np.stack([painted()] * 8)}, ColouredThing("red", "button"))
+    assert unseen == PressMeasurement(None)
+    assert not establishes_success(facts(unseen, instruction, "state_change"))
 
 
 @pytest.mark.parametrize("towards_the_camera", [True, False])
-def test_a_drawer_closes_away_from_the_camera_or_towards_it(towards_the_camera: bool) -> None:
-    rows = (slice(28, 30), slice(10, 30)) if towards_the_camera else (slice(10, 12), slice(10, 30))
-    columns = slice(30, 45)
-    frames = np.stack([painted((rows[1], columns))] * 5 + [painted((rows[0], columns))] * 3)
+def test_a_drawer_closes_away_from_the_camera_or_towards_it(towards_the_camera):
+    closed = slice(28, 30) if towards_the_camera else slice(10, 12)
+    frames = np.stack([painted((rows, slice(30, 45))) for rows in [slice(10, 30)] * 5 + [closed] * 3])
     measured = measure_push({"head": frames}, ColouredThing("red", "drawer"), np.zeros((3, 48, 72), bool))
     assert measured.remaining == pytest.approx(0.1, abs=0.02)
-    assert measured.retreat is not None
     assert measured.retreat > 0.8
 
 
-def test_a_wide_thing_rises_in_units_of_its_height() -> None:
-    low, high = (slice(34, 38), slice(10, 60)), (slice(24, 28), slice(10, 60))
-    frames = np.stack([painted(low)] * 5 + [painted(high)] * 3)
+def test_a_wide_thing_rises_in_units_of_its_height():
+    frames = np.stack([painted((rows, slice(10, 60))) for rows in [slice(34, 38)] * 5 + [slice(24, 28)] * 3])
     measured = measure_lift({"head": frames}, ColouredThing("red", "tray"), np.zeros((3, 48, 72), bool))
     assert measured.rise == pytest.approx(10 / 4, rel=0.35)
+
+
+CONFIG = SegmenterConfig(widths=(8, 16), steps=4, batch_size=2, checkpoint_every=1, frame_stride=4)
+
+
+@pytest.fixture
+def training(recordings, monkeypatch):
+    """The small recordings, with every episode taken for a training one."""
+    select = EpisodeSet.select
+    monkeypatch.setattr(EpisodeSet, "select", lambda self, **values: select(self))
+    return {"episodes": recordings.inputs["episodes"]}
+
+
+def test_killed_training_continues_to_the_same_bytes(training, tmp_path, monkeypatch, killed_after):
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    result = learned.train_segmenter(CONFIG, training, whole)
+    assert result["videos"] == result["kept"] == 4
+    assert result["found"] == result["kept"] + sum(result["left_out"].values())
+    with killed_after(2):
+        learned.train_segmenter(CONFIG, training, resumed)
+    learned.train_segmenter(CONFIG, training, resumed)
+    assert digest_folder(whole) == digest_folder(resumed)
+    masks = learned.LearnedSegmenter.load(whole).segment(np.zeros((2, 30, 50, 3), np.uint8))
+    assert (masks.shape, masks.dtype) == ((2, 30, 50), bool)
+    monkeypatch.setattr(EpisodeSet, "robot_masks", lambda self, index, view: None)
+    with pytest.raises(DataError, match="exact robot masks"):
+        learned.train_segmenter(CONFIG, training, tmp_path / "without")
+
+
+def test_the_network_learns_a_mask():
+    """A few dozen steps on one frame pair suffice for a dark block on grey."""
+    torch.manual_seed(0)
+    frames = torch.full((2, 3, 16, 24), 0.6)
+    masks = torch.zeros(2, 16, 24)
+    masks[0, 4:12, 4:12] = masks[1, 6:14, 12:20] = 1
+    frames[masks[:, None].expand_as(frames) > 0] = 0.1
+    network = learned.UNet((8, 16))
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
+    for _ in range(40):
+        loss, _ = learned.MaskObjective(network).loss(
+            learned.MaskBatch(("a", "b"), frames, masks), torch.Generator(), 0
+        )
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    video = (frames * 255).round().byte().permute(0, 2, 3, 1).numpy()
+    assert np.nanmean(frame_iou(masks.numpy() > 0, learned.LearnedSegmenter(network).segment(video))) > 0.9
+
+
+def test_augmentation_moves_masks_with_frames_and_is_seeded():
+    masks = torch.zeros(8, 32, 48)
+    masks[:, 10:22, 18:34] = 1
+    frames = masks[:, None].repeat(1, 3, 1, 1) * 0.8 + 0.1
+    moved, moved_masks = learned.augment(frames, frames, masks, torch.Generator().manual_seed(0))
+    again, _ = learned.augment(frames, frames, masks, torch.Generator().manual_seed(0))
+    assert torch.equal(moved, again)
+    assert not torch.equal(moved_masks, masks)
+    inside = (moved.mean(1) * moved_masks).sum((1, 2)) / moved_masks.sum((1, 2))
+    outside = (moved.mean(1) * (1 - moved_masks)).sum((1, 2)) / (1 - moved_masks).sum((1, 2))
+    assert bool((inside > outside + 0.05).all())
+    assert 0 <= float(moved.min()) < float(moved.max()) <= 1
+
+
+def test_colour_segmenter_finds_the_robot_from_points_of_the_first_frame():
+    frames, masks, points = make_film(True, seed=1)
+    predicted = ColourSegmenter().segment(frames["head"], points)
+    assert np.nanmean(frame_iou(masks, predicted)) > 0.8
+    unknown = np.full_like(points, np.nan)
+    assert not ColourSegmenter().segment(frames["head"], None).any()
+    assert not ColourSegmenter().segment(frames["head"], unknown).any()
+    unknown[0] = points[0]
+    assert np.array_equal(predicted, ColourSegmenter().segment(frames["head"], unknown))
+
+
+def test_missing_weights_are_named(tmp_path):
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "segmenter.json").write_text("{")
+    (tmp_path / "damaged" / "model.safetensors").write_bytes(b"x")
+    for kind, folder, error, message in (
+        ("learned", None, ArtifactError, "no weights"), ("learned", tmp_path, ArtifactError, "Not a trained segmenter"),
+        ("learned", tmp_path / "damaged", ArtifactError, "cannot be read"),
+        ("sam3", None, UnavailableError, "needs local weights"), ("sam3", tmp_path, UnavailableError, "weights not found"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=message):
+            open_segmenter(kind, **{"learned": None, "sam3": None, kind: folder})
+
+
+def in_pieces(segmenter, video, points):
+    stream = segmenter.stream()
+    return np.concatenate([stream(video[part], points[part]) for part in (slice(2), slice(2, 3), slice(3, None))])
+
+
+@pytest.mark.parametrize("segmenter", [ColourSegmenter(), learned.LearnedSegmenter(learned.UNet())])
+def test_videos_are_masked_piece_by_piece_as_at_once(segmenter):
+    frames, _, points = make_film(True, seed=1)
+    whole = segmenter.segment(frames["head"], points)
+    segmenter.stream()(frames["head"][::-1], points[::-1])  # between the pieces of one video others are masked
+    assert np.array_equal(in_pieces(segmenter, frames["head"], points), whole)
+
+
+@pytest.mark.slow
+def test_sam3_classes_at_small_random_size(tmp_path):
+    """The real tracker and processor classes out of a folder as published, random weights: shapes, prompts, loading."""
+    torch.manual_seed(0)
+    write_sam3(tmp_path)
+    segmenter = Sam3Segmenter.load(tmp_path)
+    video = np.random.default_rng(0).integers(0, 256, (4, 64, 96, 3), dtype=np.uint8)
+    points = np.full((4, 2, 2), np.nan)
+    assert not segmenter.segment(video, points).any()
+    points[:, 0] = (30, 30)
+    one = segmenter.segment(video, points)
+    assert (one.shape, one.dtype) == ((4, 64, 96), bool)
+    points[0, 1] = (200, 30)  # outside of the frame: ignored
+    assert np.array_equal(segmenter.segment(video, points), one)
+    assert np.array_equal(in_pieces(segmenter, video, points), one)
+    assert np.array_equal(Sam3Segmenter.load(tmp_path).segment(video, points), one)

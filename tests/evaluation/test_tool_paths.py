@@ -1,16 +1,11 @@
 """Where tools are found in masks, and how their paths are compared; on shipped recordings with exact masks the truth is known."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.stats import wasserstein_distance
 
 from worldline_core.actions.action_tracks import DELAY_FRAMES, changed_tracks, compute_tracks
 from worldline_core.actions.actions_config import RenderActionsConfig
-from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.render_actions import KinematicsByName
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.evaluation.video.metrics_on_request import (
@@ -28,22 +23,19 @@ LINE = np.stack([np.linspace(10, 60, 17), np.full(17, 30.0)], axis=-1)[:, None]
 
 
 @pytest.fixture(scope="module")
-def recorded(project_root: Path) -> list[tuple[EpisodeTracks, np.ndarray]]:
+def recorded(project_root):
     """Tracks and exact head masks of a recording of each shipped robot."""
     episodes = EpisodeSet.open(project_root / "artifacts/shipped/recordings")
     kinematics = KinematicsByName(RenderActionsConfig().description_paths)  # type: ignore[call-arg]
-    chosen = {row.embodiment: position for position, row in enumerate(episodes.rows) if row.split == "test"}
     found = []
-    for position in chosen.values():
-        episode, masks = episodes.episode(position), episodes.robot_masks(position, "head")
-        assert masks is not None
-        found.append(
-            (compute_tracks(episode, kinematics.get(episode.embodiment), controls="state")[0], np.asarray(masks))
-        )
+    for position in {row.embodiment: i for i, row in enumerate(episodes.rows) if row.split == "test"}.values():
+        episode = episodes.episode(position)
+        tracks, _ = compute_tracks(episode, kinematics.get(episode.embodiment), controls="state")
+        found.append((tracks, np.asarray(episodes.robot_masks(position, "head"))))
     return found
 
 
-def places_of(tracks: EpisodeTracks) -> np.ndarray:
+def places_of(tracks):
     return np.where(tracks.valid[:, 0, :, None], tracks.uv[:, 0], np.nan)
 
 
@@ -73,9 +65,6 @@ def test_pieces_of_a_video_are_one_search(recorded):
     finder = ToolFinder()
     pieces = [finder.find(masks[part], masks[late][part], points[part]) for part in (slice(0, 9), slice(9, None))]
     np.testing.assert_array_equal(np.concatenate(pieces), ToolFinder().find(masks, masks[late], points))
-
-
-def test_a_tool_without_a_robot_around_it_is_not_found():
     nothing = np.zeros((2, 40, 60), dtype=bool)
     assert np.isnan(ToolFinder().find(nothing, nothing, np.full((2, 1, 2), 20.0))).all()
 
@@ -83,18 +72,20 @@ def test_a_tool_without_a_robot_around_it_is_not_found():
 def test_hausdorff_is_the_farthest_that_either_path_leaves_the_other():
     aside = LINE.copy()
     aside[8, 0, 1] += 4
-    assert hausdorff_score(LINE, aside) == pytest.approx(1 / 4)
-    assert hausdorff_score(aside, LINE) == pytest.approx(1 / 4)
+    assert hausdorff_score(LINE, aside) == hausdorff_score(aside, LINE) == pytest.approx(1 / 4)
     assert hausdorff_score(LINE, LINE[::-1]) == 1.0  # a set of places has no direction
+    half = LINE.copy()
+    half[9:] = np.nan  # a tool that vanishes is as far as the rest of the path
+    assert hausdorff_score(LINE, half) == pytest.approx(1 / 25)
+    assert time_warping_score(LINE, half) == pytest.approx(17 / (3.125 * np.arange(1, 9).sum()))
 
 
 def test_time_warping_follows_the_definition():
-    def recursive(i: int, j: int) -> float:
+    def recursive(i, j):
         if i < 0 or j < 0:
             return 0.0 if i == j == -1 else np.inf
-        return float(np.linalg.norm(a[i] - b[j])) + min(
-            recursive(i - 1, j - 1), recursive(i - 1, j), recursive(i, j - 1)
-        )
+        before = min(recursive(i - 1, j - 1), recursive(i - 1, j), recursive(i, j - 1))
+        return float(np.linalg.norm(a[i] - b[j])) + before
 
     a, b = np.random.default_rng(0).normal(size=(5, 2)), np.random.default_rng(1).normal(size=(6, 2))
     assert time_warping_distance(a, b) == pytest.approx(recursive(4, 5))
@@ -135,23 +126,15 @@ def test_only_arms_that_move_are_scored(score):
     assert score(LINE, gone) == 0.0
 
 
-def test_a_tool_that_vanishes_on_its_way_is_as_far_as_the_rest_of_the_path():
-    half = LINE.copy()
-    half[9:] = np.nan
-    assert hausdorff_score(LINE, half) == pytest.approx(1 / 25)
-    assert time_warping_score(LINE, half) == pytest.approx(17 / (3.125 * np.arange(1, 9).sum()))
-
-
 def test_controls_are_followed_or_not():
     elsewhere = LINE + np.array([0.0, 9.0])
-    assert action_following(ControlledPair(LINE, LINE, elsewhere, None)) == pytest.approx(9 / 10)
-    assert action_following(ControlledPair(LINE, LINE, LINE, None)) == 0.5
-    assert action_following(ControlledPair(LINE, elsewhere, LINE, None)) == pytest.approx(1 / 10)
-    assert counterfactual_direction(ControlledPair(LINE, LINE, elsewhere, elsewhere)) == 1.0
-    assert counterfactual_direction(ControlledPair(LINE, LINE, LINE, elsewhere)) == 0.5
-    assert counterfactual_direction(ControlledPair(LINE, elsewhere, LINE, elsewhere)) == 0.0
-    assert counterfactual_direction(ControlledPair(LINE, LINE, LINE, LINE)) is None
-    assert counterfactual_direction(ControlledPair(LINE, LINE, elsewhere, None)) is None
+    for own, other, followed in ((LINE, elsewhere, 0.9), (LINE, LINE, 0.5), (elsewhere, LINE, 0.1)):
+        assert action_following(ControlledPair(LINE, own, other, None)) == pytest.approx(followed)
+    for own, other, asked, direction in (
+        (LINE, elsewhere, elsewhere, 1.0), (LINE, LINE, elsewhere, 0.5), (elsewhere, LINE, elsewhere, 0.0),
+        (LINE, LINE, LINE, None), (LINE, elsewhere, None, None),
+    ):  # fmt: skip
+        assert counterfactual_direction(ControlledPair(LINE, own, other, asked)) == direction
 
 
 def test_changed_controls_begin_alike_and_then_differ_as_said(recorded):

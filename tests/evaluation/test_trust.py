@@ -1,14 +1,18 @@
+"""How far verdicts can be trusted, and whether policies rank as they do in reality."""
+
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy import stats
 from scipy.stats import mannwhitneyu
 
+from tests.evaluation.conftest import POLICY
+from tests.training.conftest import build_tracks
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig, TrustConfig
-from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
+from worldline_core.evaluation.evaluation_config import TrustConfig
+from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy, mmrv, pearson, policy_agreement, spearman
 from worldline_core.evaluation.policy.judge import confidence_of
 from worldline_core.evaluation.policy.trust import (
     TRUST_COLUMNS,
@@ -20,6 +24,7 @@ from worldline_core.evaluation.policy.trust import (
     setup_vectors,
     trust_verdicts,
 )
+from worldline_core.report.results import policy_ranking
 
 OPTIONS = {"resamples": 200, "seed": 3}
 
@@ -44,30 +49,25 @@ def verdicts(starts=150, policies=6, *, seed=0, right=None):
 
 
 @pytest.fixture(scope="module")
-def known():
+def calibrated():
     rows, chances = verdicts()
     trusted, methods = trust_verdicts(rows, TrustConfig(), **OPTIONS)
     return trusted, methods["model"], chances
 
 
-def test_trust_is_the_probability_that_is_known(known):
-    trusted, found, chances = known
+def test_trust_is_the_probability_that_is_known(calibrated):
+    trusted, found, chances = calibrated
     trust = np.array([row["trust"] for row in trusted])
     assert np.abs(trust - chances).mean() < 0.03
+    for name in ("calibration_error", "auroc"):
+        assert found[name]["low"] < found[name]["value"] < found[name]["high"]
     assert found["calibration_error"]["value"] < 0.05
-    assert found["calibration_error"]["low"] < found["calibration_error"]["high"]
-    inside = [b["low"] <= b["trust"] <= b["high"] for b in found["reliability"]]
-    assert sum(inside) >= 7
+    assert sum(b["low"] <= b["trust"] <= b["high"] for b in found["reliability"]) >= 7
     assert sum(b["count"] for b in found["reliability"]) == len(trusted)
-
-
-def test_what_detects_errors_is_ranked_as_the_literature_does(known):
-    trusted, found, _ = known
-    trust = np.array([row["trust"] for row in trusted])
+    # What detects errors is ranked as the literature does.
     right = np.array([row["predicted"] == row["outcome"] for row in trusted])
     u = mannwhitneyu(-trust[~right], -trust[right]).statistic
     assert found["auroc"]["value"] == pytest.approx(u / (right.sum() * (~right).sum()), abs=1e-5)
-    assert found["auroc"]["low"] < found["auroc"]["value"] < found["auroc"]["high"]
     assert found["error"]["value"] == pytest.approx(np.mean(~right))
     assert found["error_of_marked"]["low"] > found["error_of_others"]["high"]
 
@@ -97,60 +97,44 @@ def test_verdicts_that_are_all_right_or_all_wrong_cannot_be_calibrated(right):
     rows, _ = verdicts(20, right=right)
     rows[0]["new_controls"] = 3.0
     trusted, methods = trust_verdicts(rows, TrustConfig(), **OPTIONS)
-    assert not methods["model"]["available"]
-    assert "5 of each are needed" in methods["model"]["reason"]
+    assert not methods["model"]["available"] and "5 of each" in methods["model"]["reason"]
     assert {row["trust"] for row in trusted} == {None}
     assert trusted[0]["do_not_trust"] == "new controls"  # the mark needs no calibration
 
 
-def test_without_any_signal_there_is_a_reason():
-    rows = [{**row, "confidence": None, "new_controls": None} for row in verdicts(20)[0]]
-    assert "no signal is known" in trust_verdicts(rows, TrustConfig(), **OPTIONS)[1]["model"]["reason"]
-
-
-def test_a_signal_that_is_no_number_is_refused():
-    rows, _ = verdicts(5)
+def test_signals_may_lack_or_be_infinite_but_are_numbers():
+    rows, _ = verdicts(30)
+    silent = [{**row, "confidence": None, "new_controls": None} for row in rows]
+    assert "no signal is known" in trust_verdicts(silent, TrustConfig(), **OPTIONS)[1]["model"]["reason"]
+    rows[0]["new_controls"] = float("inf")  # controls like none of the training
+    trusted, _ = trust_verdicts(rows, TrustConfig(), **OPTIONS)
+    assert trusted[0]["trust"] < 0.6 and "new controls" in trusted[0]["do_not_trust"]
     rows[7]["new_controls"] = float("nan")
     with pytest.raises(DataError, match="new_controls of 1-1"):
         trust_verdicts(rows, TrustConfig(), **OPTIONS)
 
 
-def test_controls_like_none_of_the_training_are_new_beyond_measure():
-    rows, _ = verdicts(30)
-    rows[0]["new_controls"] = float("inf")
-    trusted, _ = trust_verdicts(rows, TrustConfig(), **OPTIONS)
-    assert trusted[0]["trust"] < 0.6
-    assert "new controls" in trusted[0]["do_not_trust"]
-
-
-def test_seeds_that_disagree_make_doubt():
+@pytest.mark.parametrize(
+    ("beside", "doubts"),
+    [([], [0.1]), ([{"seed": 43, "confidence": 0.7}], [0.2] * 2), ([{"seed": 43, "predicted": "failure"}], [0.5] * 2)],
+)
+def test_seeds_that_disagree_make_doubt(beside, doubts):
     row = {**verdicts(1)[0][0], "confidence": 0.9, "predicted": "success"}
-    alone = trust_verdicts([row], TrustConfig(), **OPTIONS)[0]
-    agreeing = trust_verdicts([row, {**row, "seed": 43, "confidence": 0.7}], TrustConfig(), **OPTIONS)[0]
-    other = trust_verdicts([row, {**row, "seed": 43, "predicted": "failure"}], TrustConfig(), **OPTIONS)[0]
-    assert alone[0]["doubt"] == pytest.approx(0.1)
-    assert [r["doubt"] for r in agreeing] == pytest.approx([0.2, 0.2])
-    assert [r["doubt"] for r in other] == pytest.approx([0.5, 0.5])
+    rows, _ = trust_verdicts([row, *({**row, **other} for other in beside)], TrustConfig(), **OPTIONS)
+    assert [found["doubt"] for found in rows] == pytest.approx(doubts)
 
 
 def test_another_model_that_disagrees_tells_which_verdicts_are_wrong():
     rows, _ = verdicts(60)
     random = np.random.default_rng(2)
     # The other model is mostly right, and sure of what it says.
-    wiser = [
-        {
-            **row,
-            "method": "other",
-            "confidence": 0.9,
-            "predicted": row["outcome"] if random.uniform() < 0.9 else row["predicted"],
-        }
-        for row in rows
-    ]
-    alone = trust_verdicts(rows + wiser, TrustConfig(), **OPTIONS)[1]["model"]
-    compared = trust_verdicts(rows + wiser, TrustConfig(compare_with={"model": "other"}), **OPTIONS)[1]
-    assert compared["model"]["auroc"]["low"] > alone["auroc"]["high"]
+    other = {"method": "other", "confidence": 0.9}
+    wiser = [row | other | ({"predicted": row["outcome"]} if random.uniform() < 0.9 else {}) for row in rows]
+    config = TrustConfig(compare_with={"model": "other"})
+    alone, compared = (trust_verdicts(rows + wiser, c, **OPTIONS)[1]["model"] for c in (TrustConfig(), config))
+    assert compared["auroc"]["low"] > alone["auroc"]["high"]
     with pytest.raises(ConfigError, match="other"):
-        trust_verdicts(rows, TrustConfig(compare_with={"model": "other"}), **OPTIONS)
+        trust_verdicts(rows, config, **OPTIONS)
 
 
 @pytest.mark.parametrize(
@@ -169,31 +153,28 @@ def test_the_confidence_in_a_verdict_is_that_of_its_evidence(success, decided_by
     assert confidence_of({"success": success, "decided_by": decided_by, "statements": statements}) == expected
 
 
-def path(random: np.random.Generator, *, waits=0, arms=1, body="arm", camera=0.0, frames=33):
+def path(random, *, waits=0, arms=1, body="arm", camera=0.0, frames=33):
     """Tracks of a tool that moves 3 cm a frame or so along x, after it has waited."""
     poses = np.tile(np.eye(4), (frames, arms, 1, 1))
-    speed = 0.03 * random.uniform(0.8, 1.2)
-    poses[:, 0, 0, 3] = speed * np.maximum(np.arange(frames) - waits, 0)
+    poses[:, 0, 0, 3] = 0.03 * random.uniform(0.8, 1.2) * np.maximum(np.arange(frames) - waits, 0)
     cameras = np.tile(np.eye(4), (frames, 3, 1, 1))
     cameras[:, 0, 0, 3] = random.uniform(-0.1, 0.1) + camera
-    return SimpleNamespace(
-        episode_id="e", embodiment=body, arms=("left", "right")[:arms], views=("head", "left_wrist", "right_wrist"), num_frames=frames,
-        T_base_tool=poses, gripper=np.ones((frames, 3, arms)), T_base_camera=cameras, K=np.tile(np.eye(3), (3, 1, 1)),
-        image_size=(64, 96), camera_motion=("static",) * 3,
-    )  # fmt: skip
+    moved = {"embodiment": body, "image_size": (64, 96), "T_base_tool": poses, "T_base_camera": cameras}
+    return build_tracks("e", frames, arms, **moved)
 
 
 def test_controls_that_wait_are_new_and_those_of_training_are_not():
     random = np.random.default_rng(0)
     known = KnownRecordings.of([control_vectors(path(random)) for _ in range(100)])
-    usual = [known.novelty(*control_vectors(path(random))) for _ in range(200)]
-    assert np.mean(np.array(usual) > 1) < 0.15
-    assert known.novelty(*control_vectors(path(random, waits=12))) > 2
-    # It is known as soon as the robot has not moved with the others.
-    assert known.novelty(*control_vectors(path(random, waits=12, frames=9))) > 2
-    assert known.novelty(*control_vectors(path(random, arms=2))) == float("inf")
-    # What lies after the end of nearly all training recordings is not compared.
-    assert known.novelty(*control_vectors(path(random, frames=65))) < 3
+
+    def novelty(**changes):
+        return known.novelty(*control_vectors(path(random, **changes)))
+
+    assert np.mean([novelty() > 1 for _ in range(200)]) < 0.15
+    assert novelty(waits=12) > 2
+    assert novelty(waits=12, frames=9) > 2  # known as soon as the robot has not moved with the others
+    assert novelty(arms=2) == float("inf")
+    assert novelty(frames=65) < 3  # what lies after the end of nearly all training recordings is not compared
 
 
 def test_a_new_body_or_place_of_the_head_camera_is_a_new_setup():
@@ -202,19 +183,14 @@ def test_a_new_body_or_place_of_the_head_camera_is_a_new_setup():
     assert known.novelty(*setup_vectors(path(random))) < 1
     assert known.novelty(*setup_vectors(path(random, camera=0.5))) > 5
     assert known.novelty(*setup_vectors(path(random, body="other"))) == float("inf")
-
-
-def test_too_few_training_recordings_or_frames_are_refused():
-    random = np.random.default_rng(0)
     with pytest.raises(DataError, match="'1': 4"):
         KnownRecordings.of([control_vectors(path(random))] * 4)
     with pytest.raises(DataError, match="more than 4"):
         control_vectors(path(random, frames=4))
 
 
-CONFIG = PolicyEvaluationConfig(
-    segmenter="colour", splits=("test",), balanced=False, resamples=100, trust=TrustConfig()
-)
+CONFIG = POLICY.model_copy(update={"balanced": False, "trust": TrustConfig()})
+COMPARED = POLICY.model_copy(update={"balanced": False, "compare_policies": True})
 
 
 def test_the_step_marks_what_begins_later_than_any_training_recording(trained, tmp_path):
@@ -222,9 +198,9 @@ def test_the_step_marks_what_begins_later_than_any_training_recording(trained, t
     rows = pq.read_table(tmp_path / "decisions.parquet").to_pylist()
     assert set(TRUST_COLUMNS) <= set(rows[0])
     marks = {(row["method"], row["episode_id"]): row["do_not_trust"] for row in rows}
-    assert marks["good", "late"] == "new controls"
-    assert marks["good", "prompt"] == ""
-    assert marks["true", "late"] is None  # a recorded video is not predicted
+    # A recorded video is not predicted.
+    found = (marks["good", "late"], marks["good", "prompt"], marks["true", "late"])
+    assert found == ("new controls", "", None)
     doubts = {row["method"]: row["doubt"] for row in rows if row["episode_id"] == "prompt"}
     assert 0 < doubts["good"] < 0.5
     found = json.loads((tmp_path / "summary.json").read_text())["trust"]
@@ -232,9 +208,91 @@ def test_the_step_marks_what_begins_later_than_any_training_recording(trained, t
     assert "5 of each are needed" in found["methods"]["good"]["reason"]
 
 
-def test_trust_needs_tracks_and_training_recordings(recordings, trained, tmp_path):
-    inputs = {name: path for name, path in trained.inputs.items() if name != "tracks"}
+def test_trust_needs_tracks_and_training_recordings_and_a_comparison_sources(
+    recordings, trained, tmp_path, monkeypatch
+):
     with pytest.raises(ConfigError, match="input tracks"):
-        evaluate_policy(CONFIG, inputs, tmp_path)
+        evaluate_policy(CONFIG, {name: path for name, path in trained.inputs.items() if name != "tracks"}, tmp_path)
     with pytest.raises(DataError, match="Too few training recordings"):
         evaluate_policy(CONFIG, recordings.inputs, tmp_path)
+    monkeypatch.setattr("worldline_core.evaluation.policy.evaluate_policy.judge_trajectory", None)
+    with pytest.raises(DataError, match="at least three sources"):  # before anything is judged
+        evaluate_policy(COMPARED, recordings.inputs, tmp_path)
+
+
+DRAWS = {"resamples": 400, "seed": 1}
+
+
+def attempts_of(rates, predicted=None, *, starts=60, method="model", task="lift", paired=True, seed=0):
+    """Attempts of policies with these recorded success rates; predicted likewise (by default as recorded)."""
+    random = np.random.default_rng(seed)
+    rows = []
+    for number, rate in enumerate(rates):
+        for start in range(starts):
+            ends = random.uniform() < rate
+            says = ends if predicted is None else random.uniform() < predicted[number]
+            rows.append({
+                "method": method, "policy": f"policy_{number}", "task": task,
+                "start": f"{start}" if paired else f"{number}-{start}", "episode_id": f"{number}-{start}",
+                "outcome": "success" if ends else "failure", "predicted": "success" if says else "failure",
+            })  # fmt: skip
+    return rows
+
+
+def test_the_statistics_are_those_of_the_literature():
+    random = np.random.default_rng(3)
+    for _ in range(20):
+        recorded, predicted = random.integers(0, 6, (2, 9)) / 5
+        assert pearson(recorded, predicted) == pytest.approx(stats.pearsonr(recorded, predicted).statistic)
+        assert spearman(recorded, predicted) == pytest.approx(stats.spearmanr(recorded, predicted).statistic)
+        gaps, ranks = (recorded[:, None] - recorded, predicted[:, None] > predicted)
+        worst = np.where(ranks != (gaps > 0), np.abs(gaps), 0).max(axis=1)
+        assert mmrv(recorded, predicted) == pytest.approx(worst.mean())
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_policies_that_are_predicted_rightly_agree_and_reversed_ones_do_not(paired):
+    rates = np.linspace(0.05, 0.95, 8)
+    right = policy_agreement(attempts_of(rates, rates, paired=paired), **DRAWS)["model"]["all"]
+    wrong = policy_agreement(attempts_of(rates, rates[::-1], paired=paired), **DRAWS)["model"]["all"]
+    assert right["pearson"]["value"] > 0.9 > 0.1 > right["mmrv"]["value"]
+    assert wrong["pearson"]["value"] < -0.9 and wrong["mmrv"]["value"] > 0.5
+    for found in (right, wrong):
+        for statistic in ("pearson", "spearman", "mmrv", "rate_error"):
+            low, high = found[statistic]["over_starts_and_policies"]
+            assert low - 0.05 <= found[statistic]["value"] <= high + 0.05
+
+
+def test_nothing_but_chance_is_told_by_the_interval():
+    """Of 40 simulators that know nothing, few have an interval above zero."""
+    random = np.random.default_rng(5)
+    above = 0
+    for seed in range(40):
+        rows = attempts_of(*random.uniform(0.1, 0.9, (2, 8)), starts=30, seed=seed)
+        found = policy_agreement(rows, resamples=200, seed=0)["model"]["all"]
+        above += found["pearson"]["over_starts_and_policies"][0] > 0
+    assert above <= 6
+    found = policy_agreement(attempts_of((0.0, 0.0, 0.0)), **DRAWS)["model"]["all"]
+    assert (found["pearson"]["value"], found["mmrv"]["value"]) == (None, 0.0)  # equal rates have no correlation
+
+
+def test_predictions_under_several_seeds_are_averaged_and_tasks_stand_apart():
+    rates = (0.1, 0.5, 0.9)
+    twice = attempts_of(rates, starts=20) + attempts_of(rates, (0.0, 0.0, 0.0), starts=20)
+    found = policy_agreement(twice + attempts_of(rates, rates, task="press"), **DRAWS)["model"]
+    assert set(found) == {"all", "lift", "press"}
+    best = found["lift"]["policies"]["policy_2"]
+    assert best["attempts"] == 20 and 0.3 < best["predicted"] < 0.6 < best["recorded"]
+
+
+@pytest.mark.slow
+def test_the_step_compares_the_sources_of_its_episodes(policies, tmp_path):
+    evaluate_policy(COMPARED, policies.inputs, tmp_path)
+    found = json.loads((tmp_path / "summary.json").read_text())["policies"]
+    recorded = [found["good"]["all"]["policies"][f"policy_{name}"]["recorded"] for name in "abc"]
+    assert recorded == pytest.approx([1.0, 2 / 3, 0.0])
+    assert found["good"]["lift"]["pearson"]["value"] == pytest.approx(1.0)
+    # A simulator in which nothing moves predicts no success.
+    assert found["copy"]["all"]["pearson"]["value"] is None
+    assert found["copy"]["all"]["rate_error"]["value"] == pytest.approx(5 / 9)
+    assert policy_ranking(found)["names"][0] == "policy_a"

@@ -1,17 +1,16 @@
 """Weights of diffusers' Cosmos3 transformer load as they are and give the same velocity."""
 
-from __future__ import annotations
-
 import inspect
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
+from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
+from diffusers.pipelines.cosmos.pipeline_cosmos3_omni import get_3d_mrope_ids_text_tokens, get_3d_mrope_ids_vae_tokens
 from torch.profiler import ProfilerActivity, profile
 
-from tests.model.test_weight_memory import most_bytes  # pyright: ignore[reportMissingImports]
+from tests.model.test_checkpoint import most_bytes
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import fill, load_checkpoint
 from worldline_core.model.cosmos3 import config_from_diffusers, import_backbone, read_cosmos3
@@ -19,39 +18,29 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ImportBackboneConfig, cosmos3_config
 
 
-def load_cosmos3(folder: Path, **options: Any) -> tuple[WorldModel, dict[str, list[str]]]:
+def load_cosmos3(folder, **options):
     model, tensors, report = read_cosmos3(folder, **options)
     fill(model, tensors, where=folder, dtype=torch.float32)
     return model, report
 
 
-SHAPE: dict[str, Any] = {
-    "head_dim": 12,
-    "hidden_size": 24,
-    "intermediate_size": 40,
-    "latent_channel": 6,
-    "num_attention_heads": 4,
-    "num_hidden_layers": 3,
-    "num_key_value_heads": 2,
-    "patch_latent_dim": 24,
-    "vocab_size": 32,
+SHAPE = {
+    "head_dim": 12, "hidden_size": 24, "intermediate_size": 40, "latent_channel": 6, "num_attention_heads": 4,
+    "num_hidden_layers": 3, "num_key_value_heads": 2, "patch_latent_dim": 24, "vocab_size": 32,
     "rope_axes_dim": (2, 2, 2),
-}
+}  # fmt: skip
 
 
-KINDS: dict[str, dict[str, Any]] = {
+KINDS = {
     "nano": {},
     "edge": {"hidden_act": "relu2", "qk_norm_for_text": False, "use_und_k_norm_for_gen": True, "rms_norm_eps": 1e-5,
              "rope_theta": 1e8},
 }  # fmt: skip
 
 
-def random_transformer(kind: str, seed: int = 3) -> Any:
-    from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
-
+def random_transformer(kind, seed=3):
     torch.manual_seed(seed)
-    shape: dict[str, Any] = SHAPE | KINDS[kind]
-    model: Any = Cosmos3OmniTransformer(**shape)
+    model = Cosmos3OmniTransformer(**SHAPE | KINDS[kind])
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.normal_(0.0, 0.25)
@@ -59,19 +48,12 @@ def random_transformer(kind: str, seed: int = 3) -> Any:
 
 
 @pytest.fixture(scope="module")
-def diffusers_model() -> Any:
+def diffusers_model():
     return random_transformer("nano")
 
 
-def reference_velocity(
-    model: torch.nn.Module, latents: torch.Tensor, sigma: float, text_ids: list[int], fps: float
-) -> torch.Tensor:
+def reference_velocity(model, latents, sigma, text_ids, fps):
     """Velocity through diffusers' own packing functions, first frame clean."""
-    from diffusers.pipelines.cosmos.pipeline_cosmos3_omni import (
-        get_3d_mrope_ids_text_tokens,
-        get_3d_mrope_ids_vae_tokens,
-    )
-
     _, _, frames, height, width = latents.shape
     rows, columns = height // 2, width // 2
     count, size = len(text_ids), frames * rows * columns
@@ -96,7 +78,7 @@ def reference_velocity(
 
 @pytest.mark.parametrize("seed", [3, 4])
 @pytest.mark.parametrize("kind", list(KINDS))
-def test_diffusers_weights_give_the_same_velocity_and_gradients(kind: str, seed: int, tmp_path: Path) -> None:
+def test_diffusers_weights_give_the_same_velocity_and_gradients(kind, seed, tmp_path):
     theirs = random_transformer(kind, seed)
     theirs.save_pretrained(tmp_path / "transformer", max_shard_size="40KB")
     assert len(list((tmp_path / "transformer").glob("*.safetensors"))) > 1
@@ -121,32 +103,26 @@ def test_diffusers_weights_give_the_same_velocity_and_gradients(kind: str, seed:
         assert len(gradients) > 60 and ("layers.1.self_attn.k_norm_und_for_gen.weight" in gradients) == (kind == "edge")
         for name, gradient in gradients.items():
             weight = model.get_parameter(name)
-            found = (
-                torch.zeros_like(weight) if weight.grad is None else weight.grad
-            )  # the last layer's text is read by none
+            # The last layer's text is read by none.
+            found = torch.zeros_like(weight) if weight.grad is None else weight.grad
             torch.testing.assert_close(found, gradient, rtol=1e-4, atol=1e-5 * float(gradient.abs().max()), msg=name)
 
 
-def test_the_import_holds_one_file_of_the_result(tmp_path: Path) -> None:
+def test_the_import_holds_one_file_of_the_result(tmp_path):
     """No model in float32 beside the weights, and the same bytes whatever was drawn before."""
-    from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
-
-    shape: dict[str, Any] = SHAPE | {"hidden_size": 256, "intermediate_size": 1024, "num_hidden_layers": 6}
-    pretrained: Any = Cosmos3OmniTransformer(**shape)
-    pretrained.to(torch.bfloat16)
+    shape = SHAPE | {"hidden_size": 256, "intermediate_size": 1024, "num_hidden_layers": 6}
+    pretrained = Cosmos3OmniTransformer(**shape).to(torch.bfloat16)
     pretrained.save_pretrained(tmp_path / "pretrained")
-    inputs = {"diffusers": tmp_path / "pretrained"}
+    config, inputs = ImportBackboneConfig(dtype="bfloat16"), {"diffusers": tmp_path / "pretrained"}
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
-        counts = import_backbone(ImportBackboneConfig(dtype="bfloat16"), inputs, tmp_path / "base")
-    stored = (tmp_path / "base" / "model.safetensors").stat().st_size
-    assert counts["parameters"] == pytest.approx(stored / 2, rel=0.01)
+        counts = import_backbone(config, inputs, tmp_path / "base")
+    stored = (tmp_path / "base" / "model.safetensors").read_bytes()
+    assert counts["parameters"] == pytest.approx(len(stored) / 2, rel=0.01)
     # The mapped file and its copy in the stored type; a model in float32 would be two more.
-    assert most_bytes(recorded) < 2.2 * stored
+    assert most_bytes(recorded) < 2.2 * len(stored)
     torch.rand(3)
-    import_backbone(ImportBackboneConfig(dtype="bfloat16"), inputs, tmp_path / "again")
-    assert (tmp_path / "again" / "model.safetensors").read_bytes() == (
-        tmp_path / "base" / "model.safetensors"
-    ).read_bytes()
+    import_backbone(config, inputs, tmp_path / "again")
+    assert (tmp_path / "again" / "model.safetensors").read_bytes() == stored
     theirs, ours = dict(pretrained.named_parameters()), load_checkpoint(tmp_path / "base", dtype=torch.bfloat16)[0]
     same = {name for name, weight in ours.named_parameters() if name in theirs}
     assert len(same) > 80
@@ -154,7 +130,7 @@ def test_the_import_holds_one_file_of_the_result(tmp_path: Path) -> None:
 
 
 @torch.no_grad()
-def test_clips_of_two_rates_in_one_batch_stand_where_diffusers_puts_each(diffusers_model: Any, tmp_path: Path) -> None:
+def test_clips_of_two_rates_in_one_batch_stand_where_diffusers_puts_each(diffusers_model, tmp_path):
     """Cosmos3's fps modulation: a latent frame advances by 24 / fps; a stride of three shows 30 fps as 10."""
     diffusers_model.save_pretrained(tmp_path)
     model, _ = load_cosmos3(tmp_path, fps=30.0)
@@ -172,7 +148,7 @@ def test_clips_of_two_rates_in_one_batch_stand_where_diffusers_puts_each(diffuse
 
 @pytest.mark.parametrize("kind", list(KINDS))
 @torch.no_grad()
-def test_the_generation_tower_alone_equals_both_without_text(kind: str, tmp_path: Path) -> None:
+def test_the_generation_tower_alone_equals_both_without_text(kind, tmp_path):
     random_transformer(kind).save_pretrained(tmp_path)
     both, _ = load_cosmos3(tmp_path)
     alone, report = load_cosmos3(tmp_path, changes={"towers": "generation"})
@@ -182,51 +158,49 @@ def test_the_generation_tower_alone_equals_both_without_text(kind: str, tmp_path
     assert torch.equal(both(latents, sigma).velocity, alone(latents, sigma).velocity)
 
 
-def test_a_missing_folder_and_damaged_folders_are_named(diffusers_model: Any, tmp_path: Path) -> None:
+def test_a_missing_folder_and_damaged_folders_are_named(diffusers_model, tmp_path):
     with pytest.raises(UnavailableError, match="Cosmos3 weights are not here"):
         load_cosmos3(tmp_path / "nothing")
-    diffusers_model.save_pretrained(tmp_path / "t", max_shard_size="40KB")
-    shards = sorted((tmp_path / "t").glob("*.safetensors"))
-    shards[0].unlink()
-    with pytest.raises(CheckpointError, match="A weight file is missing"):
-        load_cosmos3(tmp_path / "t")
-    diffusers_model.save_pretrained(tmp_path / "u")
-    path = tmp_path / "u" / "diffusion_pytorch_model.safetensors"
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(CheckpointError, match="damaged"):
-        load_cosmos3(tmp_path / "u")
+    for size, damage, message in (
+        ("40KB", Path.unlink, "A weight file is missing"),
+        ("1GB", lambda path: path.write_bytes(path.read_bytes()[:100]), "damaged"),
+    ):
+        diffusers_model.save_pretrained(tmp_path / size, max_shard_size=size)
+        damage(min((tmp_path / size).glob("*.safetensors")))
+        with pytest.raises(CheckpointError, match=message):
+            load_cosmos3(tmp_path / size)
 
 
-def test_another_architecture_is_refused(diffusers_model: Any, tmp_path: Path) -> None:
+FOREIGN = (
+    ("hidden_act", "relu2"), ("hidden_act", "gelu"), ("attention_bias", True), ("_class_name", "WanTransformer3DModel"),
+)  # fmt: skip
+
+
+def test_another_architecture_is_refused(diffusers_model, tmp_path):
     diffusers_model.save_pretrained(tmp_path)
     path = tmp_path / "config.json"
     config = json.loads(path.read_text())
-    for key, value in (
-        ("hidden_act", "relu2"),
-        ("hidden_act", "gelu"),
-        ("attention_bias", True),
-        ("_class_name", "WanTransformer3DModel"),
+    for change, message in (
+        *(({key: value}, "Not a Cosmos3 transformer") for key, value in FOREIGN),
+        ({"num_hidden_layers": 2}, r"unexpected: layers\.2"),
     ):
-        path.write_text(json.dumps(config | {key: value}))
-        with pytest.raises(CheckpointError, match="Not a Cosmos3 transformer"):
+        path.write_text(json.dumps(config | change))
+        with pytest.raises(CheckpointError, match=message):
             load_cosmos3(tmp_path)
-    path.write_text(json.dumps(config | {"num_hidden_layers": 2}))
-    with pytest.raises(CheckpointError, match=r"unexpected: layers\.2"):
-        load_cosmos3(tmp_path)
 
 
-def test_weights_of_another_size_or_revision_are_refused(tmp_path: Path) -> None:
+def test_weights_of_another_size_or_revision_are_refused(tmp_path):
     commit, other = "a" * 40, "b" * 40
     folder = tmp_path / "cache" / "snapshots" / commit
     random_transformer("nano").save_pretrained(folder)
-    with pytest.raises(CheckpointError, match=r"Cosmos3-Nano(?s:.)*Cosmos3-Edge"):
-        load_cosmos3(folder, size="edge")
-    with pytest.raises(CheckpointError, match=commit):
-        load_cosmos3(folder, revision=other)
     local = tmp_path / "local"
     random_transformer("edge").save_pretrained(local)
-    with pytest.raises(CheckpointError, match="does not say"):
-        load_cosmos3(local, revision=other)
+    for place, given, message in (
+        (folder, {"size": "edge"}, r"Cosmos3-Nano(?s:.)*Cosmos3-Edge"), (folder, {"revision": other}, commit),
+        (local, {"revision": other}, "does not say"),
+    ):  # fmt: skip
+        with pytest.raises(CheckpointError, match=message):
+            load_cosmos3(place, **given)
     note = local / ".cache" / "huggingface" / "download" / "config.json.metadata"
     note.parent.mkdir(parents=True)
     note.write_text(f"{other}\netag\n1.0\n")
@@ -247,16 +221,9 @@ PUBLISHED_EDGE = {
     ("size", "published", "generation", "both"),
     [("nano", {}, (6.9e9, 7.1e9), (14.5e9, 14.6e9)), ("edge", PUBLISHED_EDGE, (1.41e9, 1.42e9), (3.0e9, 3.1e9))],
 )
-def test_the_published_config_is_the_full_size(
-    size: Any, published: dict[str, Any], generation: tuple[float, float], both: tuple[float, float]
-) -> None:
-    from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
-
-    defaults = {
-        name: parameter.default
-        for name, parameter in inspect.signature(Cosmos3OmniTransformer.__init__).parameters.items()
-        if name != "self"
-    }
+def test_the_published_config_is_the_full_size(size, published, generation, both):
+    parameters = inspect.signature(Cosmos3OmniTransformer.__init__).parameters.values()
+    defaults = {parameter.name: parameter.default for parameter in parameters if parameter.name != "self"}
     config = config_from_diffusers(defaults | published, where="published", expected=size)
     assert config == cosmos3_config(size)
     for towers, (least, most) in (("generation", generation), ("both", both)):

@@ -3,25 +3,21 @@
 The server is the test's own, on sockets and PIL: it shares no code with the client.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from tests.rollout.conftest import SIZE, recorded, track, write_recordings  # pyright: ignore[reportMissingImports]
+from tests.rollout.conftest import SIZE, recorded, track, write_recordings
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.rollout.ge_sim import tool_band
@@ -36,26 +32,21 @@ H, W = 64, 96
 class Server:
     """Every frame is the observed one, a little brighter from action to action. ``spoil`` changes an answer of /step."""
 
-    def __init__(self) -> None:
-        self.calls: list[str] = []
-        self.actions: list[np.ndarray] = []
-        self.bands: list[tuple[int, ...]] = []
-        self.cameras: list[dict] = []
-        self.spoil: Callable[[str, bytes], tuple[int, bytes]] = lambda task, answer: (200, answer)
-        self.task, self.frame = "", np.zeros(())
+    def __init__(self):
+        self.calls, self.actions, self.bands, self.cameras = [], [], [], []
+        self.spoil, self.frame = lambda answer: (200, answer), np.zeros(())
         outer = self
 
         class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
+            def do_GET(self):
                 outer.calls.append(self.path)
                 self._answer(200, b'{"status": "ok"}')
 
-            def do_POST(self) -> None:
+            def do_POST(self):
                 outer.calls.append(self.path)
-                body = self.rfile.read(int(self.headers["Content-Length"]))
-                self._answer(*outer.answer(self.path, body))
+                self._answer(*outer.answer(self.path, self.rfile.read(int(self.headers["Content-Length"]))))
 
-            def _answer(self, status: int, answer: bytes) -> None:
+            def _answer(self, status, answer):
                 self.send_response(status)
                 if status == 302:
                     self.send_header("Location", "http://127.0.0.1:1/elsewhere")
@@ -63,22 +54,20 @@ class Server:
                 self.end_headers()
                 self.wfile.write(answer)
 
-            def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+            def log_message(self, *args):
                 pass
 
         self.http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self.url = f"http://127.0.0.1:{self.http.server_port}"
         threading.Thread(target=self.http.serve_forever, args=(0.01,), daemon=True).start()
 
-    def answer(self, path: str, body: bytes) -> tuple[int, bytes]:
+    def answer(self, path, body):
         if path == "/init":
             return 200, b'{"success": true, "client_id": "me"}'
         sections = [body] if body.startswith(b"{") else _sections(body)
         meta = json.loads(sections[-1])
         assert meta["client_id"] == "me"
-        if path == "/set_task":
-            self.task = meta["task"]
-        elif path == "/set_camera_params":
+        if path == "/set_camera_params":
             self.cameras.append(meta)
         elif path == "/set_episode_data":
             assert meta["frame_shape"] == [3, 3, H, W]
@@ -88,36 +77,35 @@ class Server:
             pictures, c2w = _sections(sections[0]), np.frombuffer(sections[1], "<f4").reshape(meta["c2w_shape"])
             assert meta["traj_shape"] == [3, 3, len(pictures), H, W]
             assert c2w.shape == (3, len(pictures), 4, 4)
-            self.bands.append((len(self.actions), len(pictures)))
+            self.bands.append(len(pictures))
         elif path == "/step":
             actions = np.frombuffer(sections[0], "<f4").reshape(meta["action_shape"])
-            assert len(actions) <= 25
             self.actions.append(actions)
             facts = {"frame_shape": [len(actions), 3, 3, H, W], "state_shape": list(actions.shape)}
             pictures = [_jpeg(np.clip(self.frame.astype(int) + 2 * i, 0, 255)) for i in range(len(actions))]
-            return self.spoil(self.task, _packed([json.dumps(facts).encode(), *pictures, actions.tobytes()]))
+            return self.spoil(_packed([json.dumps(facts).encode(), *pictures, actions.tobytes()]))
         return 200, b'{"success": true}'
 
 
-def _sections(body: bytes) -> list[bytes]:
+def _sections(body):
     stream, found = io.BytesIO(body), []
     while head := stream.read(4):
         found.append(stream.read(*struct.unpack(">I", head)))
     return found
 
 
-def _packed(sections: list[bytes]) -> bytes:
+def _packed(sections):
     return b"".join(struct.pack(">I", len(section)) + section for section in sections)
 
 
-def _jpeg(picture: np.ndarray) -> bytes:
+def _jpeg(picture):
     memory = io.BytesIO()
     Image.fromarray(picture.astype(np.uint8)).save(memory, format="JPEG", quality=95)
     return memory.getvalue()
 
 
 @pytest.fixture
-def server() -> Iterator[Server]:
+def server():
     running = Server()
     yield running
     running.http.shutdown()
@@ -125,31 +113,29 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def inputs(tmp_path_factory):
     root = tmp_path_factory.mktemp("ge_sim")
     made = write_recordings(root, [(name, "test", count, VIEWS, VIEWS) for name, count in EPISODES.items()], 16)
     return {**made, "tokenizer": root}
 
 
-def config(server: Server, *, timeout_s: float = 5.0, **settings: object) -> RolloutConfig:
-    sampler = {"kind": "ge_sim", "url": server.url, "image_size": [H, W], "timeout_s": timeout_s}
-    return RolloutConfig.model_validate({"method": "theirs", "sampler": sampler, **settings})
+def run(server, inputs, output, *, timeout_s=5.0, num_frames=9):
+    url = server if isinstance(server, str) else server.url
+    sampler = {"kind": "ge_sim", "url": url, "image_size": [H, W], "timeout_s": timeout_s}
+    values = {"method": "theirs", "sampler": sampler, "num_frames": num_frames}
+    return rollout(RolloutConfig.model_validate(values), inputs, output)
 
 
-def quarantine(output: Path) -> dict[str, tuple[str, str]]:
+def quarantine(output):
     rows = pq.read_table(output / "quarantine.parquet").to_pylist()
     return {row["episode_id"]: (row["reason"], row["detail"]) for row in rows}
 
 
-def test_a_server_s_frames_become_a_rollout_set(server: Server, inputs: dict[str, Path], tmp_path: Path) -> None:
-    done = rollout(config(server, num_frames="whole"), inputs, tmp_path)
+def test_a_server_s_frames_become_a_rollout_set(server, inputs, tmp_path):
+    done = run(server, inputs, tmp_path, num_frames="whole")
     assert (done["episodes"], done["frames"], done.get("left_out")) == (4, sum(EPISODES.values()), {})
     found = RolloutSet.open(tmp_path)
     assert (found.method, found.fps, found.episode_ids) == ("theirs", 8.0, [*EPISODES])
-    first = server.calls.index("/reset")
-    assert server.calls[:first] == ["/healthz", "/init"]
-    assert server.calls[-1] == "/close"
-    begin = ["/reset", "/set_task", "/set_camera_params", "/set_episode_data"]
     for seed, (name, count) in enumerate(EPISODES.items()):
         frames = found.frames(name, "right_wrist", 42)
         assert frames.shape == (count, *SIZE, 3)
@@ -157,11 +143,11 @@ def test_a_server_s_frames_become_a_rollout_set(server: Server, inputs: dict[str
         for k in (0, 1, 5):  # the observed frame, then brighter from action to action
             assert np.abs(frames[k].astype(int) - truth - 2 * max(0, k - 1)).mean() < 6, (name, k)
     # Nine frames are one step, thirty-three two, each with a band of its own; sixty-one have one band for all steps.
-    calls = [call for call in server.calls if call not in ("/healthz", "/init", "/close")]
-    pair = ["/set_episode_traj", "/step"]
-    assert calls == [*begin, *pair] * 2 + [*begin, *pair, *pair] + [*begin, *pair, "/step", "/step"]
+    begin, pair = ["/reset", "/set_task", "/set_camera_params", "/set_episode_data"], ["/set_episode_traj", "/step"]
+    calls = [*begin, *pair] * 2 + [*begin, *pair, *pair] + [*begin, *pair, "/step", "/step"]
+    assert server.calls == ["/healthz", "/init", *calls, "/close"]
     assert [len(actions) for actions in server.actions] == [8, 8, 25, 7, 25, 25, 10]
-    assert [count for _, count in server.bands] == [8, 8, 25, 7, 60]
+    assert server.bands == [8, 8, 25, 7, 60]
     # Frame 1 is drawn for the controls of frame 1; openings (1 in these tracks) are counted from open to closed.
     wanted = np.linspace(0, 1, 9)[1:, None].repeat(16, 1)  # of episode b, whose joints go from 0 to 1
     wanted[:, [7, 15]] = 0
@@ -171,12 +157,12 @@ def test_a_server_s_frames_become_a_rollout_set(server: Server, inputs: dict[str
     assert np.array(server.cameras[0]["extrinsic"]).shape == (3, 4, 4)
 
 
-def _fewer(answer: bytes) -> bytes:
+def _fewer(answer):
     meta, *pictures, state = _sections(answer)
     return _packed([meta, *pictures[:-1], state])
 
 
-def _smaller(answer: bytes) -> bytes:
+def _smaller(answer):
     meta, _, *others = _sections(answer)
     return _packed([meta, _jpeg(np.zeros((H, W, 3))), *others])
 
@@ -193,13 +179,11 @@ BAD_ANSWERS = {
 
 
 @pytest.mark.parametrize("name", BAD_ANSWERS)
-def test_a_bad_answer_puts_its_episode_into_quarantine(
-    name: str, server: Server, inputs: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_bad_answer_puts_its_episode_into_quarantine(name, server, inputs, tmp_path):
     spoil, message = BAD_ANSWERS[name]
     answers = iter([False, True, False, False])
-    server.spoil = lambda task, answer: spoil(answer) if next(answers) else (200, answer)
-    done = rollout(config(server, num_frames=9), inputs, tmp_path)
+    server.spoil = lambda answer: spoil(answer) if next(answers) else (200, answer)
+    done = run(server, inputs, tmp_path)
     assert (done["episodes"], done["left_out"]) == (3, {"simulator_failed": 1})
     assert RolloutSet.open(tmp_path).episode_ids == ["a", "c", "long"]
     ((reason, detail),) = quarantine(tmp_path).values()
@@ -207,16 +191,14 @@ def test_a_bad_answer_puts_its_episode_into_quarantine(
     assert re.search(message, detail), detail
 
 
-def test_a_server_out_of_order_ends_the_step_and_what_is_finished_is_kept(
-    server: Server, inputs: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_server_out_of_order_ends_the_step_and_what_is_finished_is_kept(server, inputs, tmp_path):
     answers = iter([False, True, True, True])
-    server.spoil = lambda task, answer: (500, b"out of memory") if next(answers) else (200, answer)
-    with pytest.raises(UnavailableError, match=r"(?s)cannot be used.*3 refusals in a row.*out of memory.*run again"):
-        rollout(config(server, num_frames=9), inputs, tmp_path)
-    server.spoil = lambda task, answer: (200, answer)
+    server.spoil = lambda answer: (500, b"out of memory") if next(answers) else (200, answer)
+    with pytest.raises(UnavailableError, match=r"(?s)cannot be used.*3 refusals in a row.*out of memory"):
+        run(server, inputs, tmp_path)
+    server.spoil = lambda answer: (200, answer)
     server.actions.clear()
-    assert rollout(config(server, num_frames=9), inputs, tmp_path)["episodes"] == 4
+    assert run(server, inputs, tmp_path)["episodes"] == 4
     assert len(server.actions) == 3  # the first one was there
 
 
@@ -226,41 +208,33 @@ def test_a_server_out_of_order_ends_the_step_and_what_is_finished_is_kept(
         (lambda a: (302, b""), "HTTP 302"),
         (lambda a: (403, b'{"error": "unknown client_id"}'), "HTTP 403: .*unknown client_id"),
         (lambda a: (503, b""), "HTTP 503"),
-        (lambda a: (time.sleep(1.5), (200, a))[1], r"no whole answer within 0\.5 s"),
+        (lambda a: (time.sleep(0.8), (200, a))[1], r"no whole answer within 0\.3 s"),
     ],
 )
-def test_a_server_that_is_none_ends_the_step(
-    spoil: Callable, message: str, server: Server, inputs: dict[str, Path], tmp_path: Path
-) -> None:
-    server.spoil = lambda task, answer: spoil(answer)
-    timeout_s = 0.5 if "within" in message else 5.0
+def test_a_server_that_is_none_ends_the_step(spoil, message, server, inputs, tmp_path):
+    server.spoil = spoil
     with pytest.raises(UnavailableError, match=rf"(?s){server.url}/step.*{message}.*next step: start it"):
-        rollout(config(server, timeout_s=timeout_s, num_frames=9), inputs, tmp_path)
+        run(server, inputs, tmp_path, timeout_s=0.3 if "within" in message else 5.0)
 
 
-def test_no_server_is_said_before_anything_is_predicted(inputs: dict[str, Path], tmp_path: Path) -> None:
-    settings = RolloutConfig.model_validate(
-        {"sampler": {"kind": "ge_sim", "url": "http://127.0.0.1:9", "timeout_s": 5.0}}
-    )
+def test_no_server_is_said_before_anything_is_predicted(inputs, tmp_path):
     with pytest.raises(UnavailableError, match=r"(?s)127\.0\.0\.1:9/healthz.*ConnectError"):
-        rollout(settings, inputs, tmp_path)
+        run("http://127.0.0.1:9", inputs, tmp_path)
 
 
-def test_other_robots_are_counted_and_none_left_is_an_error(server: Server, tmp_path: Path) -> None:
+def test_other_robots_are_counted_and_none_left_is_an_error(server, tmp_path):
     made = write_recordings(tmp_path, [("a", "test", 9, VIEWS, VIEWS), ("b", "test", 9, ("head",), ("head",))])
     with pytest.raises(DataError, match=r"(?s)No episode could be predicted.*two arms of seven joints.*14 numbers"):
-        rollout(config(server, num_frames=9), {**made, "tokenizer": tmp_path}, tmp_path / "out")
-    assert {name: reason for name, (reason, _) in quarantine(tmp_path / "out").items()} == {
-        "a": "unsupported_controls", "b": "missing_view",
-    }  # fmt: skip
+        run(server, {**made, "tokenizer": tmp_path}, tmp_path / "out")
+    reasons = {name: reason for name, (reason, _) in quarantine(tmp_path / "out").items()}
+    assert reasons == {"a": "unsupported_controls", "b": "missing_view"}
 
 
-def test_the_tools_are_drawn_where_they_are() -> None:
+def test_the_tools_are_drawn_where_they_are():
     """A camera at the base's origin: the left tool half a metre before it, half open; the right one behind it."""
-    tracks = track("a", 0, 2)
     poses = np.tile(np.eye(4, dtype=np.float32), (2, 2, 1, 1))
     poses[:, 0, :3, 3], poses[:, 1, :3, 3] = (0.1, 0, 0.5), (0, 0, -0.5)
-    tracks = replace(tracks, T_base_tool=poses, gripper=np.full((2, 3, 2), 0.5, np.float32))
+    tracks = replace(track("a", 0, 2), T_base_tool=poses, gripper=np.full((2, 3, 2), 0.5, np.float32))
     K = np.tile(np.array([[100.0, 0, 200], [0, 100, 150], [0, 0, 1]]), (3, 1, 1))
     picture = tool_band(tracks, K, (300, 400), 0.15)[1, 0]
     # The end link is 0.35 m in front of, and 0.1 m beside the camera.
@@ -273,5 +247,5 @@ def test_the_tools_are_drawn_where_they_are() -> None:
     assert (picture[y, x - radius - 2] == 50).all()
     assert (picture[y, x + 10] == (0, 0, 255)).all()  # along x, to 0.1 m: 20 pixels
     assert (picture[y + 10, x] == (255, 255, 0)).all()  # along y, down
-    colours = np.unique(picture.reshape(-1, 3), axis=0)
-    assert len(colours) <= 5  # nothing of the tool behind the camera: background, disc, three lines
+    # Nothing of the tool behind the camera: background, disc, three lines.
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) <= 5

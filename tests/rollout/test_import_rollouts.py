@@ -1,62 +1,45 @@
 """Folders of videos as sets of rollouts: names and tiles; every file accounted for; counts, rates and sizes."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from pydantic import ValidationError
 
-from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
-from worldline_core.data.episodes.episode_set import EpisodeSetWriter
+from tests.rollout.conftest import recorded as make_frames
+from tests.rollout.conftest import write_recordings
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
 from worldline_core.rollout.import_rollouts import import_rollouts
 from worldline_core.rollout.rollout_config import ImportRolloutsConfig
 from worldline_core.rollout.rollout_set import RolloutSet
 
-SIZE, N = (32, 48), 9
+N = 9
 EPISODES = ("robot_a-1", "robot_a-2")
 
 
-def recorded(episode: str, view: str) -> np.ndarray:
-    generator = np.random.default_rng([len(view), *episode.encode()])
-    frames = np.repeat(generator.integers(60, 190, (1, 4, 6, 3)).repeat(8, 1).repeat(8, 2), N, axis=0)
-    for frame in range(N):
-        frames[frame, 8:20, frame : frame + 10] = (220, 40, 40)
-    return frames.astype(np.uint8)
+def recorded(episode, view):
+    return make_frames([len(view), *episode.encode()], N)
 
 
 @pytest.fixture(scope="module")
-def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("import") / "episodes"
-    K = np.array([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
-    joints = np.zeros((N, 14), np.float32)
-    with EpisodeSetWriter(root) as writer:
-        for name in (*EPISODES, "robot_train"):
-            episode = Episode(
-                episode_id=name, source="synthetic", embodiment="ur5e_pair", scene="s", task_family="lift",
-                instruction="lift", outcome="unknown", split="train" if "train" in name else "test", fps=8.0,
-                state=joints, action=joints, timestamps=np.arange(N) / 8.0,
-                cameras={view: CameraTrack(view, K, np.eye(4)[None], SIZE[1], SIZE[0]) for view in VIEWS},
-            )  # fmt: skip
-            writer.add(episode, {view: recorded(name, view) for view in VIEWS})
-    return root
+def episodes(tmp_path_factory):
+    root = tmp_path_factory.mktemp("import")
+    made = [(name, "train" if "train" in name else "test", N, VIEWS, VIEWS) for name in (*EPISODES, "robot_train")]
+    return write_recordings(root, made, frames=recorded)["episodes"]
 
 
-def encode(path: Path, frames: np.ndarray, fps: float = 8) -> None:
+def encode(path, frames, fps=8):
     path.parent.mkdir(parents=True, exist_ok=True)
     encode_video(path, frames, fps, crf=0, pixel_format="yuv444p")
 
 
-def close(found: np.ndarray, wanted: np.ndarray) -> bool:
+def close(found, wanted):
     return found.shape == wanted.shape and float(np.abs(found.astype(int) - wanted).mean()) < 2
 
 
 @pytest.fixture
-def videos(tmp_path: Path) -> Path:
+def videos(tmp_path):
     """Predictions that are the recordings, of every view of both test episodes."""
     for episode in EPISODES:
         for view in VIEWS:
@@ -64,7 +47,7 @@ def videos(tmp_path: Path) -> Path:
     return tmp_path / "videos"
 
 
-def run(videos: Path, episodes: Path, **config: object) -> tuple[RolloutSet, dict, list[dict]]:
+def run(videos, episodes, **config):
     output = videos.parent / "out"
     counts = import_rollouts(
         ImportRolloutsConfig.model_validate({"method": "theirs", **config}), {"videos": videos, "episodes": episodes}, output
@@ -72,7 +55,7 @@ def run(videos: Path, episodes: Path, **config: object) -> tuple[RolloutSet, dic
     return RolloutSet.open(output), counts, pq.read_table(output / "files.parquet").to_pylist()
 
 
-def test_named_files_become_a_set_of_the_same_bytes(videos: Path, episodes: Path) -> None:
+def test_named_files_become_a_set_of_the_same_bytes(videos, episodes):
     found, counts, files = run(videos, episodes)
     assert (found.method, found.fps, found.episode_ids) == ("theirs", 8.0, list(EPISODES))
     assert set(found.views(EPISODES[0])) == set(VIEWS)
@@ -84,7 +67,7 @@ def test_named_files_become_a_set_of_the_same_bytes(videos: Path, episodes: Path
     assert {(file["status"], file["view"]) for file in files} == {("matched", view) for view in VIEWS}
 
 
-def test_every_file_and_every_expected_video_is_accounted_for(videos: Path, episodes: Path) -> None:
+def test_every_file_and_every_expected_video_is_accounted_for(videos, episodes):
     (videos / "robot_a-1_head.mp4").rename(videos / "robot_a-9_head.mp4")
     encode(videos / "robot_train_head.mp4", recorded("robot_train", "head"))
     encode(videos / "sub" / "notes.mp4", recorded("robot_train", "head"))
@@ -106,7 +89,7 @@ def test_every_file_and_every_expected_video_is_accounted_for(videos: Path, epis
         run(videos, episodes, name="other_{episode}_{view}.mp4", missing="report", unknown="report")
 
 
-def test_counts_rates_and_sizes_are_compared_before_anything_is_written(videos: Path, episodes: Path) -> None:
+def test_counts_rates_and_sizes_are_compared_before_anything_is_written(videos, episodes):
     frames = recorded("robot_a-1", "head")
     encode(videos / "robot_a-1_head.mp4", frames, fps=16)
     encode(videos / "robot_a-1_left_wrist.mp4", np.concatenate([frames, frames[:2]]))
@@ -129,7 +112,7 @@ def test_counts_rates_and_sizes_are_compared_before_anything_is_written(videos: 
         run(videos, episodes, fps=8, resize=True)
 
 
-def test_templates_with_folders_seeds_and_other_names_of_views(videos: Path, episodes: Path) -> None:
+def test_templates_with_folders_seeds_and_other_names_of_views(videos, episodes):
     folder = videos.parent / "theirs"
     for episode in EPISODES:
         for seed in (1, 2):
@@ -142,7 +125,7 @@ def test_templates_with_folders_seeds_and_other_names_of_views(videos: Path, epi
     assert found.seeds("robot_a-1") == [1, 2]
 
 
-def test_ctrl_world_s_pictures_of_two_rows_are_taken_apart(videos: Path, episodes: Path) -> None:
+def test_ctrl_world_s_pictures_of_two_rows_are_taken_apart(videos, episodes):
     """As its replay script writes them: recorded views above, predicted ones below, three side by side, at 4 frames/s."""
     folder = videos.parent / "synthetic_traj/Rollouts_replay/video"
     for episode in EPISODES:
@@ -161,10 +144,11 @@ def test_ctrl_world_s_pictures_of_two_rows_are_taken_apart(videos: Path, episode
         run(videos.parent / "synthetic_traj", episodes, **config | {"tiles": [["head", None, None], *[[None] * 3] * 4]})
 
 
-def test_configurations_that_name_no_episode_or_no_view_are_refused() -> None:
-    for values in ({"name": "{view}.mp4"}, {"name": "{episode}.mp4"}, {"name": "{episode}_{view}_{camera}.mp4"}):
-        with pytest.raises(ValidationError, match="needed are"):
-            ImportRolloutsConfig.model_validate({"method": "m", **values})
-    for values in ({"views": {"top": "ceiling"}}, {"tiles": [["head", "head"]], "name": "{episode}.mp4"}):
-        with pytest.raises(ValidationError, match="each once"):
+def test_configurations_that_name_no_episode_or_no_view_are_refused():
+    for values, message in (
+        ({"name": "{view}.mp4"}, "needed are"), ({"name": "{episode}.mp4"}, "needed are"),
+        ({"name": "{episode}_{view}_{camera}.mp4"}, "needed are"), ({"views": {"top": "ceiling"}}, "each once"),
+        ({"tiles": [["head", "head"]], "name": "{episode}.mp4"}, "each once"),
+    ):  # fmt: skip
+        with pytest.raises(ValidationError, match=message):
             ImportRolloutsConfig.model_validate({"method": "m", **values})

@@ -5,8 +5,6 @@ happen in it. The weights that a run ends with are written to `<output>.safetens
 one, which imports what they need once.
 """
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
@@ -14,7 +12,6 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors.torch import save_file
@@ -29,11 +26,11 @@ from worldline_core.training.training_config import Stage1Config, Stage2Config
 STEPS = {"train_stage1": (Stage1Config, train_stage1), "train_stage2": (Stage2Config, train_stage2)}
 
 
-def kill_before(step: int) -> None:
+def kill_before(step):
     """The last process kills itself when it comes to a step, once the states before are on the disk."""
     inner = TrainingRun.step
 
-    def stepping(run: Any, at: int) -> Any:
+    def stepping(run, at):
         if int(os.environ["WORLD_SIZE"]) - 1 == int(os.environ["RANK"]) and at == step:
             while any(not (path / "state.json").is_file() for path in run.output.glob("run/training_state/step-*")):
                 time.sleep(0.01)
@@ -43,11 +40,11 @@ def kill_before(step: int) -> None:
     TrainingRun.step = stepping
 
 
-def keep_weights(path: Path) -> None:
+def keep_weights(path):
     """The first process writes the weights that the run ends with, in full precision."""
     inner = Stage.save
 
-    def save(self: Stage, *arguments: Any, **named: Any) -> Any:
+    def save(self, *arguments, **named):
         weights = gathered(self.model.state_dict())
         if os.environ["RANK"] == "0":
             save_file({name: value.contiguous() for name, value in weights.items()}, path)
@@ -56,7 +53,7 @@ def keep_weights(path: Path) -> None:
     Stage.save = save
 
 
-def work(rank: int, request: dict[str, Any]) -> None:
+def work(rank, request):
     with Path(request["log"]).open("ab") as log:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
@@ -74,7 +71,7 @@ def work(rank: int, request: dict[str, Any]) -> None:
         step(config.model_validate(run["config"]), inputs, output)  # type: ignore[operator]
 
 
-def main() -> None:
+def main():
     context = multiprocessing.get_context("fork")
     for line in sys.stdin:
         request = json.loads(line)

@@ -1,7 +1,5 @@
 """Batches by their micro-step: the same whatever reads them, from any step on, and errors that name clips."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import pickle
@@ -11,7 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -21,9 +18,9 @@ from worldline_core.errors import DataError, TrainingError
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import clip_loader
 from worldline_core.training.clip_config import ClipSampling, FrameInput, ReadingConfig
-from worldline_core.training.clip_loader import Batch, ClipLoader
+from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipSampler
-from worldline_core.training.clip_source import ClipSource, FrameSource, LatentStore
+from worldline_core.training.clip_source import FrameSource, LatentStore
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 
@@ -33,7 +30,7 @@ class Scripted(LatentStore):
 
     behaviour: dict[str, str]
 
-    def read(self, clip: Clip, views: tuple[str, ...]) -> torch.Tensor:
+    def read(self, clip, views):
         what = self.behaviour.get(clip.episode_id)
         if what == "slow":
             time.sleep(0.15)
@@ -44,14 +41,14 @@ class Scripted(LatentStore):
         return super().read(clip, views)
 
 
-def scripted(world: Any, behaviour: dict[str, str] | None = None) -> Scripted:
-    plain: Any = LatentStore.open(world.latents)
+def scripted(world, behaviour=None):
+    plain = LatentStore.open(world.latents)
     store = Scripted(plain.root, plain.description, plain.rows)
     store.behaviour = behaviour or {}
     return store
 
 
-def sampler_of(source: ClipSource, **changes: Any) -> ClipSampler:
+def sampler_of(source, **changes):
     values = {"lengths": (5, 9, 17), "view_weights": {"joint": 1.0, "primary": 1.0}, "single_view_factor": 2}
     config = ClipSampling.model_validate(changes or values)
     return ClipSampler(
@@ -59,12 +56,12 @@ def sampler_of(source: ClipSource, **changes: Any) -> ClipSampler:
     )
 
 
-def same(one: Batch, other: Batch) -> bool:
+def same(one, other):
     return (one.clips, one.views) == (other.clips, other.views) and torch.equal(one.latents, other.latents)
 
 
 @pytest.fixture(autouse=True)
-def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
+def _importable(monkeypatch):
     # pytest's importlib mode gives this file a name that a spawned process cannot import: give it one that it can.
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     monkeypatch.setattr(Scripted, "__module__", "test_clip_loader")
@@ -73,7 +70,7 @@ def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("forked_loaders")
-def test_batches_do_not_depend_on_who_reads_them_and_when(world: Any) -> None:
+def test_batches_do_not_depend_on_who_reads_them_and_when(world):
     plain = ClipLoader(scripted(world), views=VIEWS)
     sampler = sampler_of(plain.source)
     expected = [plain.load(sampler.clips(index)) for index in range(24)]
@@ -92,7 +89,7 @@ def test_batches_do_not_depend_on_who_reads_them_and_when(world: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("forked_loaders")
-def test_errors_name_their_clips_and_leave_no_process(world: Any) -> None:
+def test_errors_name_their_clips_and_leave_no_process(world):
     sampler = sampler_of(scripted(world))
     first = next(index for index in range(50) if "episode-004" in {c.episode_id for c in sampler.clips(index).clips})
     for what, kind, message in (
@@ -112,24 +109,24 @@ def test_errors_name_their_clips_and_leave_no_process(world: Any) -> None:
         assert not multiprocessing.active_children()
 
 
+KILLED = """
+import multiprocessing, pickle, sys, time
+from pathlib import Path
+from test_clip_loader import VIEWS, ClipLoader, ReadingConfig, sampler_of
+if __name__ == "__main__":
+    source = pickle.loads(Path(sys.argv[1]).read_bytes())
+    load = ClipLoader(source, views=VIEWS).batches(sampler_of(source), ReadingConfig(workers=1))
+    load(0)
+    print(*[process.pid for process in multiprocessing.active_children()], flush=True)
+    time.sleep(60)
+"""
+
+
 @pytest.mark.slow
-def test_processes_end_with_the_training_process(world: Any, tmp_path: Path) -> None:
+def test_processes_end_with_the_training_process(world, tmp_path):
     """Killed with SIGKILL, it cannot close anything: its loader processes notice and end by themselves."""
     (tmp_path / "source.pickle").write_bytes(pickle.dumps(scripted(world)))
-    code = (
-        "import multiprocessing, pickle, sys, time\n"
-        "from pathlib import Path\n"
-        "from test_clip_loader import VIEWS, sampler_of\n"
-        "from worldline_core.training.clip_config import ReadingConfig\n"
-        "from worldline_core.training.clip_loader import ClipLoader\n"
-        "if __name__ == '__main__':\n"
-        "    source = pickle.loads(Path(sys.argv[1]).read_bytes())\n"
-        "    load = ClipLoader(source, views=VIEWS).batches(sampler_of(source), ReadingConfig(workers=1))\n"
-        "    load(0)\n"
-        "    print(*[process.pid for process in multiprocessing.active_children()], flush=True)\n"
-        "    time.sleep(60)\n"
-    )
-    (tmp_path / "main.py").write_text(code)
+    (tmp_path / "main.py").write_text(KILLED)
     command = [sys.executable, str(tmp_path / "main.py"), str(tmp_path / "source.pickle")]
     folders = (Path(__file__).parent, Path(__file__).parents[2])
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders))}
@@ -143,7 +140,7 @@ def test_processes_end_with_the_training_process(world: Any, tmp_path: Path) -> 
 
 
 @pytest.mark.gpu
-def test_batches_reach_a_gpu(world: Any) -> None:
+def test_batches_reach_a_gpu(world):
     source = scripted(world)
     load = ClipLoader(source, views=VIEWS, device="cuda").batches(sampler_of(source), ReadingConfig(workers=1), stop=6)
     plain = ClipLoader(source, views=VIEWS)
@@ -151,54 +148,51 @@ def test_batches_reach_a_gpu(world: Any) -> None:
         assert torch.equal(load(index).latents.cpu(), plain.load(sampler_of(source).clips(index)).latents)
 
 
-def test_a_damaged_clip_is_named_or_skipped_and_counted(
-    world: Any, tokenizer: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(world.episodes, tmp_path / "set")
-    (video,) = (tmp_path / "set").rglob("*left_wrist*/**/*.mp4")
-    content = video.read_bytes()
-    half = len(content) // 2
-    video.write_bytes(content[:half] + bytes(len(content) - half))
-    episodes = EpisodeSet.open(tmp_path / "set")
+def test_a_damaged_clip_is_named_or_skipped_and_counted(world, tokenizer, tmp_path, monkeypatch):
+    episodes = EpisodeSet.open(shutil.copytree(world.episodes, tmp_path / "set"))
+    (video,) = episodes.root.rglob("*left_wrist*/**/*.mp4")
+    half = video.stat().st_size // 2
+    video.write_bytes(video.read_bytes()[:half] + bytes(half))
     config = FrameInput.model_validate({"image_size": [32, 32], "on_unreadable": "skip"})
-    source = FrameSource(episodes, tokenizer, config)
-    faults: dict[str, str] = {}
+    source, faults = FrameSource(episodes, tokenizer, config), {}
     for row in episodes.rows:
         try:
             source.read(Clip(row.episode_id, 0, 17, 1), VIEWS)
         except DataError as error:
             faults[row.episode_id] = str(error)
-    assert all(f"{name}, frames 0..16, view left_wrist, in" in fault for name, fault in faults.items())
-    assert all(".mp4" in fault for fault in faults.values())
+    assert all(
+        f"{name}, frames 0..16, view left_wrist, in" in fault and ".mp4" in fault for name, fault in faults.items()
+    )
     good = {row.episode_id for row in episodes.rows if row.split == "train"} - set(faults)
     assert 0 < len(good) < 6
     loader, sampler, run = ClipLoader(source, views=VIEWS), sampler_of(source, lengths=(17,)), tmp_path / "run"
-    strict = loader.batches(sampler, config.model_copy(update={"on_unreadable": "raise"}))
+
+    def batches(config=config):
+        load = loader.batches(sampler, config, run)
+        return [load(index) for index in range(10)]
+
     with pytest.raises(DataError, match="A clip cannot be read"):
-        [strict(index) for index in range(10)]
-    lenient = loader.batches(sampler, config, run)
-    batches = [lenient(index) for index in range(10)]
-    for index, batch in enumerate(batches):
+        batches(config.model_copy(update={"on_unreadable": "raise"}))
+    read = batches()
+    for index, batch in enumerate(read):
         assert set(batch.names) <= good
-        wanted = sampler.clips(index).clips
-        assert all(drawn == clip for drawn, clip in zip(batch.clips, wanted, strict=True) if clip.episode_id in good)
+        pairs = zip(batch.clips, sampler.clips(index).clips, strict=True)
+        assert all(drawn == clip for drawn, clip in pairs if clip.episode_id in good)
         assert torch.equal(batch.frames[0], source.read(batch.clips[0], VIEWS))
     path = run / "skipped_clips-0.jsonl"
     skipped = read_json_lines(path)
-    assert len(skipped) > 0
+    assert skipped
     # Steps that are done again after a kill, and a line that the kill cut short, change no count.
     with path.open("a") as file:
         file.write('{"index": 3, "cl')
-    again = loader.batches(sampler, config, run)
-    assert all(same(again(index), batch) for index, batch in enumerate(batches))
+    assert all(map(same, batches(), read))
     assert read_json_lines(path) == skipped
     monkeypatch.setattr(clip_loader, "MOST_SKIPPED", len(skipped) - 1)
-    few = loader.batches(sampler, config, run)
     with pytest.raises(DataError, match=rf"at most {len(skipped) - 1}[\s\S]*got: {len(skipped)}"):
-        [few(index) for index in range(10)]
+        batches()
 
 
-def test_where_nothing_can_be_read_skipping_ends(world: Any) -> None:
+def test_where_nothing_can_be_read_skipping_ends(world):
     source = scripted(world, {f"episode-{number:03d}": "damaged" for number in range(8)})
     load = ClipLoader(source, views=VIEWS).batches(sampler_of(source), ReadingConfig(on_unreadable="skip"))
     with pytest.raises(DataError, match=r"one of 20 clips[\s\S]*truncated"):

@@ -1,37 +1,33 @@
 """Training on several processes (gloo): one model in parts, one writer, the same weights on any number of them."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.training import conftest
+from tests.training.conftest import TINY_MODEL, losses
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.store.artifact_files import digest_folder, read_json_lines
-from worldline_core.training.training_config import TeacherConfig
-from worldline_core.training.video_teacher import train_teacher
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="module")
-def run_processes(project_root: Path) -> Iterator[Callable[..., list[int | None]]]:
+def run_processes(project_root):
     """Runs requests on processes that find each other as torchrun's do; their exit codes, None for one that hangs.
 
     Of the function:
@@ -45,9 +41,7 @@ def run_processes(project_root: Path) -> Iterator[Callable[..., list[int | None]
         requests, answers = starting.stdin, starting.stdout
         assert requests is not None
 
-        def run(
-            folder: Path, runs: list[dict[str, Any]], count: int = 2, *, alone_at_most: float = 200
-        ) -> list[int | None]:
+        def run(folder, runs, count=2, *, alone_at_most=200):
             address = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
             request = {"count": count, "environment": address, "log": folder / "log", "runs": runs}
             print(json.dumps(request | {"alone_at_most": alone_at_most}, default=str), file=requests, flush=True)
@@ -56,55 +50,29 @@ def run_processes(project_root: Path) -> Iterator[Callable[..., list[int | None]
         yield run
 
 
-def weights(output: Path) -> dict[str, torch.Tensor]:
-    return load_file(output.with_name(f"{output.name}.safetensors"))
-
-
-def difference(first: Path, second: Path) -> float:
+def difference(first, second):
     """The largest difference between the weights of two runs."""
-    one, other = weights(first), weights(second)
+    one, other = (load_file(output.with_name(f"{output.name}.safetensors")) for output in (first, second))
     assert one.keys() == other.keys()
     return max(float((one[name] - other[name]).abs().max()) for name in one)
 
 
-def losses(output: Path) -> list[float]:
-    return [row["loss"] for row in read_json_lines(output / "metrics.jsonl") if "loss" in row]
-
-
-def logged(output: Path) -> list[dict[str, float]]:
-    return read_json_lines(output / "metrics.jsonl")
-
-
-def trainer(steps: int, batch_size: int, **changes: Any) -> dict[str, Any]:
-    values: dict[str, Any] = {
-        "steps": steps,
-        "batch_size": batch_size,
-        "precision": "fp32",
-        "log_every": 2,
-        "validation_batches": 1,
-        "save_every_seconds": 1000.0,
-        "save_every_steps": 5,
-        "optimizer": {"learning_rate": 1e-3, "warmup_steps": 2},
-    }
-    return values | changes
+def trainer(steps, batch_size, **changes):
+    optimizer = {"learning_rate": 1e-3, "warmup_steps": 2}
+    return conftest.trainer(
+        steps, batch_size=batch_size, log_every=2, save_every_steps=5, optimizer=optimizer, **changes
+    )
 
 
 @pytest.fixture(scope="module")
-def inputs(world: Any, tiny_model: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    model = WorldModel(WorldModelConfig.model_validate(tiny_model))
+def inputs(world, teacher, tmp_path_factory):
+    model, folder = WorldModel(WorldModelConfig.model_validate(TINY_MODEL)), tmp_path_factory.mktemp("base")
     model.initialise(torch.Generator().manual_seed(0))
-    folder = tmp_path_factory.mktemp("base")
     save_checkpoint(folder, model, kind="base", action_contract=None)
-    shape = {"image_size": [32, 32], "patch": 8, "hidden_size": 16, "num_layers": 4, "num_heads": 2}
-    values = {"shape": shape, "trainer": trainer(2, 2), "clip_frames": 9, "held_out_episodes": 1}
-    teacher = tmp_path_factory.mktemp("teacher")
-    train_teacher(TeacherConfig.model_validate(values), {"episodes": world.episodes}, teacher)
     return {**world.inputs, "stage1": folder, "teacher": teacher}
 
 
-def stage2(
-    output: Path, inputs: dict[str, Path], name: str, *, steps: int = 20, relational: Any = None, **changes: Any
-) -> dict[str, Any]:
+def stage2(output, inputs, name, *, steps=20, relational=None, **changes):
     """A run of Stage II, four clips a step whatever the number of processes."""
     run = {key: changes.pop(key) for key in ("kill_before",) if key in changes}
     config = {
@@ -116,15 +84,13 @@ def stage2(
     return {"step": "train_stage2", "config": config, "inputs": inputs, "output": output / name, **run}
 
 
-def stage1(output: Path, world: Any, tiny_model: dict[str, Any], name: str) -> dict[str, Any]:
+def stage1(output, inputs, name):
     """A run of Stage I in which some micro-batches read their text and others do not."""
     config = {
-        "model": tiny_model,
-        "text_dropout": 0.5,
-        "clips": {"lengths": [9], "view_weights": {"primary": 1}},
+        "model": TINY_MODEL, "text_dropout": 0.5, "clips": {"lengths": [9], "view_weights": {"primary": 1}},
         "trainer": trainer(20, 2, global_batch=4),
-    }
-    return {"step": "train_stage1", "config": config, "inputs": world.inputs, "output": output / name}
+    }  # fmt: skip
+    return {"step": "train_stage1", "config": config, "inputs": inputs, "output": output / name}
 
 
 @dataclass(frozen=True)
@@ -135,15 +101,12 @@ class Runs:
     log: str
     codes: list[int | None]
 
-    def __truediv__(self, name: str) -> Path:
+    def __truediv__(self, name):
         return self.folder / name
 
 
 @pytest.fixture(scope="module")
-def runs(
-    world: Any, inputs: dict[str, Path], tiny_model: dict[str, Any], run_processes: Callable[..., list[int | None]],
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Runs:  # fmt: skip
+def runs(inputs, run_processes, tmp_path_factory):
     """Every run that the tests below compare: starting processes costs more than the runs."""
     folder = tmp_path_factory.mktemp("runs")
     one, two, four = folder / "one", folder / "two", folder / "four"
@@ -152,7 +115,7 @@ def runs(
     # One process: whole runs, and one that is stopped half-way.
     terms = {"ramp_steps": 2}
     alone = [
-        stage1(one, world, tiny_model, "text"),
+        stage1(one, inputs, "text"),
         stage2(one, inputs, "plain"),
         stage2(one, inputs, "terms", relational=terms),
     ]
@@ -160,7 +123,7 @@ def runs(
     assert run_processes(one, [stage2(one, inputs, "half", kill_before=11)], count=1) == [-9]
     # Two processes: the same, with blocks computed again; the last run loses its second process.
     shared = [
-        stage1(two, world, tiny_model, "text"),
+        stage1(two, inputs, "text"),
         stage2(two, inputs, "plain"),
         stage2(two, inputs, "terms", relational=terms),
         stage2(two, inputs, "again", sharding={"checkpointing": "block", "reduce_every_micro_step": True}),
@@ -186,44 +149,29 @@ def runs(
 @pytest.mark.parametrize(
     ("first", "second"),
     [
-        ("one/plain", "two/plain"),
-        ("one/text", "two/text"),
-        ("one/terms", "two/terms"),
-        ("one/plain", "two/again"),
-        ("one/plain", "one/killed"),
-        ("one/plain", "two/half"),
-        ("four/single", "four/plain"),
-    ],
-    ids=[
-        "two",
-        "two, text",
-        "two, relational terms",
-        "two, blocks again",
-        "two, then one",
-        "one, then two",
-        "two copies of two parts",
+        pytest.param("one/plain", "two/plain", id="two"),
+        pytest.param("one/text", "two/text", id="two, text"),
+        pytest.param("one/terms", "two/terms", id="two, relational terms"),
+        pytest.param("one/plain", "two/again", id="two, blocks again"),
+        pytest.param("one/plain", "one/killed", id="two, then one"),
+        pytest.param("one/plain", "two/half", id="one, then two"),
+        pytest.param("four/single", "four/plain", id="two copies of two parts"),
     ],
 )
-def test_another_number_of_processes_learns_the_same(runs: Runs, first: str, second: str) -> None:
+def test_another_number_of_processes_learns_the_same(runs, first, second):
     assert losses(runs / second) == pytest.approx(losses(runs / first), rel=1e-6)
     # Every term and scale is the mean over the same clips and pairs.
-    assert logged(runs / second) == [pytest.approx(row, rel=1e-5, abs=1e-9) for row in logged(runs / first)]
+    logged = [read_json_lines(runs / name / "metrics.jsonl") for name in (first, second)]
+    assert logged[1] == [pytest.approx(row, rel=1e-5, abs=1e-9) for row in logged[0]]
     # Sums of another order differ in the last digit, and Adam moves a weight by 1e-3 a step also where its gradient is
     # rounding. One digit in the gradients of a single process moves a weight by up to 3e-7 here, with relational terms by 3e-6.
     assert difference(runs / first, runs / second) <= (1e-5 if first == "one/terms" else 1e-6)
     # One writer: every line of the log once.
-    assert [row["step"] for row in read_json_lines(runs / second / "metrics.jsonl") if "loss" in row] == [
-        *range(2, 21, 2)
-    ]
+    assert [row["step"] for row in logged[1] if "loss" in row] == [*range(2, 21, 2)]
 
 
 @pytest.mark.slow
-def test_processes_that_were_killed_end_with_the_same_bytes(runs: Runs) -> None:
+def test_processes_that_were_killed_end_with_the_same_bytes_and_one_left_alone_says_so(runs):
     assert digest_folder(runs / "two/killed") == digest_folder(runs / "two/plain")
-
-
-@pytest.mark.slow
-def test_a_process_that_is_left_alone_says_so_and_ends(runs: Runs) -> None:
     assert runs.codes == [1, -9]
     assert "Another process of this training has ended or cannot be reached" in runs.log
-    assert "the same command continues from the last saved state" in runs.log

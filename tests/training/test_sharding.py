@@ -1,8 +1,6 @@
 """What saves memory: weights in parts, blocks that are computed again, compiled blocks. The same numbers come out."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -24,78 +22,65 @@ Make = Callable[..., WorldModel]
 
 
 @pytest.fixture
-def make_small(make_model: Make) -> Make:
-    """Models with both towers."""
+def make_small(make_model):
+    """Makes models with both towers."""
     return partial(make_model, towers="both", vocab_size=20)
 
 
-def sample(frames: int = 7) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def sample(frames=7):
     generator = torch.Generator().manual_seed(1)
-    latents = torch.randn(2, 3, 4, frames, 4, 6, generator=generator)
-    maps = torch.randn(2, 3, 9, frames, 4, 6, generator=generator)
+    latents, maps = (torch.randn(2, 3, channels, frames, 4, 6, generator=generator) for channels in (4, 9))
     return latents, maps, torch.rand(2, generator=generator) * 0.8 + 0.1
 
 
-def clip_pass(model: WorldModel) -> torch.Tensor:
+def clip_pass(model):
     latents, maps, sigma = sample()
     text = model.encode_text(torch.arange(12).reshape(2, 6))
     return model(latents, sigma, action_maps=maps, text=text).velocity
 
 
-def teacher_forcing_pass(model: WorldModel) -> torch.Tensor:
+def teacher_forcing_pass(model):
     latents, maps, _ = sample()
     sigma = torch.full((2, 3), 0.5)
     return model.forward_teacher_forcing(latents, latents, sigma, action_maps=maps, spec=SPEC, views=VIEWS)
 
 
-def rollout_pass(model: WorldModel) -> torch.Tensor:
+def rollout_pass(model):
     """Blocks through a cache whose window moves on before the way back begins."""
     latents, maps, _ = sample(9)
     first = latents[..., :1, :, :]
     return self_forced_rollout(model, first, maps, latents, 1, views=VIEWS, spec=SPEC, with_gradient=True)
 
 
+EXACT = {"rtol": 0, "atol": 0}
 PASSES = [clip_pass, teacher_forcing_pass, rollout_pass]
 
 
-def gradients(model: WorldModel, passing: Callable[[WorldModel], torch.Tensor]) -> tuple[dict[str, torch.Tensor], int]:
+def gradients(model, passing):
     """Gradients of a pass, and how often the first block ran."""
-    calls: list[int] = []
+    calls = []
     model.layers[0].mlp_moe_gen.up_proj.register_forward_hook(lambda *_: calls.append(1))  # pyright: ignore[reportAttributeAccessIssue]
     passing(model).square().mean().backward()
     return {name: value.grad for name, value in model.named_parameters() if value.grad is not None}, len(calls)
 
 
 @pytest.mark.parametrize("passing", PASSES)
-def test_blocks_computed_again_give_the_same_gradients(
-    make_small: Make, passing: Callable[[WorldModel], torch.Tensor]
-) -> None:
-    plain, once = gradients(make_small(), passing)
-    config = ShardingConfig(checkpointing="block")
-    again, twice = gradients(place_model(make_small(), config, precision="fp32", device="cpu"), passing)
-    assert plain.keys() == again.keys()
-    assert all(torch.equal(plain[name], again[name]) for name in plain)
-    assert twice > once
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("passing", PASSES)
-def test_compiled_blocks_give_the_same_gradients(
-    make_small: Make, passing: Callable[[WorldModel], torch.Tensor]
-) -> None:
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_blocks_computed_again_and_compiled_ones_give_the_same_gradients(make_small, passing, compiled):
     # In tests every function is wrapped to check its shapes, and each wrapper counts as compiling the same one again.
     torch._dynamo.reset()
-    plain, _ = gradients(make_small(), passing)
-    config = ShardingConfig(compile=True, checkpointing="block")
+    plain, once = gradients(make_small(), passing)
+    config = ShardingConfig(compile=compiled, checkpointing="block")
     with torch._dynamo.config.patch(recompile_limit=100):
-        compiled, _ = gradients(place_model(make_small(), config, precision="fp32", device="cpu"), passing)
-    assert plain.keys() == compiled.keys()
+        found, twice = gradients(place_model(make_small(), config, precision="fp32", device="cpu"), passing)
+    assert plain.keys() == found.keys()
     for name, value in plain.items():
-        torch.testing.assert_close(compiled[name], value, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(found[name], value, **({"rtol": 1e-4, "atol": 1e-6} if compiled else EXACT))
+    assert compiled or twice > once
 
 
 @pytest.fixture
-def group_of_64() -> Iterator[None]:
+def group_of_64():
     """This process is the first of 64, the others answer nothing."""
     torch.distributed.init_process_group("fake", store=FakeStore(), rank=0, world_size=64)
     yield
@@ -104,7 +89,7 @@ def group_of_64() -> Iterator[None]:
 
 @pytest.mark.usefixtures("group_of_64")
 @pytest.mark.parametrize("shards", [None, 8])
-def test_one_of_64_holds_a_64th_of_everything(make_model: Make, shards: int | None) -> None:
+def test_one_of_64_holds_a_64th_of_everything(make_model, shards):
     sizes = {"hidden_size": 64, "intermediate_size": 128, "head_dim": 64, "num_heads": 2, "num_kv_heads": 1}
     model = make_model(**sizes, rope_sections=(16, 8, 8))
     matrices = {name for name, value in model.named_parameters() if value.shape[0] % 64 == 0}
@@ -124,9 +109,5 @@ def test_one_of_64_holds_a_64th_of_everything(make_model: Make, shards: int | No
             assert own_part(value).numel() * parts == whole[name]
     # What does not divide is shared out too, the first processes holding a row each.
     assert all(own_part(value).shape[0] <= -(-value.shape[0] // parts) for value in named.values())
-
-
-@pytest.mark.usefixtures("group_of_64")
-def test_processes_that_do_not_divide_into_groups_are_named(make_model: Make) -> None:
     with pytest.raises(ConfigError, match=r"a divisor of 64, the number of processes[\s\S]*got: 7"):
         place_model(make_model(), ShardingConfig(shards=7), precision="fp32", device="cpu")

@@ -1,48 +1,25 @@
 """What the text tower is fed: bytes for the embedded default, the backbone's own chat prompt at full size."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
+import json
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from worldline_core.errors import ConfigError, UnavailableError
-from worldline_core.model.text import ClipFacts, Cosmos3Text, load_text_encoder
+from tests.training.conftest import TINY_MODEL, stage1
+from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
+from worldline_core.model.text import VISION_START, ClipFacts, Cosmos3Text, load_text_encoder
 from worldline_core.model.world_model_config import TextConfig
 from worldline_core.rehearsal.outside_models import write_qwen2_tokenizer
-from worldline_core.training.clip_loader import Batch, ClipLoader
+from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch
 from worldline_core.training.clip_source import LatentStore
-from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.stage1 import train_stage1
-from worldline_core.training.training_config import Stage1Config
-
-CLIP = ClipFacts(17, 8.0, (32, 32))
 
 
-def test_stage1_feeds_the_chat_prompt_of_each_clip(
-    world: Any, tiny_model: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stage1_feeds_the_chat_prompt_of_each_clip(world, tmp_path, seen):
     write_qwen2_tokenizer(tmp_path / "tokenizer")
-    config = Stage1Config.model_validate(
-        {
-            "model": tiny_model | {"vocab_size": 1024},
-            "text": {"kind": "cosmos3", "path": str(tmp_path / "tokenizer"), "max_length": 200},
-            "text_dropout": 0.0,
-            "clips": {"lengths": [9], "view_weights": {"primary": 1}},
-            "trainer": {"steps": 2, "batch_size": 2, "validation_batches": 0},
-        }
-    )
-    seen: list[Batch] = []
-    inner = FlowMatchingObjective.loss
-
-    def loss(self: FlowMatchingObjective, batch: Batch, generator: torch.Generator, step: int) -> Any:
-        seen.append(batch)
-        return inner(self, batch, generator, step)
-
-    monkeypatch.setattr(FlowMatchingObjective, "loss", loss)
+    config = stage1(model=TINY_MODEL | {"vocab_size": 1024}, text={"kind": "cosmos3", "path": str(tmp_path / "tokenizer"), "max_length": 200}, text_dropout=0.0, clips={"lengths": [9], "view_weights": {"primary": 1}}, trainer={"steps": 2, "batch_size": 2, "validation_batches": 0})  # fmt: skip
     train_stage1(config, world.inputs, tmp_path / "out")
     text = Cosmos3Text(tmp_path / "tokenizer")
     assert len(seen) == 2
@@ -53,10 +30,10 @@ def test_stage1_feeds_the_chat_prompt_of_each_clip(
             assert ids[mask].tolist() == text.ids(instruction, ClipFacts(9, 8.0, (32, 32)))
 
 
-def test_a_stride_slows_the_frames_that_the_prompt_names(world: Any) -> None:
-    asked: list[ClipFacts] = []
+def test_a_stride_slows_the_frames_that_the_prompt_names(world):
+    asked = []
 
-    def record(texts: list[str], clips: list[ClipFacts]) -> tuple[torch.Tensor, torch.Tensor]:
+    def record(texts, clips):
         asked.extend(clips)
         return torch.ones(len(texts), 1, dtype=torch.long), torch.ones(len(texts), 1, dtype=torch.bool)
 
@@ -68,20 +45,78 @@ def test_a_stride_slows_the_frames_that_the_prompt_names(world: Any) -> None:
     assert asked == [ClipFacts(9, 8.0, (32, 32))]
 
 
-def test_bytes_are_what_the_shipped_checkpoints_were_trained_on() -> None:
+def test_bytes_are_what_the_shipped_checkpoints_were_trained_on():
     ids, mask = load_text_encoder(TextConfig(max_length=6), 300)([" Lift ", "put it down"], [CLIP, CLIP])
     # Bytes of "lift" and "put i" are shifted by two, 1 ends a text, 0 pads.
     assert ids.tolist() == [[110, 107, 104, 118, 1, 0], [114, 119, 118, 34, 107, 1]]
     assert mask.tolist() == [[True] * 5 + [False], [True] * 6]
 
 
-def test_text_that_does_not_fit_the_model_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="vocabulary is too small"):
-        load_text_encoder(TextConfig(), 100)
-    with pytest.raises(UnavailableError, match="text tokenizer is not here"):
-        load_text_encoder(TextConfig(kind="cosmos3", path=str(tmp_path / "none")), 151_936)
-    with pytest.raises(ConfigError, match="needs a folder"):
-        load_text_encoder(TextConfig(kind="cosmos3"), 300)
+def test_text_that_does_not_fit_the_model_is_refused(tmp_path):
     write_qwen2_tokenizer(tmp_path)
-    with pytest.raises(ConfigError, match="vocabulary is too small"):
-        load_text_encoder(TextConfig(kind="cosmos3", path=str(tmp_path)), 20)
+    for config, size, error, message in (
+        (TextConfig(), 100, ConfigError, "vocabulary is too small"),
+        (TextConfig(kind="cosmos3", path=str(tmp_path)), 20, ConfigError, "vocabulary is too small"),
+        (TextConfig(kind="cosmos3"), 300, ConfigError, "needs a folder"),
+        (TextConfig(kind="cosmos3", path=str(tmp_path / "none")), 151_936, UnavailableError, "is not here"),
+    ):
+        with pytest.raises(error, match=message):
+            load_text_encoder(config, size)
+
+
+UNUSED = [
+    f"{name}_template"
+    for name in ("inverse_duration", "image_resolution", "inverse_image_resolution", "inverse_video_resolution")
+]
+CLIP = ClipFacts(num_frames=129, fps=24.0, image_size=(480, 640))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_qwen2_tokenizer(tmp_path / "tokenizer")
+    return tmp_path / "tokenizer"
+
+
+@pytest.mark.parametrize("system_prompt", [True, False])
+def test_ids_are_those_of_diffusers(folder, system_prompt):
+    from diffusers.pipelines.cosmos.pipeline_cosmos3_omni import Cosmos3OmniPipeline
+
+    (folder.parent / "model_index.json").write_text(json.dumps({"default_use_system_prompt": system_prompt}))
+    text = Cosmos3Text(folder, system_prompt=system_prompt)
+    with pytest.raises(CheckpointError, match="system_prompt"):
+        Cosmos3Text(folder, system_prompt=not system_prompt)
+    pipeline = SimpleNamespace(
+        config=SimpleNamespace(default_use_system_prompt=system_prompt),
+        text_tokenizer=text.tokenizer,
+        llm_special_tokens={
+            "start_of_generation": text.tokenizer.convert_tokens_to_ids(VISION_START),
+            "eos_token_id": text.tokenizer.eos_token_id,
+        },
+        duration_template="The video is {duration:.1f} seconds long and is of {fps:.0f} FPS.",
+        video_resolution_template="This video is of {height}x{width} resolution.",
+        **dict.fromkeys(UNUSED, ""),
+    )
+    for instruction in ("lift the red cube.", "put it down", ""):
+        expected, _ = Cosmos3OmniPipeline.tokenize_prompt(
+            pipeline, instruction, num_frames=129, height=480, width=640, fps=24.0
+        )
+        assert text.ids(instruction, CLIP) == expected
+
+
+def test_a_long_instruction_loses_its_last_words_and_nothing_else(folder):
+    whole = Cosmos3Text(folder).ids("lift the red cube", CLIP)
+    assert Cosmos3Text(folder, max_length=len(whole)).ids("lift the red cube", CLIP) == whole
+    shorter = Cosmos3Text(folder, max_length=len(whole) - 1)
+    assert shorter.ids("lift the red cube", CLIP) == shorter.ids("lift the red", CLIP)
+    with pytest.raises(ConfigError, match="too short for the prompt's frame"):
+        Cosmos3Text(folder, max_length=10).ids("lift", CLIP)
+
+
+def test_missing_or_foreign_tokenizers_are_named(tmp_path):
+    with pytest.raises(UnavailableError, match="text tokenizer is not here"):
+        Cosmos3Text(tmp_path / "nothing")
+    write_qwen2_tokenizer(tmp_path)
+    for path in tmp_path.glob("tokenizer*.json"):
+        path.write_text(path.read_text().replace("<|vision_start|>", "<|vision_begin|>"))
+    with pytest.raises(CheckpointError, match="Not the tokenizer of a Cosmos3 model"):
+        Cosmos3Text(tmp_path)

@@ -1,10 +1,6 @@
 """The train_tokenizer step: from scratch, from another tokenizer, measured on another set."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -13,40 +9,39 @@ from tasks.train_tokenizer import train_tokenizer as tokenizer_task
 from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.tokenizers import PatchTokenizer
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
+from worldline_core.store.artifact_files import digest_folder, read_json_lines
 from worldline_core.training.train_tokenizer import train_tokenizer
 from worldline_core.training.training_config import TokenizerConfig
 
 CONFIG = TokenizerConfig(
-    image_size=(32, 32),
-    channels=8,
-    refinement_width=4,
-    refinement_depth=1,
-    held_out_episodes=1,
-    clip_frames=9,
-    fit_clips=6,
-    steps=3,
-    batch_size=1,
-)
+    image_size=(32, 32), channels=8, refinement_width=4, refinement_depth=1, held_out_episodes=1, clip_frames=9,
+    fit_clips=6, steps=3, checkpoint_every=1, batch_size=1,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def trained(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(world, tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained")
     train_tokenizer(CONFIG, {"episodes": world.episodes}, folder)
     return folder
 
 
-def test_the_step_writes_a_tokenizer_its_losses_and_its_metrics(trained: Path) -> None:
+def test_the_step_writes_a_tokenizer_its_losses_and_its_metrics(trained):
     metrics = json.loads((trained / "metrics.json").read_text())
-    assert metrics["training_episodes"] == 6
-    assert metrics["training_views"] == 18
+    assert (metrics["training_episodes"], metrics["training_views"]) == (6, 18)
     assert metrics["held_out"]["psnr/decoded"] > 10
-    rows = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
-    assert rows[-1]["step"] == 3
+    assert read_json_lines(trained / "metrics.jsonl")[-1]["step"] == 3
     assert PatchTokenizer.load(trained).latent_channels == 8
 
 
-def test_without_steps_only_the_bases_are_fitted(world: Any, tmp_path: Path) -> None:
+def test_a_killed_training_ends_with_the_same_bytes(world, trained, tmp_path, killed_after):
+    with killed_after(2):
+        train_tokenizer(CONFIG, {"episodes": world.episodes}, tmp_path)
+    train_tokenizer(CONFIG, {"episodes": world.episodes}, tmp_path)
+    assert digest_folder(tmp_path) == digest_folder(trained)
+
+
+def test_without_steps_only_the_bases_are_fitted(world, tmp_path):
     changes = {"steps": 0, "max_episodes": 2}
     counts = train_tokenizer(CONFIG.model_copy(update=changes), {"episodes": world.episodes}, tmp_path)
     assert not (tmp_path / "metrics.jsonl").exists()
@@ -56,12 +51,10 @@ def test_without_steps_only_the_bases_are_fitted(world: Any, tmp_path: Path) -> 
     assert PatchTokenizer.load(tmp_path).latent_channels == 8
 
 
-def test_a_small_decoder_is_trained_for_the_latents_of_an_existing_tokenizer(
-    world: Any, trained: Path, tmp_path: Path
-) -> None:
+def test_a_small_decoder_is_trained_for_the_latents_of_an_existing_tokenizer(world, trained, tmp_path):
     inputs = {"episodes": world.episodes, "encoder": trained}
     tokenizer_task.check_inputs(inputs)
-    before = {path.name: path.read_bytes() for path in trained.iterdir() if path.is_file()}
+    before = digest_folder(trained)
     found = [
         train_tokenizer(CONFIG.model_copy(update={"steps": steps}), inputs, tmp_path / str(steps)) for steps in (0, 12)
     ]
@@ -69,13 +62,13 @@ def test_a_small_decoder_is_trained_for_the_latents_of_an_existing_tokenizer(
     assert all(metrics["held_out"]["psnr/decoded"] > metrics["own_decoder"]["psnr/linear"] for metrics in found)
     assert found[0]["own_decoder"] == found[1]["own_decoder"]
     assert found[0]["own_decoder"]["psnr/decoded"] > 10
-    assert {path.name: path.read_bytes() for path in trained.iterdir() if path.is_file()} == before
+    assert digest_folder(trained) == before
     tokenizer = PatchTokenizer.load(trained)
     assert SmallDecoder.load(tmp_path / "12", tokenizer, tokenizer.encoder_digest[:16]).config.width == 4
     assert not (tmp_path / "12" / "tokenizer.json").exists()
 
 
-def test_a_wan_autoencoder_gets_one_too(world: Any, tmp_path: Path) -> None:
+def test_a_wan_autoencoder_gets_one_too(world, tmp_path):
     torch.manual_seed(0)
     small_wan_autoencoder().save_pretrained(tmp_path / "wan" / "vae")
     inputs = {"episodes": world.episodes, "encoder": tmp_path / "wan"}
