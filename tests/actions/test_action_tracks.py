@@ -30,15 +30,6 @@ def test_future_observations_do_not_matter(kinematics, episode):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
-def test_state_or_action_may_be_projected(kinematics, episode):
-    by_action, _ = compute_tracks(episode, kinematics, controls="action")
-    by_state, _ = compute_tracks(episode, kinematics, controls="state")
-    assert (by_action.controls, by_state.controls) == ("action", "state")
-    expected = kinematics.tool_poses(episode.state.astype(np.float64)).float().numpy()
-    np.testing.assert_allclose(by_state.T_base_tool, expected, atol=1e-6)
-    assert np.abs(by_state.T_base_tool - by_action.T_base_tool).max() > 1e-4
-
-
 def test_without_a_mount_extrinsics_are_recorded_or_solved_once(kinematics, episode):
     poses = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()
     recorded = replace(episode, T_base_ee=poses, gripper=np.ones((len(poses), 2)))

@@ -73,9 +73,7 @@ def agibot(tmp_path_factory: pytest.TempPathFactory) -> ArmKinematics:
 
 
 @pytest.fixture(scope="module")
-def kinematics_of(
-    tmp_path_factory: pytest.TempPathFactory, agibot: ArmKinematics
-) -> Callable[[Episode], ArmKinematics]:
+def kinematics_of(tmp_path_factory, agibot: ArmKinematics) -> Callable[[Episode], ArmKinematics]:
     folder = tmp_path_factory.mktemp("toy")
     body = '<body name="upper"><joint name="a" axis="0 0 1"/><body name="hand" pos="0.3 0 0"><joint name="b" axis="0 1 0"/>'
     (folder / "toy.xml").write_text(f"<mujoco><worldbody>{body}</body></body></worldbody></mujoco>")
@@ -165,9 +163,7 @@ def test_every_kind_is_here(sources: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDED))
-def test_commands_and_measurements_give_other_tracks(
-    sources: dict[str, Any], kinematics_of: Callable[[Episode], ArmKinematics], name: str
-) -> None:
+def test_commands_and_measurements_give_other_tracks(sources, kinematics_of, name):
     episode = first_episode(sources[name])
     kinematics = kinematics_of(episode)
     by_action, by_state = (compute_tracks(episode, kinematics, controls=c)[0] for c in ("action", "state"))
@@ -178,9 +174,7 @@ def test_commands_and_measurements_give_other_tracks(
 
 
 @pytest.mark.parametrize("name", sorted(NOT_COMMANDED))
-def test_commands_that_are_not_recorded_are_refused(
-    sources: dict[str, Any], kinematics_of: Callable[[Episode], ArmKinematics], name: str
-) -> None:
+def test_commands_that_are_not_recorded_are_refused(sources, kinematics_of, name):
     episode = first_episode(sources[name])
     needed = episode.state_kind == "joints" and episode.T_base_ee is None
     kinematics = kinematics_of(episode) if needed else None
@@ -220,9 +214,7 @@ def test_a_waist_that_moves_is_refused(sources: dict[str, Any], agibot: ArmKinem
         compute_tracks(one, agibot)
 
 
-def test_the_step_projects_commands_or_says_what_is_missing(
-    sources: dict[str, Any], agibot: ArmKinematics, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_step_projects_commands_or_says_what_is_missing(sources, agibot, tmp_path, monkeypatch):
     source = sources["agibot_world"].model_dump(mode="json")
     curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "set")
     inputs = {"episodes": tmp_path / "set"}

@@ -88,17 +88,6 @@ def test_tracks_of_a_resized_image_give_the_same_map(seed, scale_rows, scale_col
 
 @any_scene
 @given(SEEDS)
-def test_the_order_of_the_arms_does_not_matter(seed):
-    (tools, opening, K, cameras), size = random_scene(seed, arms=3)
-    before = project_tools(tools, opening, K, cameras, size)
-    after = project_tools(tools[:, [2, 0, 1]], opening[:, [2, 0, 1]], K, cameras, size)
-    for name in (*VALUES, "valid", "cause"):
-        torch.testing.assert_close(getattr(after, name), getattr(before, name)[:, :, [2, 0, 1]], atol=1e-12, rtol=0)
-    torch.testing.assert_close(render(after, size), render(before, size), atol=1e-12, rtol=0)
-
-
-@any_scene
-@given(SEEDS)
 def test_a_masked_sample_leaves_nothing_whatever_it_holds(seed):
     scene, size = random_scene(seed)
     batch = batch_of(project_tools(*scene, size))
