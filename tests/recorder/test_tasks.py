@@ -77,37 +77,30 @@ def test_bodies_reach_their_workspace(name: str) -> None:
 
 def test_outcomes_are_read_from_the_things(recorder: EpisodeRecorder) -> None:
     random = np.random.default_rng(0)
-    layouts = {task: layout_of(recorder, task, random) for task in TASKS}
-    lift, place, close, press, carry = (layouts[task] for task in TASKS)
-    qpos = still(recorder, lift)
-    assert judged(recorder, lift, qpos) == ("failure", "missed")
-    qpos[4:, joint_of(recorder, f"{lift.target.kind}_0") + 2] += LIFTED + 0.01
-    assert judged(recorder, lift, qpos) == ("success", "")
-    qpos = still(recorder, place)
-    assert judged(recorder, place, qpos) == ("failure", "missed")
-    address = joint_of(recorder, f"{place.target.kind}_0")
-    qpos[-1, address : address + 2] = place.goal.xy
-    assert judged(recorder, place, qpos) == ("success", "")
-    qpos = still(recorder, close)
-    assert judged(recorder, close, qpos) == ("failure", "missed")
-    qpos[-1, joint_of(recorder, "drawer_0")] = 0.5 * scene.DRAWER_TRAVEL
-    assert judged(recorder, close, qpos) == ("failure", "incomplete")
-    qpos[-1, joint_of(recorder, "drawer_0")] = 0.1 * scene.DRAWER_TRAVEL
-    assert judged(recorder, close, qpos) == ("success", "")
-    qpos = still(recorder, press)
-    assert judged(recorder, press, qpos) == ("failure", "missed")
-    qpos[-1, joint_of(recorder, "button_1")] = scene.BUTTON_TRAVEL
-    assert judged(recorder, press, qpos) == ("failure", "wrong place")
-    qpos[-1, joint_of(recorder, "button_0")] = scene.BUTTON_TRAVEL
-    assert judged(recorder, press, qpos) == ("success", "")
-    qpos = still(recorder, carry)
-    assert judged(recorder, carry, qpos) == ("failure", "missed")
-    address = joint_of(recorder, "tray_0")
-    qpos[4:, address + 2] += LIFTED + 0.01
-    assert judged(recorder, carry, qpos) == ("success", "")
+    lift, place, close, press, carry = layouts = [layout_of(recorder, task, random) for task in TASKS]
+
+    def ends(layout: Layout, joint: str, columns: slice, *values: float) -> tuple[str, str]:
+        """Outcome where the thing of this joint is elsewhere from the fourth frame on."""
+        qpos = still(recorder, layout)
+        qpos[4:, joint_of(recorder, joint) :][:, columns] = values
+        return judged(recorder, layout, qpos)
+
+    def height(layout: Layout, joint: str) -> float:
+        return still(recorder, layout)[0, joint_of(recorder, joint) + 2] + LIFTED + 0.01
+
+    for layout in layouts:
+        assert judged(recorder, layout, still(recorder, layout)) == ("failure", "missed")
+    block, thing = f"{lift.target.kind}_0", f"{place.target.kind}_0"
+    assert ends(lift, block, slice(2, 3), height(lift, block)) == ("success", "")
+    assert ends(place, thing, slice(2), *place.goal.xy) == ("success", "")
+    assert ends(close, "drawer_0", slice(1), 0.5 * scene.DRAWER_TRAVEL) == ("failure", "incomplete")
+    assert ends(close, "drawer_0", slice(1), 0.1 * scene.DRAWER_TRAVEL) == ("success", "")
+    assert ends(press, "button_1", slice(1), scene.BUTTON_TRAVEL) == ("failure", "wrong place")
+    assert ends(press, "button_0", slice(1), scene.BUTTON_TRAVEL) == ("success", "")
+    raised = height(carry, "tray_0")
+    assert ends(carry, "tray_0", slice(2, 3), raised) == ("success", "")
     # One end on the table, the other raised.
-    qpos[4:, address + 3 : address + 7] = [np.cos(0.3), np.sin(0.3), 0.0, 0.0]
-    assert judged(recorder, carry, qpos)[0] == "failure"
+    assert ends(carry, "tray_0", slice(2, 7), raised, np.cos(0.3), np.sin(0.3), 0.0, 0.0)[0] == "failure"
 
 
 def test_layouts_name_what_is_there_and_keep_things_apart(recorder: EpisodeRecorder) -> None:
