@@ -55,15 +55,13 @@ def test_episodes_are_simulations_of_recorded_starts(world: WorldLine, starts: R
     simulation = world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=1)
     assert np.array_equal(observed["pixels"]["head"], simulation.pictures[0]["head"])
     driven = commands(starts, [1], 20)[:, 0]
-    first = observed["pixels"]["head"]
-    blocks = simulation.step(driven[:16])
+    first, block = observed["pixels"]["head"], simulation.step(driven[:16])[0]["head"]
     for number, command in enumerate(driven, start=1):
         observed, reward, terminated, truncated, info = environment.step(command)
-        if number < 16:
-            assert np.array_equal(observed["pixels"]["head"], first)
+        if number < 20:
+            assert np.array_equal(observed["pixels"]["head"], first if number < 16 else block[-1])
+        if number <= 16:
             np.testing.assert_allclose(observed["agent_pos"], simulation.states[0, number - 1], atol=1e-6)
-        elif number < 20:
-            assert np.array_equal(observed["pixels"]["head"], blocks[0]["head"][-1])
         assert (reward, terminated, truncated) == (0.0, False, number == 20)
     # What was commanded until the end, the last command held.
     ended = simulation.step(np.concatenate((driven[16:], np.repeat(driven[-1:], 12, axis=0))))[0]["head"][3]
@@ -84,8 +82,6 @@ def test_pictures_may_be_asked_for_more_often(world: WorldLine, starts: Recorded
     assert np.array_equal(seen[6], simulation.pictures[0]["head"])
     assert np.array_equal(seen[14], seen[7])
     assert np.array_equal(seen[15], simulation.step(driven)[0]["head"][-1])
-    with pytest.raises(ConfigError, match=r"(?s)divisor of 16.*observe_every 5"):
-        WorldLineEnv(model=world, observe_every=5, **SHORT)
 
 
 def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: RecordedStarts) -> None:
@@ -126,18 +122,11 @@ def test_what_cannot_be_seen_is_no_success(world: WorldLine, starts: RecordedSta
         environment.step(commands(starts, [0], 1)[0][0])
 
 
-def test_episodes_begin_at_named_frames_with_what_came_before(
-    world: WorldLine, shipped: Path, starts: RecordedStarts
-) -> None:
+def test_episodes_begin_at_named_frames_with_what_came_before(world, shipped, starts):
     """The state is that of the commands so far, the judge sees the whole video, and the episode goes on as it was recorded."""
     seen: list[Trajectory] = []
     names, frames = [starts.rows[2].episode_id, starts.rows[0].episode_id], [0, 20]
-    options: dict[str, Any] = {
-        "model": world,
-        "episode_frames": 2,
-        **SHORT,
-        "success": lambda video: seen.append(video),
-    }
+    options: Any = {**SHORT, "model": world, "episode_frames": 2, "success": lambda video: seen.append(video)}
     environment = WorldLineVectorEnv(2, **options)
     observed, infos = environment.reset(seed=[3, 4], options={"start": names, "frame": frames})
     assert infos["episode_id"].tolist() == names
@@ -181,12 +170,11 @@ def test_episodes_begin_at_named_frames_with_what_came_before(
 def test_normalised_actions_are_the_robots_limits(robot: str) -> None:
     embodiment = load_embodiment(robot)
     spaces = RobotSpaces(embodiment, ["head"], (4, 6), flat=True, normalised=True)
-    grippers = (tuple(sorted((arm.gripper.closed, arm.gripper.open))) for arm in embodiment.arms)
-    limits = np.concatenate([(*arm.limits, gripper) for arm, gripper in zip(embodiment.arms, grippers, strict=True)])
+    limits = np.concatenate([[*arm.limits, sorted((arm.gripper.closed, arm.gripper.open))] for arm in embodiment.arms])
     ones = np.ones((2, embodiment.state_size))
     for action, expected in ((-1, limits[:, 0]), (1, limits[:, 1]), (0, limits.mean(axis=1))):
         np.testing.assert_array_equal(spaces.commands(action * ones, 2), np.stack([expected, expected]))
-    assert (spaces.action.low.tolist(), spaces.action.high.tolist()) == (list(-ones[0]), list(ones[0]))
+    assert (spaces.action.low == -1).all() and (spaces.action.high == 1).all()
     drawn = spaces.action.sample()
     np.testing.assert_array_equal(spaces.actions(spaces.commands(drawn)), drawn)
     units = RobotSpaces(embodiment, ["head"], (4, 6), flat=True, normalised=False)
@@ -200,9 +188,7 @@ def test_normalised_actions_are_the_robots_limits(robot: str) -> None:
     RobotSpaces(turning, ["head"], (4, 6), flat=True, normalised=False)
 
 
-def test_normalised_actions_and_flat_observations_change_the_form_alone(
-    world: WorldLine, starts: RecordedStarts
-) -> None:
+def test_normalised_actions_and_flat_observations_change_the_form_alone(world, starts):
     plain = WorldLineEnv(model=world, episode_frames=2, **SHORT)
     flat = WorldLineEnv(model=world, episode_frames=2, flat_observation=True, normalised_actions=True, **SHORT)
     for one in (plain, flat):
@@ -246,16 +232,13 @@ def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLin
 
 @pytest.mark.slow
 def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> None:
-    """Replayed in the environment, recorded episodes end as they did: 8 of the 10 first ones at least."""
-    environment = WorldLineVectorEnv(10, model=world, episode_frames=32, embodiment=ROBOT, splits=("test", "ood_test"))
-    count = min(10, len(environment.starts))
-    recorded = environment.starts.rows[:count]
+    """Replayed in the environment, recorded episodes end as they did: all of five but one at least."""
+    environment = WorldLineVectorEnv(5, model=world, episode_frames=32, embodiment=ROBOT, splits=("test", "ood_test"))
+    recorded = [row.outcome == "success" for row in environment.starts.rows]
     environment.reset(seed=0)
-    driven = commands(environment.starts, list(range(10)), 32)
-    for command in driven:
+    for command in commands(environment.starts, list(range(5)), 32):
         *_, infos = environment.step(command)
-    agree = [infos["is_success"][slot] == (row.outcome == "success") for slot, row in enumerate(recorded)]
-    assert sum(agree) >= 0.8 * count
+    assert (infos["is_success"] == recorded).sum() >= 4
 
 
 def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: RecordedStarts) -> None:
@@ -280,6 +263,8 @@ def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: RecordedStar
     for change in ({"num_envs": -1}, {"episode_frames": 2.5}, {"success": "measurd"}, {"reward": "sotf"}):
         with pytest.raises(ConfigError, match="Not an environment"):
             WorldLineVectorEnv(**{"num_envs": 2, "model": world, **SHORT, **change})
+    with pytest.raises(ConfigError, match=r"(?s)divisor of 16.*observe_every 5"):
+        WorldLineEnv(model=world, observe_every=5, **SHORT)
     for fps, reason in ((8.0, "of another split"), (10.0, "of another rate")):
         found = RecordedStarts(shipped / "recordings", view_sets=[VIEWS], fps=fps, splits=("test",))
         with pytest.raises(DataError, match=rf"(?s)of one robot.*left out.*{reason}"):

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -78,9 +78,7 @@ def policy(lerobot: Callable[..., str], project_root: Path, tmp_path_factory: py
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recording", [False, True])
-def test_lerobot_eval_runs_a_policy_inside_the_simulator(
-    lerobot: Callable[..., str], policy: Path, tmp_path: Path, recording: bool
-) -> None:
+def test_lerobot_eval_runs_a_policy_inside_the_simulator(lerobot, policy, tmp_path, recording):
     lerobot(
         tmp_path, "lerobot_eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=worldline",
         "--env.embodiment=ur5e_silver", "--env.episode_length=16",
@@ -102,9 +100,7 @@ def test_lerobot_eval_runs_a_policy_inside_the_simulator(
 
 
 @pytest.mark.slow
-def test_lerobot_eval_runs_the_same_policy_in_mujoco(
-    lerobot: Callable[..., str], policy: Path, starts: RecordedStarts, tmp_path: Path
-) -> None:
+def test_lerobot_eval_runs_the_same_policy_in_mujoco(lerobot, policy, starts, tmp_path):
     pytest.importorskip("mujoco")
     lerobot(
         tmp_path, "lerobot_eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=worldline", "--env.world=mujoco",
@@ -127,36 +123,30 @@ RECORDED = (
 )  # fmt: skip
 
 
-def check_recorded(project_root: Path, root: Path, views: tuple[str, ...], *, lossless: bool) -> list[np.ndarray]:
+def check_recorded(world: WorldLine, starts: RecordedStarts, root: Path, *, lossless: bool) -> list[np.ndarray]:
     """Each of two recorded episodes is a simulation under its commands, which are returned."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    shipped, driven = project_root / "artifacts" / "shipped", []
-    written: Any = LeRobotDataset("local/any", root=root)
+    driven, written = [], cast("Any", LeRobotDataset("local/any", root=root))
     assert (written.num_episodes, written.fps, written.meta.robot_type) == (2, 8, "worldline")
-    starts = RecordedStarts(shipped / "recordings", embodiment="ur5e_silver", splits=["test"], view_sets=[views], fps=8)
     names = [f"{name.replace('/', '_')}.pos" for name in load_embodiment("ur5e_silver").state_names]
     assert written.features["action"]["names"] == written.features["observation.state"]["names"] == names
-    world, threads = WorldLine.from_pretrained(shipped / "models" / "causal"), torch.get_num_threads()
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the command
     try:
-        for number in range(2):
-            episodes: Any = written.meta.episodes
-            first, end = (episodes[number][f"dataset_{name}_index"] for name in ("from", "to"))
-            rows: list[Any] = [written[index] for index in range(first, end)]
+        for number, episode in enumerate(written.meta.episodes):
+            rows = [written[i] for i in range(episode["dataset_from_index"], episode["dataset_to_index"])]
             assert len(rows) > 16
-            commands = torch.stack([row["action"] for row in rows]).double().numpy()
-            start = starts[number]
+            commands, start = torch.stack([row["action"] for row in rows]).double().numpy(), starts[number]
             simulation = world.start(
                 start.images, start.cameras, embodiment="ur5e_silver", state=start.state, seed=number
             )
             states = np.concatenate(([simulation.state[0]], simulation.follow(commands[None])[1][0]))[: len(rows)]
             np.testing.assert_allclose(torch.stack([row["observation.state"] for row in rows]), states, atol=1e-6)
-            seen: list[dict[str, Any]] = [simulation.pictures[0]] * 16
+            first = simulation.pictures[0]
             simulation.step(commands[:16])
-            seen += [simulation.pictures[0]]
-            for row, pictures in zip(rows, seen, strict=False):
-                for view in views:
+            for row, pictures in zip(rows, [first] * 16 + [simulation.pictures[0]], strict=False):
+                for view in VIEWS:
                     shown = 255 * row[f"observation.images.{view}"].permute(1, 2, 0).double().numpy()
                     if lossless:
                         np.testing.assert_array_equal(shown.round(), pictures[view])
@@ -168,8 +158,8 @@ def check_recorded(project_root: Path, root: Path, views: tuple[str, ...], *, lo
     return driven
 
 
-def check_replayed(project_root: Path, starts: RecordedStarts, root: Path) -> None:
-    for number, commands in enumerate(check_recorded(project_root, root, VIEWS, lossless=True)):
+def check_replayed(world: WorldLine, starts: RecordedStarts, root: Path) -> None:
+    for number, commands in enumerate(check_recorded(world, starts, root, lossless=True)):
         np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
 
 
@@ -180,42 +170,35 @@ REPLAY = (
 
 
 @pytest.mark.slow
-def test_lerobot_record_writes_what_recorded_commands_lead_to(
-    lerobot: Callable[..., str], project_root: Path, starts: RecordedStarts, tmp_path: Path
-) -> None:
+def test_lerobot_record_writes_what_recorded_commands_lead_to(lerobot, world, starts, tmp_path):
     assert "Commands come at" not in lerobot(tmp_path, "lerobot_record", *REPLAY)
-    check_replayed(project_root, starts, tmp_path / "out")
+    check_replayed(world, starts, tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_lerobot_record_goes_on_with_a_dataset(
-    lerobot: Callable[..., str], project_root: Path, starts: RecordedStarts, tmp_path: Path
-) -> None:
+def test_lerobot_record_goes_on_with_a_dataset(lerobot, world, starts, tmp_path):
     """Another command records the second episode; it begins at the second start."""
     pytest.importorskip("deepdiff", reason="--resume compares features with deepdiff, of LeRobot's core_scripts")
     asked = [option.replace("num_episodes=2", "num_episodes=1") for option in (*REPLAY, "--robot.dataset_root=out")]
     lerobot(tmp_path, "lerobot_record", *asked)
     lerobot(tmp_path, "lerobot_record", *asked, "--resume=true")
-    check_replayed(project_root, starts, tmp_path / "out")
+    check_replayed(world, starts, tmp_path / "out")
     assert len(list((tmp_path / "out" / "meta" / "cameras").iterdir())) == 2
 
 
 @pytest.mark.slow
-def test_lerobot_rollout_drives_a_policy_as_on_a_robot(
-    lerobot: Callable[..., str], project_root: Path, policy: Path, tmp_path: Path
-) -> None:
+def test_lerobot_rollout_drives_a_policy_as_on_a_robot(lerobot, policy, world, starts, tmp_path):
     lerobot(
         tmp_path, "lerobot_rollout", "--strategy.type=episodic", f"--policy.path={policy}", "--policy.device=cpu",
         "--robot.type=worldline", "--robot.dataset_root=out", "--fps=8", "--dataset.repo_id=local/rollout_act", *RECORDED,
     )  # fmt: skip
-    views = ("head", "left_wrist", "right_wrist")
-    check_recorded(project_root, tmp_path / "out", views, lossless=False)
+    check_recorded(world, starts, tmp_path / "out", lossless=False)
     # It is curated by the file that lies in it; the cameras are where the robot carried them.
     config = validate(CurateConfig, read_yaml(tmp_path / "out" / "curate.yaml")["curate"], where="curate.yaml")
     counts = curate(config, {}, tmp_path / "curated")
     assert (counts["kept"], counts["quarantined"]) == (2, 0), counts
     episodes = EpisodeSet.open(tmp_path / "curated")
-    assert all(row.stage2_ok and row.embodiment == "ur5e_silver" and row.views == views for row in episodes.rows)
+    assert all(row.stage2_ok and row.embodiment == "ur5e_silver" and row.views == VIEWS for row in episodes.rows)
     episode = episodes.episode(0)
     kinematics = ArmKinematics(load_embodiment("ur5e_silver"))
     for view, carried in kinematics.wrist_cameras_of(kinematics.link_poses(np.array(episode.state))).items():

@@ -119,9 +119,7 @@ def test_pictures_are_predicted_when_they_are_looked_at(robot: Any, replay: Any)
     assert len(robot._running.commands) == 8
 
 
-def test_pictures_may_be_observed_more_often(
-    plugin: ModuleType, robot: Any, world: WorldLine, starts: RecordedStarts
-) -> None:
+def test_pictures_may_be_observed_more_often(plugin, robot, world, starts):
     robot.config.observe_every = 8
     robot.connect()
     commands = starts.commands(0)
@@ -152,9 +150,7 @@ def test_actions_of_other_robots_are_refused(robot: Any, replay: Any) -> None:
 
 
 @pytest.mark.usefixtures("announcements")
-def test_episodes_begin_where_lerobot_announces_them(
-    robot: Any, replay: Any, world: WorldLine, starts: RecordedStarts
-) -> None:
+def test_episodes_begin_where_lerobot_announces_them(robot, replay, world, starts):
     robot.connect()
     assert starts.commands(0)[0].tolist() != starts.commands(1)[0].tolist()
     for episode in (0, 1, 1, 0):
@@ -173,9 +169,7 @@ def test_episodes_begin_where_lerobot_announces_them(
 
 
 @pytest.mark.usefixtures("announcements")
-def test_cameras_of_an_episode_are_written_into_its_dataset(
-    robot: Any, replay: Any, starts: RecordedStarts, tmp_path: Path
-) -> None:
+def test_cameras_of_an_episode_are_written_into_its_dataset(robot, replay, starts, tmp_path):
     recorded = tmp_path / "recorded"
     robot.config.dataset_root = str(recorded)
     robot.connect()
@@ -201,10 +195,7 @@ def test_cameras_of_an_episode_are_written_into_its_dataset(
 
 
 @pytest.mark.parametrize(("interval", "warned"), [(1 / 30, True), (1 / 8, False)])
-def test_commands_at_another_rate_are_told(
-    plugin: ModuleType, robot: Any, replay: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch,
-    interval: float, warned: bool,
-) -> None:  # fmt: skip
+def test_commands_at_another_rate_are_told(plugin, robot, replay, caplog, monkeypatch, interval, warned):
     robot.connect()
     clock = iter(np.arange(100) * interval)
     monkeypatch.setattr(plugin.robot.time, "perf_counter", lambda: next(clock))
