@@ -306,6 +306,7 @@ class Training:
         steps = (max(extrapolated(partial(trace, step), self.model.num_layers)) for step in self.turns)
         return max([*steps, *(held() for held in self.before)])
 
+    @cache  # noqa: B019 - a few trainings a process
     def estimate(self, devices: int) -> Estimate:
         """Memory on each of so many devices that share the training."""
         trainer, shards = self.trainer, min(self.trainer.sharding.shards or devices, devices)
