@@ -56,6 +56,14 @@ def config(**changes):
     })  # fmt: skip
 
 
+TRAJECTORIES = {"clips": 2, "clips_per_shard": 2, "substeps": [1, 1, 1, 1]}
+QUICK = {
+    "trajectory_regression": {"trainer": trainer(1), "trajectories": TRAJECTORIES},
+    "distribution_matching": {"trainer": trainer(6)},
+}
+"""For tests of the first step, or of what all steps begin with."""
+
+
 @dataclass(frozen=True)
 class Finished:
     """A distillation that nothing disturbed."""
@@ -139,7 +147,7 @@ def test_the_head_alone_is_distilled_and_said(inputs, tmp_path):
     model, info = load_checkpoint(inputs["stage2"])
     head = TrainedClips(view_sets=(("head",),), strides=(1,))
     save_checkpoint(tmp_path / "head", model, kind="stage2", action_contract=info.contract, trained=head)
-    given, alone = inputs | {"stage2": tmp_path / "head"}, config().model_copy(update={"views": ["head"]})
+    given, alone = inputs | {"stage2": tmp_path / "head"}, config(**QUICK).model_copy(update={"views": ["head"]})
     for settings, wrong in ((config(), given), (alone, inputs)):
         with pytest.raises(DataError, match=r"(?s)not trained on these views together.*distill\.views"):
             distill(settings, wrong, tmp_path / "refused")
@@ -150,7 +158,7 @@ def test_the_head_alone_is_distilled_and_said(inputs, tmp_path):
 
 def test_a_causal_model_goes_on_beside_its_teacher(finished, tmp_path, make_model):
     given = finished.inputs | {"causal": finished.output}
-    other = config().model_copy(update={"sigmas": (1.0, 0.9, 0.8, 0.6, 0.0)})
+    other = config(**QUICK).model_copy(update={"sigmas": (1.0, 0.9, 0.8, 0.6, 0.0)})
     distill(other, given, tmp_path / "out")
     before, after = read_checkpoint_info(finished.output), read_checkpoint_info(tmp_path / "out" / "teacher_forcing")
     assert after.metadata["start"] == {"kind": "causal", "weights_sha256": before.weights_sha256}
@@ -174,7 +182,7 @@ def test_a_causal_model_goes_on_beside_its_teacher(finished, tmp_path, make_mode
 
 def test_blocks_learn_from_generated_history_and_stage2_as_well(finished, tmp_path):
     forcing = {"trainer": trainer(3), "history": "generated", "teacher_share": 0.5}
-    distill(config(teacher_forcing=forcing), finished.inputs, tmp_path)
+    distill(config(teacher_forcing=forcing, **QUICK), finished.inputs, tmp_path)
     before, after = (load_checkpoint(root / "teacher_forcing")[0] for root in (finished.output, tmp_path))
     assert not torch.equal(next(before.parameters()), next(after.parameters()))
     assert read_json_lines(tmp_path / "teacher_forcing/metrics.jsonl")[-1]["validation/rollout_error"] > 0
@@ -332,20 +340,13 @@ def mixed(tmp_path_factory, make_contract):
     return {**made, "stage2": root / "stage2"}
 
 
-def views_config(kind, splits, **clips):
-    trainer = {"batch_size": 1, "precision": "fp32", "log_every": 6, "validation_batches": 1}
-    source = {"kind": kind} | ({"image_size": SIZE} if kind == "frames" else {})
-    return DistillConfig.model_validate(
-        {
-            "input": source, "clips": {"lengths": [17], **clips}, "splits": splits,
-            "validation_splits": splits[-1:], "block_size": 2,
-            "teacher_forcing": {"trainer": {**trainer, "steps": 16}},
-            "trajectory_regression": {
-                "trainer": {**trainer, "steps": 16},
-                "trajectories": {"clips": 16, "clips_per_shard": 1, "substeps": [1, 1, 1, 1]},
-            },
-            "distribution_matching": {"trainer": {**trainer, "steps": 18}},
-        }
+def views_config(kind, splits, steps=16, **clips):
+    trajectories = {"clips": steps, "clips_per_shard": 1, "substeps": [1, 1, 1, 1]}
+    return config(
+        input={"kind": kind} | ({"image_size": SIZE} if kind == "frames" else {}), clips={"lengths": [17], **clips},
+        splits=splits, validation_splits=splits[-1:], teacher_forcing={"trainer": trainer(steps, batch_size=1)},
+        trajectory_regression={"trainer": trainer(steps, batch_size=1), "trajectories": trajectories},
+        distribution_matching={"trainer": trainer(steps + 2, batch_size=1)},
     )  # fmt: skip
 
 
@@ -391,7 +392,7 @@ def test_subsets_of_complete_recordings_are_distilled_and_known(mixed, tmp_path)
 
 
 def test_a_model_that_saw_no_left_wrist_says_so(mixed, tmp_path):
-    distill(views_config("latents", ["validation"]), mixed, tmp_path)
+    distill(views_config("latents", ["validation"], steps=4), mixed, tmp_path)
     assert read_checkpoint_info(tmp_path).trained == TrainedClips(view_sets=(RIGHT,), strides=(1,))
 
 
