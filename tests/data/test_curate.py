@@ -19,7 +19,6 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap.exported import write_episode_mcap
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import ImageTransform
 
@@ -194,18 +193,6 @@ def test_views_and_calibration_can_be_demanded(tmp_path: Path, sample: Make) -> 
     assert EpisodeSet.open(tmp_path / "out").rows[0].views == ("head", "left_wrist")
     curate(config(raw), {}, tmp_path / "all")
     assert all(row.stage2_ok for row in EpisodeSet.open(tmp_path / "all").rows)  # any views, one camera at least
-
-
-def test_unsteady_frame_times_are_a_wrong_rate(tmp_path: Path, sample: Make) -> None:
-    folder = tmp_path / "raw"
-    for number, stretch in enumerate((1, 1.25)):
-        episode, frames, _ = sample(number)
-        write_episode_mcap(folder / f"{number}.mcap", replace(episode, timestamps=episode.timestamps * stretch), frames)
-    source = {"kind": "mcap", "path": str(folder)}
-    curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "out")
-    assert reasons(EpisodeSet.open(tmp_path / "out")) == {"episode-001": "wrong_fps"}
-    (row,) = EpisodeSet.open(tmp_path / "out").quarantine()
-    assert row.numbers["measured_fps"] == pytest.approx(6.4)
 
 
 @pytest.mark.parametrize("index_too", [False, True])

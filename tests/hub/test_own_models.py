@@ -19,7 +19,8 @@ SMALL = (
     "models.tokenizer=null", "models.base=null", "models.teacher=null", "models.segmenter=null",
     "train_tokenizer={channels: 8, steps: 2, fit_clips: 2, refinement_width: 8, refinement_depth: 1, batch_size: 2}",
     "train_stage1.model={latent_channels: 8, hidden_size: 32, num_heads: 2, num_layers: 2}", "train_stage2.relational=null",
-    "distill.clips={lengths: [17]}",
+    "distill.clips={lengths: [17]}", "distill.distribution_matching.trainer.steps=2",
+    "distill.distribution_matching.trainer.log_every=2",
     "curate.sources=[{kind: episode_set, path: artifacts/shipped/recordings, name: shipped, include: ["
     "ur5e_silver-test-s1-00000, ur5e_silver-train-s1-00000, ur5e_silver-train-s1-00001]}]",
 )  # fmt: skip

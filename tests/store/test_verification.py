@@ -73,7 +73,7 @@ def test_a_flipped_byte_is_named_before_it_is_used(run: Run, kind: str, tmp_path
     folder = run[kind]
     for path in [*folder_files(folder), folder / "manifest.json"]:
         size = path.stat().st_size
-        for place, position in enumerate(sorted({0, 4 * size // 5, size - 1} & set(range(size)))):
+        for place, position in enumerate(sorted({0, 4 * size // 5} & set(range(size)))):
             with flipped(path, position, 0 if path.suffix == ".json" else place):
                 with pytest.raises(ArtifactError, match="damaged") as error:
                     next_step(tmp_path, folder)
