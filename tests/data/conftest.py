@@ -1,11 +1,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
@@ -48,8 +46,3 @@ def make_sample(
         "state_names": tuple(f"{a}/{n}" for a in ("left", "right") for n in (*(f"j{i}" for i in range(6)), "gripper")),
     }  # fmt: skip
     return Episode(**(values | changes)), frames, masks  # type: ignore[arg-type]
-
-
-@pytest.fixture
-def sample() -> Callable[..., Sample]:
-    return make_sample

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.data.conftest import make_sample
 from tests.data.curating import record, run
 from tools.corrupted.conventions import written_as_moving, written_as_wxyz
 from worldline_core.data.curation.episode_checks import check_commands, check_joints, check_tool_poses
@@ -174,9 +175,6 @@ def test_kinematics_without_torch_are_those_with_it(name: str) -> None:
     np.testing.assert_allclose(tool_poses(robot, read_tree(robot), state), expected, atol=1e-12)
 
 
-Make = Callable[..., tuple]
-
-
 def test_a_wrong_reading_and_its_repair_cancel() -> None:
     rotations = Rotation.random(100, random_state=2).as_matrix()
     for write, read in ((written_as_wxyz, reread_as_wxyz), (written_as_moving, reread_as_moving)):
@@ -197,10 +195,10 @@ def sheared(poses: np.ndarray, frame: int, deviation: float) -> np.ndarray:
     return result
 
 
-def test_both_sides_of_the_threshold_show_in_the_curated_set(tmp_path: Path, sample: Make) -> None:
+def test_both_sides_of_the_threshold_show_in_the_curated_set(tmp_path: Path) -> None:
     samples = []
     for number, deviation in enumerate((0.0, 0.9e-3, 1.1e-3)):
-        episode, *pictures = sample(number)
+        episode, *pictures = make_sample(number)
         wrist = episode.cameras["left_wrist"]
         wrist = replace(wrist, T_base_camera=sheared(wrist.T_base_camera, 4, deviation))
         samples.append((replace(episode, cameras={**episode.cameras, "left_wrist": wrist}), *pictures))
@@ -218,31 +216,31 @@ def test_both_sides_of_the_threshold_show_in_the_curated_set(tmp_path: Path, sam
     assert row.numbers["rotation_deviation"] == pytest.approx(1.1e-3, rel=1e-2)
 
 
-def test_tool_poses_are_held_to_the_same(sample: Make) -> None:
+def test_tool_poses_are_held_to_the_same() -> None:
     tools = np.tile(np.eye(4), (9, 2, 1, 1))
     values = {"T_base_ee": sheared(tools, 3, 5e-4), "gripper": np.zeros((9, 2))}
-    repaired = with_rigid_poses(sample(0, **values)[0])
+    repaired = with_rigid_poses(make_sample(0, **values)[0])
     assert repaired.conventions["rotations_repaired"] == 2  # both arms of frame 3
     assert repaired.conventions["rotations_repaired_of"] == "tool poses"
     assert rotation_deviation(repaired.T_base_ee[..., :3, :3]).max() < 1e-12
     values["T_base_ee"] = sheared(tools, 3, 5e-3)
     with pytest.raises(RejectedInputError, match=r"Not a rigid transform[\s\S]*tool poses, frame 3") as caught:
-        with_rigid_poses(sample(0, **values)[0])
+        with_rigid_poses(make_sample(0, **values)[0])
     assert caught.value.reason == "invalid_tool_pose"
     assert caught.value.evidence["rotation_deviation"] == pytest.approx(5e-3, rel=1e-2)
 
 
 @pytest.mark.parametrize("track", ["state", "action"])
-def test_a_zero_quaternion_in_a_state_of_tool_poses_is_quarantined(track: str, sample: Make) -> None:
+def test_a_zero_quaternion_in_a_state_of_tool_poses_is_quarantined(track: str) -> None:
     names = tuple(f"{a}/{n}" for a in ("left", "right") for n in ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper"))
     rows = np.tile(np.array([0.1, 0.2, 0.3, 0, 0, 0, 1, 0.5] * 2, np.float32), (9, 1))
     arrays = {"state": rows.copy(), "action": rows.copy()}
     given = {"state_names": names, "state_kind": "ee_pose"}
-    whole = sample(0, **arrays, **given)[0]
+    whole = make_sample(0, **arrays, **given)[0]
     assert with_rigid_poses(whole) is whole
     arrays[track][5, 11:15] = 0
     with pytest.raises(RejectedInputError, match=rf"no direction[\s\S]*{track} right/qx, entry 5") as caught:
-        with_rigid_poses(sample(0, **arrays, **given)[0])
+        with_rigid_poses(make_sample(0, **arrays, **given)[0])
     assert caught.value.reason == "nan_state"
     assert caught.value.evidence["columns"] == ["right/qx", "right/qy", "right/qz", "right/qw"]
 

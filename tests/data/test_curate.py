@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from tests.data.conftest import make_sample
 from tests.data.curating import reasons, record, run
 from tools.corrupted import droid_annotation
 from tools.corrupted.content import NUM_FRAMES
@@ -22,16 +22,14 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import ImageTransform
 
-Make = Callable[..., tuple]
-
 
 def config(*sources: Path, **changes: Any) -> CurateConfig:
     listed = [{"kind": "episode_set", "path": str(path)} for path in sources]
     return CurateConfig.model_validate({"sources": listed, "image_size": (16, 24), "fps": 8, **changes})
 
 
-def test_labels_of_things_are_stored_and_follow_a_resize(tmp_path: Path, sample: Make) -> None:
-    episode, frames, masks = sample(0)
+def test_labels_of_things_are_stored_and_follow_a_resize(tmp_path: Path) -> None:
+    episode, frames, masks = make_sample(0)
     labels = np.zeros((9, 32, 48), np.uint8)
     labels[:, 4:8, 6:10] = 1
     labels[:, 20:22, 30:34] = 3
@@ -52,8 +50,8 @@ def test_labels_of_things_are_stored_and_follow_a_resize(tmp_path: Path, sample:
     assert np.array_equal(small, expected)  # a quarter of the first pixel is less than half of it
 
 
-def test_kept_episodes_are_resized_and_calibration_follows(tmp_path: Path, sample: Make) -> None:
-    samples = [sample(number) for number in range(2)]
+def test_kept_episodes_are_resized_and_calibration_follows(tmp_path: Path) -> None:
+    samples = [make_sample(number) for number in range(2)]
     counts = curate(config(record(tmp_path / "raw", samples)), {}, tmp_path / "out")
     assert (counts["found"], counts["kept"], counts["quarantined"], counts["reasons"]) == (2, 2, 0, {})
     curated = EpisodeSet.open(tmp_path / "out")
@@ -69,8 +67,8 @@ def test_kept_episodes_are_resized_and_calibration_follows(tmp_path: Path, sampl
     assert str(tmp_path) not in json.dumps([row.__dict__ for row in curated.rows])
 
 
-def test_inputs_override_configured_paths(tmp_path: Path, sample: Make) -> None:
-    raw = record(tmp_path / "raw", [sample(0)])
+def test_inputs_override_configured_paths(tmp_path: Path) -> None:
+    raw = record(tmp_path / "raw", [make_sample(0)])
     assert curate(config(tmp_path / "elsewhere"), {"source.0": raw}, tmp_path / "out")["kept"] == 1
     with pytest.raises(DataError, match="Source folder is missing"):
         curate(config(tmp_path / "elsewhere"), {}, tmp_path / "out2")
@@ -80,8 +78,8 @@ def with_head(episode: Episode, **changes: Any) -> Episode:
     return replace(episode, cameras={**episode.cameras, "head": replace(episode.cameras["head"], **changes)})
 
 
-def test_bad_values_are_quarantined_and_the_rest_goes_on(tmp_path: Path, sample: Make) -> None:
-    samples = [sample(number, **({"fps": 5.0} if number == 6 else {})) for number in range(9)]
+def test_bad_values_are_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None:
+    samples = [make_sample(number, **({"fps": 5.0} if number == 6 else {})) for number in range(9)]
     episodes = [episode for episode, *_ in samples]
     episodes[1].state[4, 2] = np.nan
     episodes[2].state[3, 1] = 9.0
@@ -109,8 +107,8 @@ def test_bad_values_are_quarantined_and_the_rest_goes_on(tmp_path: Path, sample:
     assert rows["episode-006"].numbers == {"wanted_fps": 8.0, "recorded_fps": 5.0}
 
 
-def test_a_truncated_video_costs_only_its_own_episodes(tmp_path: Path, sample: Make) -> None:
-    raw = record(tmp_path / "raw", [sample(number, num_frames=40) for number in range(4)])
+def test_a_truncated_video_costs_only_its_own_episodes(tmp_path: Path) -> None:
+    raw = record(tmp_path / "raw", [make_sample(number, num_frames=40) for number in range(4)])
     video = raw / "datasets/ur5e_pair/videos/observation.images.head/chunk-000/file-000.mp4"
     content = video.read_bytes()
     video.write_bytes(content[: int(len(content) * 0.7)])
@@ -125,15 +123,15 @@ def test_a_truncated_video_costs_only_its_own_episodes(tmp_path: Path, sample: M
     assert row.numbers["decoded_frames"] < 40
 
 
-def test_missing_columns_missing_files_and_robots_that_nobody_describes(tmp_path: Path, sample: Make) -> None:
+def test_missing_columns_missing_files_and_robots_that_nobody_describes(tmp_path: Path) -> None:
     """A robot is refused where a name is given, and for Stage I alone where the recording says `none`."""
     still = np.zeros((9, 16), np.float32)
     raw = record(tmp_path / "raw", [
-        sample(0),
-        sample(1, embodiment="xarm7_pair", state=still, action=still, state_names=None),
-        sample(2, embodiment="none"),
-        sample(3, embodiment="none", views=("head",)),
-        sample(4, embodiment="ur5e_pairs"),
+        make_sample(0),
+        make_sample(1, embodiment="xarm7_pair", state=still, action=still, state_names=None),
+        make_sample(2, embodiment="none"),
+        make_sample(3, embodiment="none", views=("head",)),
+        make_sample(4, embodiment="ur5e_pairs"),
     ])  # fmt: skip
     data = raw / "datasets/xarm7_pair/data/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(data).drop_columns(["action"]), data)
@@ -149,18 +147,18 @@ def test_missing_columns_missing_files_and_robots_that_nobody_describes(tmp_path
     assert "did you mean 'ur5e_pair'?" in rows["episode-004"].detail
 
 
-def test_equal_content_is_kept_once(tmp_path: Path, sample: Make) -> None:
-    copy = sample(0)
-    raw = record(tmp_path / "raw", [sample(0), (replace(copy[0], episode_id="again"), *copy[1:]), sample(1)])
-    other = record(tmp_path / "other", [sample(1)])
+def test_equal_content_is_kept_once(tmp_path: Path) -> None:
+    copy = make_sample(0)
+    raw = record(tmp_path / "raw", [make_sample(0), (replace(copy[0], episode_id="again"), *copy[1:]), make_sample(1)])
+    other = record(tmp_path / "other", [make_sample(1)])
     counts = curate(config(raw, other), {}, tmp_path / "out")
     assert (counts["found"], counts["kept"]) == (4, 2)
     gone = reasons(EpisodeSet.open(tmp_path / "out"))
     assert gone == {"episode-000": "duplicate", "episode-001#source.1": "duplicate_id"}
 
 
-def test_a_scene_in_training_and_in_test_is_an_error(tmp_path: Path, sample: Make) -> None:
-    samples = [sample(0, scene="kitchen"), sample(1, scene="kitchen", split="test")]
+def test_a_scene_in_training_and_in_test_is_an_error(tmp_path: Path) -> None:
+    samples = [make_sample(0, scene="kitchen"), make_sample(1, scene="kitchen", split="test")]
     raw = record(tmp_path / "raw", samples)
     with pytest.raises(DataError, match=r"(?s)both in train and in test.*kitchen"):
         curate(config(raw), {}, tmp_path / "out")
@@ -168,8 +166,8 @@ def test_a_scene_in_training_and_in_test_is_an_error(tmp_path: Path, sample: Mak
     assert counts["splits"] == {"test": 2}
 
 
-def test_a_multiple_of_the_rate_is_thinned(tmp_path: Path, sample: Make) -> None:
-    episode, frames, masks = sample(0)
+def test_a_multiple_of_the_rate_is_thinned(tmp_path: Path) -> None:
+    episode, frames, masks = make_sample(0)
     doubled = replace(episode, fps=16.0, timestamps=episode.timestamps / 2)
     raw = record(tmp_path / "raw", [(doubled, frames, masks)])
     curate(config(raw), {}, tmp_path / "out")
@@ -181,10 +179,10 @@ def test_a_multiple_of_the_rate_is_thinned(tmp_path: Path, sample: Make) -> None
     assert EpisodeSet.open(tmp_path / "out").frames(0, "head").shape[0] == 5
 
 
-def test_views_and_calibration_can_be_demanded(tmp_path: Path, sample: Make) -> None:
-    episode, *pictures = sample(2)
+def test_views_and_calibration_can_be_demanded(tmp_path: Path) -> None:
+    episode, *pictures = make_sample(2)
     uncalibrated = replace(episode, cameras={"head": episode.cameras["head"]})
-    raw = record(tmp_path / "raw", [sample(0), sample(1, views=("head",)), (uncalibrated, *pictures)])
+    raw = record(tmp_path / "raw", [make_sample(0), make_sample(1, views=("head",)), (uncalibrated, *pictures)])
     curate(config(raw, views=("head", "left_wrist"), require_calibration=True), {}, tmp_path / "out")
     assert reasons(EpisodeSet.open(tmp_path / "out")) == {
         "episode-001": "missing_view",
@@ -196,9 +194,9 @@ def test_views_and_calibration_can_be_demanded(tmp_path: Path, sample: Make) -> 
 
 
 @pytest.mark.parametrize("index_too", [False, True])
-def test_half_the_rate_in_the_metadata_of_a_set_is_a_wrong_rate(tmp_path: Path, sample: Make, index_too: bool) -> None:
+def test_half_the_rate_in_the_metadata_of_a_set_is_a_wrong_rate(tmp_path: Path, index_too: bool) -> None:
     """Without the check every second frame would be taken, those of the next episode among them."""
-    raw = record(tmp_path / "raw", [sample(0), sample(1)])
+    raw = record(tmp_path / "raw", [make_sample(0), make_sample(1)])
     info = raw / "datasets/ur5e_pair/meta/info.json"
     info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": 4}))
     if index_too:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.data.conftest import make_sample
 from tests.data.curating import record
 from tools.thumbnails import view_thumbnails
 from worldline_core.config import validate
@@ -27,7 +27,6 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.fingerprint import fingerprint
 from worldline_core.errors import ConfigError, DataError
 
-Make = Callable[..., tuple]
 SIZE = (64, 96)
 
 
@@ -235,8 +234,8 @@ def test_shares_are_met_and_new_scenes_move_no_old_one() -> None:
     assert sum(drawn_split(scene, other) != drawn[scene] for scene in scenes) > 1000
 
 
-def test_patterns_come_first_and_declared_splits_stay(sample: Make) -> None:
-    episode = sample(0)[0]
+def test_patterns_come_first_and_declared_splits_stay() -> None:
+    episode = make_sample(0)[0]
     splits = DrawnSplits(by="scene", test=0, validation=0, patterns={"lab*": "test"})
     assert with_split(replace(episode, scene="laboratory", split="train"), splits).split == "test"
     assert with_split(replace(episode, split="test"), splits).split == "train"

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.data.conftest import make_sample
 from tests.data.curating import files_of
 from worldline_core.data.episodes.episode import ARRAYS, EpisodeDescription
 from worldline_core.data.episodes.episode_index import read_index, write_index
@@ -21,8 +21,6 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.frames import packed_images, unpacked_images
 from worldline_core.errors import DataError
 
-Make = Callable[..., tuple]
-
 
 def write(root: Path, samples: list[tuple]) -> EpisodeSet:
     with EpisodeSetWriter(root, video_crf=10) as writer:
@@ -32,8 +30,8 @@ def write(root: Path, samples: list[tuple]) -> EpisodeSet:
     return EpisodeSet.open(root)
 
 
-def test_what_is_written_is_read_back(tmp_path: Path, sample: Make) -> None:
-    samples = [sample(number) for number in range(3)]
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    samples = [make_sample(number) for number in range(3)]
     stored = write(tmp_path / "set", samples)
     assert len(stored) == 3
     for i, (episode, frames, masks) in enumerate(samples):
@@ -56,17 +54,17 @@ def test_what_is_written_is_read_back(tmp_path: Path, sample: Make) -> None:
     assert (rejected.episode_id, rejected.reason, rejected.numbers) == ("broken", "nan_state", {"frame": 3})
 
 
-def test_bytes_depend_on_the_episodes_alone(tmp_path: Path, sample: Make) -> None:
-    samples = [sample(number) for number in range(3)]
+def test_bytes_depend_on_the_episodes_alone(tmp_path: Path) -> None:
+    samples = [make_sample(number) for number in range(3)]
     write(tmp_path / "a", samples)
     write(tmp_path / "b", samples[::-1])
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
-    write(tmp_path / "c", [sample(0), sample(1), sample(7)])
+    write(tmp_path / "c", [make_sample(0), make_sample(1), make_sample(7)])
     assert files_of(tmp_path / "a") != files_of(tmp_path / "c")
 
 
-def test_a_killed_writer_continues_to_the_same_bytes(tmp_path: Path, sample: Make) -> None:
-    samples = [sample(number) for number in range(3)]
+def test_a_killed_writer_continues_to_the_same_bytes(tmp_path: Path) -> None:
+    samples = [make_sample(number) for number in range(3)]
     write(tmp_path / "undisturbed", samples)
     EpisodeSetWriter(tmp_path / "killed", video_crf=10).add(*samples[1])
     parts = tmp_path / "killed/run/episodes/parts"
@@ -86,8 +84,8 @@ def test_a_killed_writer_continues_to_the_same_bytes(tmp_path: Path, sample: Mak
         EpisodeSetWriter(tmp_path / "killed")
 
 
-def test_segments_cut_every_array(tmp_path: Path, sample: Make) -> None:
-    samples = [sample(number) for number in range(2)]
+def test_segments_cut_every_array(tmp_path: Path) -> None:
+    samples = [make_sample(number) for number in range(2)]
     stored = write(tmp_path / "curated", samples)
     linked = {"start": 2, "stop": 7, "num_frames": 5, "video_frames": 5, "dataset": "../curated/datasets/ur5e_pair"}
     write_index(tmp_path / "filtered", [replace(stored.rows[1], **linked)])
@@ -111,8 +109,8 @@ def test_segments_cut_every_array(tmp_path: Path, sample: Make) -> None:
     assert EpisodeSet.open(tmp_path / "elsewhere/filtered").frames(0, "head").shape == (5, 32, 48, 3)
 
 
-def test_foreign_index_rows_cannot_leave_the_folder(tmp_path: Path, sample: Make) -> None:
-    write(tmp_path / "set", [sample(0)])
+def test_foreign_index_rows_cannot_leave_the_folder(tmp_path: Path) -> None:
+    write(tmp_path / "set", [make_sample(0)])
     rows = read_index(tmp_path / "set")
     for path, message in (("../../etc", "outside of the dataset folder"), (os.fspath(tmp_path), "absolute path")):
         write_index(tmp_path / "set", [replace(rows[0], dataset=path)])
@@ -120,11 +118,11 @@ def test_foreign_index_rows_cannot_leave_the_folder(tmp_path: Path, sample: Make
             EpisodeSet.open(tmp_path / "set", allow_linked=False).episode(0)
 
 
-def test_states_without_images_are_kept_and_the_record_is_stored_whole(tmp_path: Path, sample: Make) -> None:
+def test_states_without_images_are_kept_and_the_record_is_stored_whole(tmp_path: Path) -> None:
     """Every field that the record declares comes back; a field that is added to it is stored without another line."""
     poses = np.tile(np.eye(4), (9, 2, 1, 1))
     poses[:, :, 0, 3] = np.arange(18).reshape(9, 2) / 7
-    episode, frames, _ = sample(
+    episode, frames, _ = make_sample(
         0, T_base_ee=poses, gripper=np.linspace(0, 1, 18).reshape(9, 2), video_frames=4, bank="b", candidate=3,
         primary_view="left_wrist", conventions={"layout": "x", "n": 3},
     )  # fmt: skip
@@ -143,11 +141,11 @@ def test_states_without_images_are_kept_and_the_record_is_stored_whole(tmp_path:
         stored.frames(0, "head", [4])
 
 
-def test_different_robots_get_datasets_of_their_own(tmp_path: Path, sample: Make) -> None:
+def test_different_robots_get_datasets_of_their_own(tmp_path: Path) -> None:
     with EpisodeSetWriter(tmp_path / "set") as writer:
-        writer.add(*sample(0))
-        writer.add(*sample(1, embodiment="xarm7_pair"))
-        writer.add(*sample(2, views=("head", "right_wrist")))
+        writer.add(*make_sample(0))
+        writer.add(*make_sample(1, embodiment="xarm7_pair"))
+        writer.add(*make_sample(2, views=("head", "right_wrist")))
     stored = EpisodeSet.open(tmp_path / "set")
     assert [row.dataset for row in stored.rows] == ["datasets/ur5e_pair", "datasets/xarm7_pair", "datasets/ur5e_pair_2"]
     assert stored.rows[2].views == ("head", "right_wrist")
@@ -160,9 +158,9 @@ def test_different_robots_get_datasets_of_their_own(tmp_path: Path, sample: Make
         stored.position("absent")
 
 
-def test_labels_of_more_than_a_gigabyte_are_read_image_by_image(tmp_path: Path, sample: Make) -> None:
+def test_labels_of_more_than_a_gigabyte_are_read_image_by_image(tmp_path: Path) -> None:
     """Eight images are written of the 4000 that the table declares: going on beyond them is what is refused."""
-    episode, frames, masks = sample(0)
+    episode, frames, masks = make_sample(0)
     with EpisodeSetWriter(tmp_path / "set") as writer:
         writer.add(episode, frames, masks, thing_labels={"head": masks["head"].astype(np.uint8)})
     (path,) = tmp_path.rglob("thing_labels.parquet")
@@ -180,9 +178,9 @@ def test_labels_of_more_than_a_gigabyte_are_read_image_by_image(tmp_path: Path, 
         next(images)
 
 
-def test_what_does_not_belong_together_is_refused(tmp_path: Path, sample: Make) -> None:
+def test_what_does_not_belong_together_is_refused(tmp_path: Path) -> None:
     writer = EpisodeSetWriter(tmp_path / "set")
-    episode, frames, masks = sample(0)
+    episode, frames, masks = make_sample(0)
     short = masks["head"][:4]
     smaller = replace(episode, cameras={**episode.cameras, "head": episode.cameras["head"].resized(96, 64)})
     for given, message in (
@@ -205,9 +203,9 @@ def test_what_does_not_belong_together_is_refused(tmp_path: Path, sample: Make) 
 @pytest.mark.parametrize(
     ("field", "value"), [("scene", 3), ("fps", "fast"), ("state_names", "left"), ("candidate", "one")]
 )
-def test_a_description_of_another_type_is_refused(sample: Make, field: str, value: object) -> None:
-    described = sample(0)[0].described()
-    assert EpisodeDescription.arguments(described)["state_names"] == sample(0)[0].state_names
+def test_a_description_of_another_type_is_refused(field: str, value: object) -> None:
+    described = make_sample(0)[0].described()
+    assert EpisodeDescription.arguments(described)["state_names"] == make_sample(0)[0].state_names
     with pytest.raises(ValueError, match=field):
         EpisodeDescription.arguments({**described, field: value})
 

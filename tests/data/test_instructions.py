@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
+from tests.data.conftest import make_sample
 from worldline_core.data.episodes.instructions import (
     RAW_INSTRUCTION,
     mentions_outcome,
@@ -49,8 +49,8 @@ def test_of_several_annotations_the_majority_counts() -> None:
     assert one_annotation(["n/a", " "]) == one_annotation([]) == ""
 
 
-def test_the_raw_text_is_kept_where_it_differs(sample: Callable[..., tuple]) -> None:
-    changed = with_instruction(replace(sample(0)[0], instruction="Lift the block.", conventions={"layout": "x"}))
+def test_the_raw_text_is_kept_where_it_differs() -> None:
+    changed = with_instruction(replace(make_sample(0)[0], instruction="Lift the block.", conventions={"layout": "x"}))
     assert changed.instruction == "lift the block"
     assert changed.conventions == {"layout": "x", RAW_INSTRUCTION: "Lift the block."}
     assert with_instruction(changed) is changed

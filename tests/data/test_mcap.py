@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from mcap_ros2.reader import read_ros2_messages
 from scipy.spatial.transform import Rotation
 
+from tests.data.conftest import make_sample
 from tests.data.curating import run
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -28,8 +28,6 @@ from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.sources.open import undistorted
 from worldline_core.errors import DataError
 from worldline_core.geometry.lens import Distortion
-
-Make = Callable[..., tuple]
 
 
 def tools() -> np.ndarray:
@@ -43,9 +41,9 @@ def tools() -> np.ndarray:
 
 
 @pytest.mark.parametrize("encoding", ["protobuf", "ros2"])
-def test_an_episode_comes_back_as_it_was(tmp_path: Path, sample: Make, encoding: Encoding) -> None:
+def test_an_episode_comes_back_as_it_was(tmp_path: Path, encoding: Encoding) -> None:
     gripper = np.linspace(0, 1, 18).reshape(9, 2)
-    episode, frames, masks = sample(0, T_base_ee=tools(), gripper=gripper, conventions={"layout": "x", "n": 3})
+    episode, frames, masks = make_sample(0, T_base_ee=tools(), gripper=gripper, conventions={"layout": "x", "n": 3})
     for name in ("a.mcap", "b.mcap"):
         write_episode_mcap(tmp_path / name, episode, frames, robot_masks=masks, encoding=encoding)
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
@@ -67,9 +65,9 @@ def test_an_episode_comes_back_as_it_was(tmp_path: Path, sample: Make, encoding:
         assert getattr(read.episode, name) == getattr(episode, name)
 
 
-def test_ros_2_decoders_read_the_export(tmp_path: Path, sample: Make) -> None:
+def test_ros_2_decoders_read_the_export(tmp_path: Path) -> None:
     """Read by the decoder of mcap-ros2-support alone; `fixed` is a camera that stays."""
-    episode, frames, masks = sample(0, T_base_ee=tools(), gripper=np.zeros((9, 2)))
+    episode, frames, masks = make_sample(0, T_base_ee=tools(), gripper=np.zeros((9, 2)))
     fixed = replace(episode.cameras["head"], T_base_camera=episode.cameras["head"].T_base_camera[:1])
     episode = replace(episode, cameras={**episode.cameras, "head": fixed})
     write_episode_mcap(tmp_path / "a.mcap", episode, frames, masks, encoding="ros2")
@@ -103,9 +101,9 @@ def test_ros_2_decoders_read_the_export(tmp_path: Path, sample: Make) -> None:
     assert np.allclose(Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix(), fixed.T_base_camera[0, :3, :3])
 
 
-def test_protobuf_decoders_read_the_export(tmp_path: Path, sample: Make) -> None:
+def test_protobuf_decoders_read_the_export(tmp_path: Path) -> None:
     """Read by the decoder of mcap-protobuf-support, and by the classes that Foxglove publishes."""
-    episode, frames, _ = sample(0, T_base_ee=tools(), gripper=np.zeros((9, 2)))
+    episode, frames, _ = make_sample(0, T_base_ee=tools(), gripper=np.zeros((9, 2)))
     write_episode_mcap(tmp_path / "a.mcap", episode, frames)
     found: dict[str, list] = {}
     with (tmp_path / "a.mcap").open("rb") as stream:
@@ -125,8 +123,8 @@ def test_protobuf_decoders_read_the_export(tmp_path: Path, sample: Make) -> None
     assert np.allclose([tool.translation.x, tool.translation.y, tool.translation.z], tools()[0, 1, :3, 3])
 
 
-def test_a_rollout_is_exported(tmp_path: Path, sample: Make) -> None:
-    episode, frames, _ = sample(0)
+def test_a_rollout_is_exported(tmp_path: Path) -> None:
+    episode, frames, _ = make_sample(0)
     about = {"metadata": {"method": "stage2", "seed": "42"}, "cameras": episode.cameras, "T_base_ee": tools()}
     for name in ("a.mcap", "b.mcap"):
         write_rollout_mcap(tmp_path / name, frames, 8.0, **about)  # type: ignore[arg-type]
@@ -178,9 +176,9 @@ def seen_through(lens: Distortion | None, camera: CameraTrack) -> tuple[np.ndarr
     return x, y
 
 
-def distorted_sample(make: Make, lens: Distortion | None) -> tuple:
+def distorted_sample(lens: Distortion | None) -> tuple:
     """The sample episode whose head camera looks at the scene through the lens."""
-    episode, frames, masks = make(0, height=HEIGHT, width=WIDTH)
+    episode, frames, masks = make_sample(0, height=HEIGHT, width=WIDTH)
     head = replace(episode.cameras["head"], K=K)
     x, y = seen_through(lens, head)
     frames["head"] = np.repeat(scene(x, y).round().astype(np.uint8)[None], len(frames["head"]), axis=0)
@@ -214,9 +212,9 @@ def off_from_scene(curated: EpisodeSet) -> float:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_a_distorted_mcap_is_curated_into_a_pinhole_recording(tmp_path: Path, sample: Make, model: str) -> None:
+def test_a_distorted_mcap_is_curated_into_a_pinhole_recording(tmp_path: Path, model: str) -> None:
     lens = LENSES[model]
-    episode, frames, masks = distorted_sample(sample, lens)
+    episode, frames, masks = distorted_sample(lens)
     path = tmp_path / "mcap" / "0.mcap"
     write_mcap_of_lens(path, episode, frames, masks, lens=lens)
     assert read_exported_episode(McapFile(path)).distortions == {"head": lens}
@@ -233,9 +231,9 @@ def test_a_distorted_mcap_is_curated_into_a_pinhole_recording(tmp_path: Path, sa
 
 
 @pytest.mark.parametrize("fit", ["stretch", "letterbox", "crop"])
-def test_undistortion_and_every_fit_agree_with_k(tmp_path: Path, sample: Make, fit: str) -> None:
+def test_undistortion_and_every_fit_agree_with_k(tmp_path: Path, fit: str) -> None:
     lens = LENSES["plumb_bob"]
-    episode, frames, masks = distorted_sample(sample, lens)
+    episode, frames, masks = distorted_sample(lens)
     path = tmp_path / "mcap" / "0.mcap"
     write_mcap_of_lens(path, episode, frames, masks, lens=lens)
     curated = curated_mcap(tmp_path, image_size=(64, 64), fit=fit)
@@ -250,8 +248,8 @@ def test_undistortion_and_every_fit_agree_with_k(tmp_path: Path, sample: Make, f
     assert camera.K[0, 0] / camera.K[1, 1] == pytest.approx(ratio, rel=0.02)
 
 
-def test_unusable_lenses_are_quarantined_with_their_numbers(tmp_path: Path, sample: Make) -> None:
-    episode, frames, _ = distorted_sample(sample, None)
+def test_unusable_lenses_are_quarantined_with_their_numbers(tmp_path: Path) -> None:
+    episode, frames, _ = distorted_sample(None)
     folds = Distortion("radtan", (-0.9, 0.1, 0.0, 0.0))
     write_episode_mcap(tmp_path / "mcap" / "0.mcap", episode, frames)
     second = replace(episode, episode_id="folds", state=episode.state + 0.01)
@@ -268,24 +266,24 @@ def test_unusable_lenses_are_quarantined_with_their_numbers(tmp_path: Path, samp
     assert "double_sphere" in rows["unknown"].detail
 
 
-def loaded(sample: Make, **changes: Any) -> LoadedEpisode:
-    episode, frames, masks = distorted_sample(sample, LENSES["plumb_bob"])
+def loaded(**changes: Any) -> LoadedEpisode:
+    episode, frames, masks = distorted_sample(LENSES["plumb_bob"])
     values = {"distortions": {"head": LENSES["plumb_bob"]}, **changes}
     episode = replace(episode, cameras=values.pop("cameras", episode.cameras))
     return LoadedEpisode(episode, tuple(frames), frames.__getitem__, masks.get, **values)
 
 
-def test_a_lens_needs_a_camera_matrix_of_the_images_own_size(sample: Make) -> None:
+def test_a_lens_needs_a_camera_matrix_of_the_images_own_size() -> None:
     with pytest.raises(RejectedInputError, match=r"lens is stated for a view without a camera matrix[\s\S]*view top"):
-        undistorted(loaded(sample, distortions={"top": LENSES["plumb_bob"]}))
-    episode = distorted_sample(sample, None)[0]
+        undistorted(loaded(distortions={"top": LENSES["plumb_bob"]}))
+    episode = distorted_sample(None)[0]
     smaller = episode.cameras["head"].resized(80, 60)
-    wrong = undistorted(loaded(sample, cameras={**episode.cameras, "head": smaller}))
+    wrong = undistorted(loaded(cameras={**episode.cameras, "head": smaller}))
     with pytest.raises(RejectedInputError, match=r"another size than their lens[\s\S]*60x80[\s\S]*120x160"):
         wrong.frames("head")
     singular = replace(episode.cameras["head"], K=np.diag([95.0, 0.0, 1.0]))
     with pytest.raises(RejectedInputError, match="cannot be inverted") as caught:
-        undistorted(loaded(sample, cameras={**episode.cameras, "head": singular}))
+        undistorted(loaded(cameras={**episode.cameras, "head": singular}))
     assert caught.value.reason == "singular_intrinsics"
-    untouched = loaded(sample, distortions={})
+    untouched = loaded(distortions={})
     assert undistorted(untouched) is untouched

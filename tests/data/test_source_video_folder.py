@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.data import curating
+from tests.data.conftest import make_sample
 from tests.data.curating import reasons, record, run
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.render_actions import render_actions
@@ -177,7 +178,7 @@ def test_a_state_without_columns_is_none_and_only_that() -> None:
             Episode(**about, state=values, action=values, state_kind=kind)
 
 
-def test_from_a_folder_of_videos_to_the_clips_of_stage_1(tmp_path: Path, project_root: Path, sample: Any) -> None:
+def test_from_a_folder_of_videos_to_the_clips_of_stage_1(tmp_path: Path, project_root: Path) -> None:
     """Together with a robot's recording: Stage I takes both, Stage II and the action tracks the robot's alone."""
     import torch
 
@@ -190,7 +191,7 @@ def test_from_a_folder_of_videos_to_the_clips_of_stage_1(tmp_path: Path, project
     write_video(root / "moving.mp4", pictures(1))
     (root / "moving.txt").write_text("push the red block")
     write_video(root / "still.mp4", pictures(2, moving=False))
-    record(robot, [sample(0, num_frames=FRAMES, height=HEIGHT, width=WIDTH)])
+    record(robot, [make_sample(0, num_frames=FRAMES, height=HEIGHT, width=WIDTH)])
     counts, episodes = run(tmp_path, settings(root), {"kind": "episode_set", "path": str(robot)})
     assert counts["kept"] == 3
 

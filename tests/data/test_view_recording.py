@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ from worldline_core.data.video.thumbnails import ThumbnailMaker, shrunk
 from worldline_core.filters.filter import examine
 from worldline_core.filters.filter_config import FilterConfig
 
-Make = Callable[..., tuple]
 FRAMES = 40
 Copied = tuple[dict[str, Any], dict[str, Any], EpisodeSet]
 
@@ -208,8 +207,8 @@ def test_a_recorded_size_that_is_none_is_refused(noted: str) -> None:
     assert caught.value.reason == "unreadable"
 
 
-def test_too_few_or_too_many_images_are_refused(tmp_path: Path, sample: Make) -> None:
-    _, frames, _ = sample(0)
+def test_too_few_or_too_many_images_are_refused(tmp_path: Path) -> None:
+    _, frames, _ = make_sample(0)
     images = frames["head"]
     for count in (len(images) - 1, len(images) + 1):
         recorded = RecordedView(lambda: iter(images), count)
@@ -220,8 +219,8 @@ def test_too_few_or_too_many_images_are_refused(tmp_path: Path, sample: Make) ->
         store_view(RecordedView(lambda: iter(()), 3), tmp_path / "v.mp4", 8.0, VideoSettings())
 
 
-def test_a_source_without_clips_gives_its_images_one_by_one(sample: Make) -> None:
-    episode, frames, _ = sample(0)
+def test_a_source_without_clips_gives_its_images_one_by_one() -> None:
+    episode, frames, _ = make_sample(0)
     asked: list[int] = []
 
     def images(view: str) -> Iterator[np.ndarray]:
