@@ -62,8 +62,7 @@ def write_split(folder: Path, listed: str) -> None:
     (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  version: 5\n  {listed}\n")
 
 
-@pytest.mark.parametrize("place", ["bags/run", "."])
-@pytest.mark.parametrize("prefix", ["", "run/"])
+@pytest.mark.parametrize(("place", "prefix"), [("bags/run", ""), (".", "run/")])
 def test_a_split_bag_is_one_recording(tmp_path: Path, place: str, prefix: str) -> None:
     toy.robot().write(tmp_path / "whole" / "a.mcap")
     root = tmp_path / "split"
@@ -75,9 +74,8 @@ def test_a_split_bag_is_one_recording(tmp_path: Path, place: str, prefix: str) -
     assert len(opened.episode_ids()) == 2
     loaded = opened.load(name)
     assert np.array_equal(loaded.episode.state, whole.episode.state)
-    assert np.array_equal(
-        loaded.episode.cameras["right_wrist"].T_base_camera, whole.episode.cameras["right_wrist"].T_base_camera
-    )
+    found, expected = (each.episode.cameras["right_wrist"].T_base_camera for each in (loaded, whole))
+    assert np.array_equal(found, expected)
     assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(90))
     ranges = toy.declared(root, episodes={"by": "ranges", "ranges": [{"name": "x", "start_s": 1.0, "stop_s": 2.0}]})
     assert source(ranges).load(f"{name}-x").episode.num_frames == pytest.approx(30, abs=1)
