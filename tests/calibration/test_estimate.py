@@ -57,6 +57,7 @@ def test_a_camera_is_made_exact_from_a_start_nearby(bank: Loaded, kinematics: Ar
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("rendering")
 def test_a_still_camera_is_found_and_bad_sets_are_unsure(tmp_path: Path) -> None:
     hidden_cameras.record("xarm7_white", tmp_path, 8, 0)
     loaded = hidden_cameras.read_set(tmp_path / "xarm7_white_0.json")
@@ -76,11 +77,30 @@ def test_what_cannot_be_estimated_is_named(bank: Loaded, kinematics: ArmKinemati
     for episodes, reason in ((bank[:2], "2 episodes"), (benchmark.SPOILED["still"](bank), "not enough motion")):
         (found,) = estimate_views(iter(episodes), kinematics, len(episodes))
         assert found.camera is None and reason in found.reasons[0]
+
+
+def without_mounts(kinematics: ArmKinematics) -> ArmKinematics:
     arms = [arm.model_copy(update={"wrist_camera": None}) for arm in kinematics.embodiment.arms]
-    bare = ArmKinematics(kinematics.embodiment.model_copy(update={"arms": tuple(arms)}))
+    return ArmKinematics(kinematics.embodiment.model_copy(update={"arms": tuple(arms)}))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("rendering")
+def test_a_wrist_camera_is_found_where_no_description_mounts_it(
+    tmp_path: Path, bank: Loaded, kinematics: ArmKinematics
+) -> None:
+    hidden_cameras.record("xarm7_single", tmp_path, 8, 0)
+    loaded = [
+        (e, {"right_wrist": f["right_wrist"]}) for e, f in hidden_cameras.read_set(tmp_path / "xarm7_single_0.json")
+    ]
+    robot = ArmKinematics(load_embodiment("xarm7_single"))
+    (found,) = estimate_views(iter(loaded), without_mounts(robot), len(loaded))
+    assert found.verdict == "sure", found.reasons
+    tools = np.concatenate([robot.tool_poses(episode.state.astype(np.float64)).numpy() for episode, _ in loaded])
+    assert benchmark.estimate_errors(found, loaded[0][0].cameras["right_wrist"], tools, 0)["tool"] < 4
     wrist = [(episode, {"left_wrist": frames["head"]}) for episode, frames in bank[:3]]
-    (found,) = estimate_views(iter(wrist), bare, 3)
-    assert found.camera is None and "wrist_camera" in found.reasons[0]
+    (found,) = estimate_views(iter(wrist), without_mounts(kinematics), 3)
+    assert found.verdict == "unsure" and "mount" in found.notes[0], "a still camera is no wrist camera"
 
 
 def test_sure_cameras_are_read_back_as_a_calibration_file(tmp_path, bank, kinematics):

@@ -424,9 +424,10 @@ class WristView:
         self.camera, self.differences = camera, _STEPS
         self._steps: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         shows = (motion.texture > MIN_TEXTURE) & (motion.change > MIN_CHANGE)
-        shows &= ~_covered(camera, hand, radii, shows.shape)
+        shows &= ~covered_cells(camera, hand, radii, shows.shape)
         step, row, column = np.nonzero(shows)
-        self.step, self.flow = step, motion.flow[step, row, column].astype(np.float64)
+        self.step, self.row, self.column = step, row, column
+        self.flow = motion.flow[step, row, column].astype(np.float64)
         _, self._first, self._of, count = np.unique(step, return_index=True, return_inverse=True, return_counts=True)
         self.share = np.minimum(1.0, MOST_CELLS_A_STEP / count)[self._of]
         self.uv = cell_centres(camera.height, camera.width)[row, column]
@@ -443,6 +444,12 @@ class WristView:
         """The same cells, compared with the flow that another camera predicts; its place on the hand is a parameter, too."""
         other = copy(self)
         other.camera, other._steps, other.differences = camera, {}, _STEPS_AND_PLACE
+        return other
+
+    def without(self, covered: np.ndarray) -> WristView:
+        """The same view, in which some cells (r, c) of all steps count nothing."""
+        other = copy(self)
+        other.share = self.share * ~covered[self.row, self.column]
         return other
 
     def agreement(self, lag: float) -> np.ndarray:
@@ -537,7 +544,7 @@ def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.nda
     return turns, delayed(relative[:, :3, 3], frames)
 
 
-def _covered(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def covered_cells(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Bool (n, r, c): cells hidden by these points (n + 1, p, 3) at either end of a step, with a margin."""
     rows, columns = (np.arange(count) * CELL_PX + (CELL_PX - 1) / 2 for count in shape[1:])
     hidden = np.zeros((shape[0] + 1, *shape[1:]), dtype=bool)

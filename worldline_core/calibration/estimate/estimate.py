@@ -68,12 +68,10 @@ def _estimate(recorded: RecordedView, kinematics: ArmKinematics) -> ViewEstimate
     reason = too_few(recorded)
     if reason is None and arm is None:
         reason = too_little(recorded)
-    elif reason is None and mount is None:
-        reason = "the robot's description mounts no camera here: add about where (`wrist_camera`, docs/embodiments.md)"
     if reason is not None:
         count = len(recorded.episodes)
         return ViewEstimate(recorded.view, arm is not None, "unsure", None, reasons=(reason,), episodes=count)
-    if arm is not None and mount is not None:
+    if arm is not None:
         return judge_wrist(recorded, estimate_wrist(recorded, arm, mount))
     return judge_still(recorded, estimate_still(recorded))
 

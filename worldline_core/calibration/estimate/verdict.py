@@ -31,7 +31,7 @@ from worldline_core.calibration.estimate.still_camera import (
     tools_apart,
     tools_in_view,
 )
-from worldline_core.calibration.estimate.wrist_camera import WristCamera
+from worldline_core.calibration.estimate.wrist_camera import LEAST_WRIST_AGREEMENT, WristCamera
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import Resize, project_points
 
@@ -46,7 +46,7 @@ MIRRORED_GAIN = -20.0
 """Log-likelihood above which mirrored pictures cannot be told apart; of usual sets it is -90 to -260."""
 LEAST_IN_VIEW = 0.1
 SHARED_WRIST_CAMERA = 1.5
-LEAST_WRIST_AGREEMENT, FEWEST_FINGER_STEPS = 0.3, 20
+FEWEST_FINGER_STEPS = 20
 LARGEST_WRIST_HALVES_APART, LARGEST_WRIST_INTERVAL = 0.05, 10.0
 """The same of wrist cameras, which are nearer to what they see."""
 FEWEST_EPISODES = 3
@@ -137,8 +137,7 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     if found.rival is not None and found.rival_agreements is not None:
         apart = 100 * tools_apart(fitted.camera, found.rival.camera, recorded)
         gain = found.agreements - found.rival_agreements
-        deviations = float(gain.mean() / max(gain.std(ddof=1) / np.sqrt(len(gain)), 1e-6))
-        if deviations < RIVAL_DEVIATIONS:
+        if (deviations := _deviations(gain)) < RIVAL_DEVIATIONS:
             reasons.append(
                 f"another camera, {apart:.0f} % of the width away, fits as well ({deviations:.1f} deviations)"
             )
@@ -179,15 +178,21 @@ def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
         recorded.view, np.zeros(PARAMETERS), information, SHARED_WRIST_CAMERA, shown, len(recorded.episodes)
     )
     reasons: list[str] = []
-    known = found.agreements[np.isfinite(found.agreements)]
-    typical = float(np.median(known)) if len(known) else 0.0
-    if len(known) < FEWEST_EPISODES:
-        reasons.append(f"the scene's motion is seen in {len(known)} episodes, {FEWEST_EPISODES} needed")
+    typical, known = found.agreement, int(np.isfinite(found.agreements).sum())
+    if known < FEWEST_EPISODES:
+        reasons.append(f"the scene's motion is seen in {known} episodes, {FEWEST_EPISODES} needed")
     elif typical < LEAST_WRIST_AGREEMENT:
         reasons.append(
             f"the scene does not move as the hand does (agreement {typical:.2f}, {LEAST_WRIST_AGREEMENT} needed): the"
-            " states, the robot or the arm are others, or the mount is far from the described one"
+            " states, the robot or the arm are others, or the view is no wrist camera of this arm"
         )
+    if found.rival_agreements is not None:
+        deviations = _deviations(found.agreements - found.rival_agreements)
+        if deviations < RIVAL_DEVIATIONS:
+            reasons.append(
+                f"a camera that is mounted otherwise fits as well ({deviations:.1f} deviations): describe about where it is"
+                " (`wrist_camera`, docs/embodiments.md)"
+            )
     if found.fingers < FEWEST_FINGER_STEPS:
         reasons.append(
             f"the fingers move in {found.fingers} pictures, {FEWEST_FINGER_STEPS} needed to see where the tool is"
@@ -222,8 +227,15 @@ def _estimate(
         intervals=error.kinds,
         agreement=typical,
         reasons=tuple(reasons),
+        notes=("the mount was searched: the description has none, or another one",) if found.searched else (),
         episodes=len(recorded.episodes),
     )
+
+
+def _deviations(gain: np.ndarray) -> float:
+    """By how many standard deviations the gains (e,) in agreement lie above 0 in the mean; NaN are left out."""
+    known = gain[np.isfinite(gain)]
+    return float(known.mean() / max(known.std(ddof=1) / np.sqrt(len(known)), 1e-6)) if len(known) > 1 else 0.0
 
 
 def full_size(camera: CameraTrack, image_size: tuple[int, int]) -> CameraTrack:

@@ -17,24 +17,39 @@ import numpy as np
 from worldline_core.calibration.camera_errors import (
     HAND_REACH_M,
     LAG,
+    NEAR_M,
     PARAMETERS,
     Equations,
     StillView,
     WristView,
+    covered_cells,
 )
+from worldline_core.calibration.estimate.mount_search import mounts_around
 from worldline_core.calibration.estimate.recordings import RecordedView, ViewOfEpisode, certainty
 from worldline_core.calibration.estimate.refine import LAG_PRIOR, FittedCamera, climb
 from worldline_core.calibration.evidence import MIN_OPENING_STEP
 from worldline_core.calibration.observation import tool_travel
 from worldline_core.data.episodes.episode import CameraTrack
-from worldline_core.geometry.transforms import rigid_inverse
+from worldline_core.geometry.cameras import project_points
+from worldline_core.geometry.transforms import pose_from_rotation, rigid_inverse, rotation_angle
+from worldline_core.pictures import evenly_spaced
 
+FRAMES_OF_SIGHT, HIDDEN_BEHIND_M, STILL_M = 6, 0.005, 1e-3
+"""Frames in which it is looked at what the hand hides of itself, how far behind another point one is hidden, and the palm's motion."""
 AT_REST_M = 0.012
 """Travel of a tool in a step in which the fingers' own flow is seen, unhidden by the scene's."""
-MOUNT_PRIOR = np.array([0.25] * 3 + [0.04] * 3)
-"""Standard deviations from a described mount [rad, m]."""
-WRIST_FOCALS = (0.5, 0.75, 1.1)
-"""Starts, in widths of the picture: 90, 67 and 49 degrees across."""
+MOUNT_PRIOR, SEARCHED_PRIOR = np.array([0.25] * 3 + [0.04] * 3), np.array([1.0] * 3 + [0.05] * 3)
+"""Standard deviations from a described mount, and from one that was searched [rad, m]."""
+WRIST_FOCALS, SEARCHED_FOCALS = (0.5, 0.75, 1.1), (0.5, 0.85)
+"""Starts, in widths of the picture: 90, 67 and 49 degrees across; and of a search, in which every mount is seen with each."""
+LEAST_WRIST_AGREEMENT = 0.3
+"""Share of the scene's flow, in the median of held-out episodes, that a camera must explain."""
+EPISODES_OF_STARTS, FOLLOWED = 5, 6
+"""Episodes in which starts are compared, and how many starts of a search are followed."""
+MOST_COVERED, BLIND = 0.7, pose_from_rotation(np.array([0.0, 0.0, 9.0]), np.eye(3))
+"""Share of the picture that the hand may cover in a search; a camera far ahead of the hand, which it never sees."""
+RIVAL_APART, RIVAL_TURNED = 0.05, 0.15
+"""A rival shows the tool elsewhere [widths], or is turned against the best camera [rad]."""
 WRIST_FOCAL_PRIOR = 0.5
 ROUNDS, BLURS = 8, (1.8, 1.0)
 
@@ -48,11 +63,15 @@ class WristEvidence:
     fingers: StillView | None
     finger_steps: int
 
-    def agreement(self, fitted: FittedCamera) -> float:
+    def agreement(self, camera: CameraTrack, lag: float) -> float:
         """Share of the scene's flow that a camera explains, by the logarithms of errors; NaN where nothing is seen."""
-        carried = replace(fitted.camera, T_base_camera=self.tools @ fitted.camera.T_base_camera)
-        left, none = self.scene.at(carried).agreement(fitted.lag)
+        left, none = self.scene_errors(camera, lag)
         return 1.0 - float(left / none) if none > 0 else float("nan")
+
+    def scene_errors(self, camera: CameraTrack, lag: float) -> np.ndarray:
+        """(2,) sums of the logarithms of errors of the scene's flow, as a camera explains it and unexplained."""
+        carried = replace(camera, T_base_camera=self.tools @ camera.T_base_camera)
+        return self.scene.at(carried).agreement(lag)
 
     def at(self, camera: CameraTrack, lag: float, blur: float) -> Equations:
         theta = np.zeros(PARAMETERS)
@@ -71,29 +90,60 @@ class WristEvidence:
         )
 
 
-def wrist_evidence(recorded: RecordedView, arm: int, start: CameraTrack) -> list[WristEvidence]:
-    """The evidence of each episode; cells near the hand, as seen from `start`, are left out of the scene."""
-    return [_evidence(episode, recorded, arm, start) for episode in recorded.episodes]
+def wrist_evidence(recorded: RecordedView, arm: int, seen_from: CameraTrack) -> list[WristEvidence]:
+    """The evidence of each episode, without what the hand hides from a camera."""
+    return [_evidence(episode, recorded, arm, seen_from) for episode in recorded.episodes]
 
 
-def _evidence(episode: ViewOfEpisode, recorded: RecordedView, arm: int, start: CameraTrack) -> WristEvidence:
+def _evidence(episode: ViewOfEpisode, recorded: RecordedView, arm: int, seen_from: CameraTrack) -> WristEvidence:
     tools = episode.tools[:, arm]
-    T_tool_base = rigid_inverse(tools)
-    distance = np.linalg.norm(episode.points - tools[:, None, :3, 3], axis=-1)
-    near = np.median(distance, axis=0) < HAND_REACH_M
-    hand = episode.points[:, near]
-    carried = replace(start, T_base_camera=tools @ start.T_base_camera)
-    scene = WristView(carried, episode.rough_gray, episode.rough, hand, episode.radii[near])
+    near = _near_hand(episode, arm)
+    hand, radii = episode.points[:, near], episode.radii[near]
+    carried = replace(seen_from, T_base_camera=tools @ seen_from.T_base_camera)
+    scene = WristView(carried, episode.rough_gray, episode.rough, hand, radii)
     fingers, moves = None, np.zeros(0, dtype=bool)
     if episode.gripper is not None:
         moves = np.abs(np.diff(episode.gripper[:, arm])) > MIN_OPENING_STEP
         moves &= tool_travel(episode.tools)[:, arm] < AT_REST_M
         if moves.any():
-            in_tool = np.einsum("nij,npj->npi", T_tool_base[:, :3, :3], hand) + T_tool_base[:, None, :3, 3]
-            camera = recorded.unknown_camera(fine=True)
-            fingers = StillView(camera, in_tool, episode.radii[near], episode.fine, certainty(episode.fine))
+            points = _in_tool(hand, tools)
+            seen = _seen(points, radii, seen_from)
+            still = recorded.unknown_camera(fine=True)
+            fingers = StillView(still, points[:, seen], radii[seen], episode.fine, certainty(episode.fine))
             fingers.measured[~moves] = 0.0
     return WristEvidence(tools, scene, fingers, int(moves.sum()))
+
+
+def _near_hand(episode: ViewOfEpisode, arm: int) -> np.ndarray:
+    """(p,) bool: which points of the robot belong to the hand."""
+    distance = np.linalg.norm(episode.points - episode.tools[:, arm, None, :3, 3], axis=-1)
+    return np.median(distance, axis=0) < HAND_REACH_M
+
+
+def _in_tool(points: np.ndarray, tools: np.ndarray) -> np.ndarray:
+    """Points (n, p, 3) in the frames of tools (n, 4, 4)."""
+    T_tool_base = rigid_inverse(tools)
+    return np.einsum("nij,npj->npi", T_tool_base[:, :3, :3], points) + T_tool_base[:, None, :3, 3]
+
+
+def _seen(points: np.ndarray, radii: np.ndarray, camera: CameraTrack) -> np.ndarray:
+    """(p,) bool: which of the hand's points (n, p, 3) are seen from a camera in most frames: no other point hides them, and the
+    palm does not, which is what stands still in the tool's frame.
+    """
+    palm = np.ptp(points, axis=0).max(axis=-1) < STILL_M
+    seen = np.zeros(len(radii))
+    chosen = points[evenly_spaced(len(points), FRAMES_OF_SIGHT)]
+    for hand in chosen:
+        uv, depth = project_points(hand, camera.K, camera.T_base_camera)
+        reach = np.maximum(1.0, camera.K[0, 0] * radii / np.maximum(depth, NEAR_M))
+        beside = np.linalg.norm(uv[:, None] - uv, axis=-1) < reach
+        nearer = (depth > NEAR_M) & (depth < depth[:, None] - HIDDEN_BEHIND_M)
+        hidden = (beside & nearer).any(axis=1)
+        for i in np.flatnonzero(~hidden & ~palm):
+            before = uv[palm & nearer[i]].astype(np.float32)
+            hidden[i] = len(before) > 2 and cv2.pointPolygonTest(cv2.convexHull(before), uv[i].tolist(), False) >= 0
+        seen += ~hidden
+    return seen > len(chosen) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,28 +153,110 @@ class WristCamera:
     Attributes:
         agreements: (e,) of each episode with the camera of the half that it does not belong to; NaN where it shows nothing.
         fingers: number of steps in which the fingers' own motion is seen.
+        searched: whether the mount was searched, not described.
+        rival: the best camera of a search that is mounted otherwise.
+        rival_agreements: (e,) of each episode with the rival; NaN as above.
     """
 
     fitted: FittedCamera
     halves: tuple[FittedCamera, ...]
     agreements: np.ndarray
     fingers: int
+    searched: bool = False
+    rival: FittedCamera | None = None
+    rival_agreements: np.ndarray | None = None
+
+    @property
+    def agreement(self) -> float:
+        """The median of the episodes that show something; 0 where none does."""
+        known = self.agreements[np.isfinite(self.agreements)]
+        return float(np.median(known)) if len(known) else 0.0
 
 
-def estimate_wrist(recorded: RecordedView, arm: int, T_tool_mount: np.ndarray) -> WristCamera:
-    """The camera of a wrist view, from where the description mounts it about; its focal length is not known at all."""
-    starts = [mounted(recorded, T_tool_mount, focal) for focal in WRIST_FOCALS]
-    evidence = wrist_evidence(recorded, arm, starts[1])
-    few = evidence[:: max(1, len(evidence) // 5)]
-    rough = [fit_wrist(few, start, 0.0, start) for start in starts]
-    best = max(rough, key=lambda fit: fit.likelihood)
-    prior_at = starts[1]
-    # Cells that the hand covers are known better now.
-    evidence = wrist_evidence(recorded, arm, best.camera)
-    best = fit_wrist(evidence, best.camera, best.lag, prior_at)
-    halves = tuple(fit_wrist(evidence[i::2], best.camera, best.lag, prior_at) for i in (0, 1))
-    agreements = np.array([each.agreement(halves[1 - i % 2]) for i, each in enumerate(evidence)])
+def estimate_wrist(recorded: RecordedView, arm: int, T_tool_mount: np.ndarray | None) -> WristCamera:
+    """The camera of a wrist view, from where the description mounts it about; from all around the hand where it says nothing,
+    or what it says does not fit. The focal length is not known at all.
+    """
+    few = recorded.of(recorded.episodes[:: max(1, len(recorded.episodes) // EPISODES_OF_STARTS)])
+    if T_tool_mount is not None:
+        starts = [mounted(recorded, T_tool_mount, focal) for focal in WRIST_FOCALS]
+        evidence = wrist_evidence(few, arm, starts[1])
+        rough = [fit_wrist(evidence, start, 0.0, starts[1], MOUNT_PRIOR) for start in starts]
+        best = max(rough, key=lambda fit: fit.likelihood)
+        found = _made_exact(recorded, arm, best, starts[1], MOUNT_PRIOR)
+        if found.agreement >= LEAST_WRIST_AGREEMENT:
+            return found
+    starts = _searched_starts(few, arm)
+    rough = [(each, fit_wrist(each, start, 0.0, start, SEARCHED_PRIOR)) for start, each in starts]
+    distinct = _distinct(rough)
+    # The hand hides something else from each of them: they are compared by what the first one sees, in all episodes.
+    common = wrist_evidence(recorded, arm, distinct[0].camera)
+    fits = [fit_wrist(common, fit.camera, fit.lag, fit.camera, SEARCHED_PRIOR) for fit in distinct]
+    fits.sort(key=lambda fit: -fit.likelihood)
+    found = _made_exact(recorded, arm, fits[0], fits[0].camera, SEARCHED_PRIOR)
+    rival = next((fit for fit in fits[1:] if _apart(fit.camera, found.fitted.camera)), None)
+    if rival is None:
+        return replace(found, searched=True)
+    against = wrist_evidence(recorded, arm, rival.camera)
+    rival = fit_wrist(against, rival.camera, rival.lag, rival.camera, SEARCHED_PRIOR)
+    if not _apart(rival.camera, found.fitted.camera):
+        return replace(found, searched=True)
+    agreements = np.array([each.agreement(rival.camera, rival.lag) for each in against])
+    return replace(found, searched=True, rival=rival, rival_agreements=agreements)
+
+
+def _made_exact(
+    recorded: RecordedView, arm: int, rough: FittedCamera, prior_at: CameraTrack, prior: np.ndarray
+) -> WristCamera:
+    """A rough camera fitted to all episodes, and to each half of them; cells that the hand hides are known now."""
+    evidence = wrist_evidence(recorded, arm, rough.camera)
+    best = fit_wrist(evidence, rough.camera, rough.lag, prior_at, prior)
+    halves = tuple(fit_wrist(evidence[i::2], best.camera, best.lag, prior_at, prior) for i in (0, 1))
+    others = [halves[1 - i % 2] for i in range(len(evidence))]
+    agreements = np.array([e.agreement(other.camera, other.lag) for e, other in zip(evidence, others, strict=True)])
     return WristCamera(best, halves, agreements, sum(each.finger_steps for each in evidence))
+
+
+def _searched_starts(few: RecordedView, arm: int) -> list[tuple[CameraTrack, list[WristEvidence]]]:
+    """The cameras around the hand that explain the scene's flow best, the best first, and what they see."""
+    blind = mounted(few, BLIND, 1.0)  # nothing of the hand is hidden from it
+    evidence = wrist_evidence(few, arm, blind)
+    near = _near_hand(few.episodes[0], arm)
+    hands = [_in_tool(e.points[:, near], e.tools[:, arm]).mean(axis=0) for e in few.episodes]
+    hand, radii = np.mean(hands, axis=0), few.episodes[0].radii[near]
+    cells = few.episodes[0].rough.change.shape[1:]
+    scored = []
+    for T in mounts_around(hand):
+        for focal in SEARCHED_FOCALS:
+            camera = mounted(few, T, focal)
+            twice = replace(camera, T_base_camera=np.repeat(camera.T_base_camera, 2, axis=0))
+            covered = covered_cells(twice, np.stack([hand, hand]), radii, (1, *cells))[0]
+            if covered.mean() < MOST_COVERED:
+                seen = [replace(each, scene=each.scene.without(covered)) for each in evidence]
+                scored.append((explained(seen, camera), camera))
+    best = sorted(scored, key=lambda each: -each[0])[:FOLLOWED]
+    return [(camera, wrist_evidence(few, arm, camera)) for _, camera in best]
+
+
+def explained(evidence: Sequence[WristEvidence], camera: CameraTrack) -> float:
+    """Share of the scene's flow of all episodes together that a camera explains, without a lag."""
+    left, none = np.sum([each.scene_errors(camera, 0.0) for each in evidence], axis=0)
+    return 1.0 - float(left / none) if none > 0 else 0.0
+
+
+def _distinct(rough: Sequence[tuple[list[WristEvidence], FittedCamera]]) -> list[FittedCamera]:
+    """Cameras that are mounted apart, those that explain most of what they see first."""
+    kept: list[FittedCamera] = []
+    for _, fit in sorted(rough, key=lambda each: -explained(each[0], each[1].camera)):
+        if all(_apart(fit.camera, other.camera) for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def _apart(one: CameraTrack, other: CameraTrack) -> bool:
+    places = [project_points(np.zeros((1, 3)), c.K, c.T_base_camera)[0][0] / c.width for c in (one, other)]
+    turned = one.T_base_camera[0, :3, :3].T @ other.T_base_camera[0, :3, :3]
+    return bool(np.linalg.norm(places[0] - places[1]) > RIVAL_APART or rotation_angle(turned) > RIVAL_TURNED)
 
 
 def mounted(recorded: RecordedView, T_tool_camera: np.ndarray, focal: float) -> CameraTrack:
@@ -135,9 +267,13 @@ def mounted(recorded: RecordedView, T_tool_camera: np.ndarray, focal: float) -> 
     return replace(camera, K=K, T_base_camera=T_tool_camera[None])
 
 
-def fit_wrist(evidence: Sequence[WristEvidence], start: CameraTrack, lag: float, prior_at: CameraTrack) -> FittedCamera:
-    """The camera that explains all episodes best from a start, with the prior of its pose around another."""
-    return climb(lambda camera, lag, blur: _equations(evidence, camera, lag, blur, prior_at), start, lag, BLURS, ROUNDS)
+def fit_wrist(
+    evidence: Sequence[WristEvidence], start: CameraTrack, lag: float, prior_at: CameraTrack, prior: np.ndarray
+) -> FittedCamera:
+    """The camera that explains all episodes best from a start; `prior` are the standard deviations of its pose from another's."""
+    return climb(
+        lambda camera, lag, blur: _equations(evidence, camera, lag, blur, prior_at, prior), start, lag, BLURS, ROUNDS
+    )
 
 
 def _equations(
@@ -146,6 +282,7 @@ def _equations(
     lag: float,
     blur: float,
     prior_at: CameraTrack,
+    prior: np.ndarray,
 ) -> Equations:
     """Normal equations of all episodes at a camera, with the priors."""
     found = [each.at(camera, lag, blur) for each in evidence]
@@ -156,7 +293,7 @@ def _equations(
     towards = np.concatenate([cv2.Rodrigues(apart[:3, :3])[0][:, 0], apart[:3, 3]])
     focal = float(np.log(camera.K[0, 0] / prior_at.K[0, 0]))
     towards = np.append(towards, [-focal, -lag])
-    weight = np.append(MOUNT_PRIOR, [WRIST_FOCAL_PRIOR, LAG_PRIOR]) ** -2.0
+    weight = np.append(prior, [WRIST_FOCAL_PRIOR, LAG_PRIOR]) ** -2.0
     return Equations(
         information + np.diag(weight), gradient + weight * towards, likelihood - float(weight @ towards**2) / 2
     )
