@@ -27,7 +27,6 @@ SMALL = (
 WANTED = (
     "curate", "filter", "render_actions", "train_tokenizer", "encode_latents", "train_stage1", "train_stage2", "distill",
 )  # fmt: skip
-EPISODE = "ur5e_silver-test-s1-00000"
 
 
 @pytest.fixture(scope="module")
