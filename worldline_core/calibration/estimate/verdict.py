@@ -206,7 +206,8 @@ def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
     interval = error.kinds[-1].half_interval
     if interval > LARGEST_WRIST_INTERVAL:
         reasons.append(f"the tool's place in the picture is known to {interval:.1f} % of the width only")
-    return _estimate(recorded, fitted, error, typical, reasons, wrist=True)
+    notes = ("the mount was searched: the description has none, or another one",) if found.searched else ()
+    return replace(_estimate(recorded, fitted, error, typical, reasons, wrist=True), notes=notes)
 
 
 def _estimate(
@@ -227,7 +228,6 @@ def _estimate(
         intervals=error.kinds,
         agreement=typical,
         reasons=tuple(reasons),
-        notes=("the mount was searched: the description has none, or another one",) if found.searched else (),
         episodes=len(recorded.episodes),
     )
 
