@@ -20,6 +20,7 @@ import numpy as np
 from worldline_core.calibration.evidence import MIN_CHANGE, MIN_IMAGE_PAIRS, MIN_TEXTURE, observable_views
 from worldline_core.calibration.observation import (
     CELL_PX,
+    LONGEST_STEP_PX,
     Motion,
     Observation,
     Reading,
@@ -38,7 +39,7 @@ LAG = PARAMETERS - 1
 NUISANCE_PRIOR = np.array([0.3, 0.5, 0.5])
 """Standard deviations of the nuisance parameters: thickness of the links, factors on the predicted flow and change."""
 EDGE_CELLS = 0.35
-NEAR_M, MIN_STEP_PX, STILL_STEP_PX, LONGEST_STEP_PX = 0.03, 0.3, 0.05, 20.0
+NEAR_M, MIN_STEP_PX, STILL_STEP_PX = 0.03, 0.3, 0.05
 NOISE_CHANGE = 2.0
 MIN_CELLS = 60
 SAMPLE_CELLS_STILL, SAMPLE_CELLS_WRIST = 90.0, 2.5
@@ -255,11 +256,9 @@ class StillView:
         if key not in self._maps:  # the start is evaluated with more than one blur
             self._maps[key] = self._predicted(theta)
         value, shift, growth, cover = self._maps[key]
-        if blur not in self._by_blur:
-            self._by_blur[blur] = _blurred(self.measured, blur)
-        measured, value = self._by_blur[blur], _blurred(value, blur)
+        measured, value = self._blurred(blur), _blurred(value, blur)
         active = (cover > 0.1) | (np.abs(measured).max(axis=-1) > 0.3)
-        down, across = np.gradient(value, axis=(1, 2))
+        down, across = (np.moveaxis(each, -1, 0).copy() for each in np.gradient(value, axis=(1, 2)))
         columns = np.arange(size)
         information, gradient, likelihood = np.zeros((size + 2, size + 2)), np.zeros(size + 2), 0.0
         for gain_index, channels in ((size, (0, 1)), (size + 1, (2,))):
@@ -267,16 +266,17 @@ class StillView:
             predicted, seen = (trust[..., None] * each[..., channels] for each in (value, measured))
             gain = max(float((predicted * seen).sum()) / max(float((predicted**2).sum()), 1e-9), 0.05)
             error, cells = seen - gain * predicted, float((trust**2 * active).sum())
-            weight = 1.0 / max(float((error**2).sum()) / max(cells, 1.0), 1e-9)
-            left_open = float((error**2).sum()) / max(float((seen**2).sum()), 1e-9)
+            squares = float((error**2).sum())
+            weight = 1.0 / max(squares / max(cells, 1.0), 1e-9)
+            left_open = squares / max(float((seen**2).sum()), 1e-9)
             likelihood -= len(channels) * cells / 2 * np.log(max(left_open, 1e-9))
             for c, channel in enumerate(channels):
-                slope = -gain * (
-                    across[..., channel, None] * shift[..., 0, :] + down[..., channel, None] * shift[..., 1, :]
-                )
+                slope = across[channel] * shift[0]
+                slope += down[channel] * shift[1]
+                slope *= -gain
                 if channel < 2:
-                    slope[..., :-1] += gain * cover[..., None] * growth[..., channel, :]
-                slope = (trust[..., None] * slope).reshape(-1, len(columns))
+                    slope[:-1] += gain * cover * growth[channel]
+                slope = np.ascontiguousarray((trust * slope).reshape(size, -1).T)
                 scaled = gain * predicted[..., c].reshape(-1)
                 residual = error[..., c].reshape(-1)
                 information[np.ix_(columns, columns)] += weight * (slope.T @ slope)
@@ -294,22 +294,25 @@ class StillView:
         theta = np.zeros(PARAMETERS)
         theta[LAG] = lag
         value = self._predicted(theta)[0]
-        if blur not in self._by_blur:
-            self._by_blur[blur] = _blurred(self.measured, blur)
-        seen, value = self._by_blur[blur][..., :2], _blurred(value, blur)[..., :2]
+        seen, value = self._blurred(blur)[..., :2], _blurred(value, blur)[..., :2]
         if self.certainty is not None:
             seen, value = (np.sqrt(self.certainty)[..., None] * each for each in (seen, value))
         return np.array([(value * seen).sum(), (value**2).sum(), (seen**2).sum()], dtype=np.float64)
 
+    def _blurred(self, blur: float) -> np.ndarray:
+        if blur not in self._by_blur:
+            self._by_blur[blur] = _blurred(self.measured, blur)
+        return self._by_blur[blur]
+
     def shown(self, theta: np.ndarray) -> np.ndarray:
         """(2, k) mean displacement of the robot in the picture by each parameter [% of the width]; none by the lag."""
         _, _, ahead, slope = projected(self.points, moved_camera(self.camera, theta))
-        mean = slope[ahead].mean(axis=0) if ahead.any() else np.zeros((2, LAG))
+        mean = slope[:, :, ahead].mean(axis=-1) if ahead.any() else np.zeros((2, LAG))
         return 100 / self.camera.width * np.c_[mean, np.zeros(2)]
 
     def _predicted(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Maps in cells: motion (n, r, c, 3), shift by each of k parameters and the links' thickness
-        (n, r, c, 2, k + 1) [cells], growth of the step by each parameter (n, r, c, 2, k) [px], cover (n, r, c)."""
+        (2, k + 1, n, r, c) [cells], growth of the step by each parameter (2, k, n, r, c) [px], cover (n, r, c)."""
         camera = moved_camera(self.camera, theta)
         uv, depth, ahead, slope = projected(self.points, camera)
         uv = delayed(uv, float(theta[LAG]))
@@ -318,68 +321,83 @@ class StillView:
         alive = ahead[1:] & ahead[:-1] & (length > STILL_STEP_PX)
         kept = (length * alive).max(axis=0) > MIN_STEP_PX
         count, (rows, columns) = len(step), self.measured.shape[1:3]
-        value, cover = np.zeros((count, rows, columns, 3), np.float32), np.zeros((count, rows, columns), np.float32)
-        shift = np.zeros((count, rows, columns, 2, PARAMETERS + 1), np.float32)
-        growth = np.zeros((count, rows, columns, 2, PARAMETERS), np.float32)
-        if not kept.any():  # nothing of the robot moves before such a camera
-            return value, shift, growth, cover
         step, length, alive = step[:, kept].astype(np.float32), length[:, kept].astype(np.float32), alive[:, kept]
         start = ((uv[:-1, kept] - (CELL_PX - 1) / 2) / CELL_PX).astype(np.float32)
         reach = (camera.K[0, 0] * self.radii[kept] / depth[:-1, kept] / CELL_PX).astype(np.float32)
         faster = np.gradient(step, axis=0) if len(step) > 1 else 0 * step
-        slope = slope[:, kept]
-        moves = np.concatenate([(slope[:-1] + slope[1:]) / 2, -step[..., None]], axis=-1)
-        grows = np.concatenate([np.diff(slope, axis=0), -faster[..., None]], axis=-1)
+        slope = slope[:, :, :, kept]
         # A cell takes from the points near it their step, and how the parameters move the step's start and change the step.
         # Where several points meet, the fastest one counts most.
         weight = (length + 0.1) ** 2
-        taken = np.concatenate([step[..., None], moves / CELL_PX, grows], axis=-1).reshape(*step.shape[:2], -1)
-        taken = np.concatenate([taken * weight[..., None], weight[..., None]], axis=-1).astype(np.float32)
+        taken = np.empty((2, 1 + 2 * PARAMETERS, *length.shape), np.float32)
+        np.multiply(np.moveaxis(step, -1, 0), weight, out=taken[:, 0])
+        np.multiply((slope[:, :, :-1] + slope[:, :, 1:]) / 2 / CELL_PX, weight, out=taken[:, 1:PARAMETERS])
+        np.multiply(np.moveaxis(-step, -1, 0) / CELL_PX, weight, out=taken[:, PARAMETERS])
+        np.multiply(np.diff(slope, axis=2), weight, out=taken[:, 1 + PARAMETERS : -1])
+        np.multiply(np.moveaxis(-faster, -1, 0), weight, out=taken[:, -1])
+        taken = np.concatenate([taken.reshape(-1, *length.shape), weight[None]])
         thickness, way = (weight * reach).astype(np.float32), step / CELL_PX
         square = (way**2).sum(axis=-1, keepdims=True) + 1e-6
         lines = np.concatenate([way, -(start * way).sum(axis=-1, keepdims=True)], axis=-1) / square
         row, column = np.mgrid[:rows, :columns].reshape(2, -1).astype(np.float32)
         cells = np.stack([column, row, np.ones_like(row)])
+        found = np.zeros((len(taken), count, len(row)), np.float32)
+        thicker, cover = np.zeros((2, count, len(row)), np.float32), np.zeros((count, len(row)), np.float32)
+        # New arrays at each step would cost as much as the arithmetic.
+        planes = np.empty((5, length.shape[1], len(row)), np.float32)
         for i in range(count):
             on = np.flatnonzero(alive[i])
             if not len(on):
                 continue
+            x, y, along, inside, other = planes[:, : len(on)]
             (across, down), far = way[i, on].T[..., None], start[i, on].T[..., None]
-            along = lines[i, on] @ cells  # (p, m): the place on a point's step that is nearest to a cell
+            np.matmul(lines[i, on], cells, out=along)  # the place on a point's step that is nearest to a cell
             np.clip(along, 0.0, 1.0, out=along)
-            x, y = column - far[0], row - far[1]
-            x -= along * across
-            y -= along * down
-            distance = np.sqrt(x * x + y * y)
-            inside = (distance - reach[i, on, None]) / EDGE_CELLS
-            inside = 1.0 / (1.0 + np.exp(np.clip(inside, -20.0, 20.0, out=inside), out=inside))
-            covered = (1.0 - np.prod(1.0 - inside, axis=0)).reshape(rows, columns)
-            found = inside.T @ taken[i, on]
-            total = found[:, -1:] + 1e-9
+            np.subtract(column, far[0], out=x)
+            x -= np.multiply(along, across, out=other)
+            np.subtract(row, far[1], out=y)
+            y -= np.multiply(along, down, out=other)
+            np.multiply(x, x, out=along)
+            along += np.multiply(y, y, out=other)
+            distance = np.sqrt(along, out=along)
+            np.subtract(distance, reach[i, on, None], out=inside)
+            inside /= EDGE_CELLS
+            np.exp(np.clip(inside, -20.0, 20.0, out=inside), out=inside)
+            inside += 1.0
+            np.divide(1.0, inside, out=inside)
+            np.subtract(1.0, np.prod(np.subtract(1.0, inside, out=other), axis=0), out=cover[i])
+            np.matmul(taken[:, i, on], inside, out=found[:, i])
             inside /= np.clip(distance, 0.3, None, out=distance)
-            thicker = np.stack([thickness[i, on] @ np.multiply(inside, away, out=away) for away in (x, y)], axis=-1)
-            shift[i, ..., -1] = (thicker / total).reshape(rows, columns, 2)
-            found = (found[:, :-1] / total).reshape(rows, columns, 2, -1)
-            motion = found[..., 0]
-            cover[i] = covered
-            value[i, ..., :2] = covered[..., None] * motion
-            value[i, ..., 2] = covered * np.log1p(np.minimum(lengths(motion), LONGEST_STEP_PX))
-            shift[i, ..., :-1], growth[i] = found[..., 1 : 1 + PARAMETERS], found[..., 1 + PARAMETERS :]
-        return value, shift, growth, cover
+            for axis, away in enumerate((x, y)):
+                thicker[axis, i] = thickness[i, on] @ np.multiply(inside, away, out=other)
+        total = found[-1] + 1e-9
+        thicker /= total
+        found = (found[:-1] / total).reshape(2, -1, count, rows, columns)
+        cover = cover.reshape(count, rows, columns)
+        motion = found[:, 0]
+        value = np.empty((count, rows, columns, 3), np.float32)
+        np.multiply(cover, motion, out=np.moveaxis(value, -1, 0)[:2])
+        speed = np.log1p(np.minimum(lengths(np.moveaxis(motion, 0, -1)), LONGEST_STEP_PX))
+        np.multiply(cover, speed, out=value[..., 2])
+        shift = np.concatenate([found[:, 1 : 1 + PARAMETERS], thicker.reshape(2, 1, count, rows, columns)], axis=1)
+        return value, shift, found[:, 1 + PARAMETERS :], cover
 
 
 def projected(points: np.ndarray, camera: CameraTrack) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels (n, p, 2), depth and visibility (n, p), and the pixels' derivatives by the camera's parameters (n, p, 2, k - 1)."""
+    """Pixels (n, p, 2), depth and visibility (n, p), and the pixels' derivatives by the camera's parameters (2, k - 1, n, p)."""
     pose, K = camera.T_base_camera[0], camera.K
     seen = (points - pose[:3, 3]) @ pose[:3, :3]
     ahead = seen[..., 2] > NEAR_M
     depth = np.where(ahead, seen[..., 2], 1.0)
     x, y = seen[..., 0] / depth, seen[..., 1] / depth
-    f, g, none = K[0, 0], K[1, 1], np.zeros_like(x)
+    f, g = K[0, 0], K[1, 1]
     uv = np.stack([f * x + K[0, 2], g * y + K[1, 2]], axis=-1)
-    u = [f * x * y, -f * (1 + x * x), f * y, -f / depth, none, f * x / depth, f * x]
-    v = [g * (1 + y * y), -g * x * y, -g * x, none, -g / depth, g * y / depth, g * y]
-    return uv, depth, ahead, np.stack([np.stack(u, axis=-1), np.stack(v, axis=-1)], axis=-2)
+    slope = np.zeros((2, LAG, *x.shape))
+    u = f * x * y, -f * (1 + x * x), f * y, -f / depth, 0.0, f * x / depth, f * x
+    v = g * (1 + y * y), -g * x * y, -g * x, 0.0, -g / depth, g * y / depth, g * y
+    for place, value in zip(np.ndindex(2, LAG), (*u, *v), strict=True):
+        slope[place] = value
+    return uv, depth, ahead, slope
 
 
 def delayed(values: np.ndarray, frames: float) -> np.ndarray:
@@ -428,14 +446,20 @@ class WristView:
         step, row, column = np.nonzero(shows)
         self.step, self.row, self.column = step, row, column
         self.flow = motion.flow[step, row, column].astype(np.float64)
-        _, self._first, self._of, count = np.unique(step, return_index=True, return_inverse=True, return_counts=True)
+        pictures, self._first, self._of, count = np.unique(
+            step, return_index=True, return_inverse=True, return_counts=True
+        )
         self.share = np.minimum(1.0, MOST_CELLS_A_STEP / count)[self._of]
         self.uv = cell_centres(camera.height, camera.width)[row, column]
+        self._pixels = np.c_[self.uv, np.ones(len(step))]
         across = (self.uv - ((camera.width - 1) / 2, (camera.height - 1) / 2)) / camera.width
         self.plane = np.c_[np.ones(len(step)), across]
-        value = gray[:-1].astype(np.float32)
-        x, y = (np.stack([cv2.Sobel(v, cv2.CV_32F, *order, scale=1 / 8) for v in value]) for order in ((1, 0), (0, 1)))
-        tensor = cell_means(np.stack([x * x, x * y, x * y, y * y], axis=-1))[step, row, column].reshape(-1, 2, 2)
+        tensor = np.empty((len(step), 2, 2), np.float32)
+        for number, picture in enumerate(pictures):
+            x, y = (cv2.Sobel(gray[picture], cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+            here = slice(self._first[number], self._first[number] + count[number])
+            means = cell_means(np.stack([x * x, x * y, y * y]))[:, row[here], column[here]]
+            tensor[here] = np.array([means[:2], means[1:]]).T
         sharp = tensor / (np.trace(tensor, axis1=1, axis2=2) + FAINT_EDGE)[:, None, None]
         error_px = FLOW_ERROR_PX + FLOW_ERROR_SHARE * lengths(self.flow)
         self.certainty = sharp.astype(np.float64) / error_px[:, None, None] ** 2
@@ -523,8 +547,7 @@ class WristView:
             self._steps[moves] = _steps_between(camera.T_base_camera, float(theta[LAG]))
         turns, places = self._steps[moves]
         turned = camera.K @ turns @ np.linalg.inv(camera.K)
-        pixels = np.c_[self.uv, np.ones(len(self.uv))]
-        return np.einsum("mij,mj->mi", turned[self.step], pixels), (places @ camera.K.T)[self.step]
+        return np.einsum("mij,mj->mi", turned[self.step], self._pixels), (places @ camera.K.T)[self.step]
 
     def _flow(self, seen: tuple[np.ndarray, np.ndarray], depth: np.ndarray) -> np.ndarray:
         """(m, 2) flow [px] at the inverse depths (m,) [1/m]."""
@@ -592,8 +615,9 @@ def _estimate(view: str, evidence: StillView | WristView, shared: float, every: 
     start = equations = evidence.equations(theta, BLURS[-1])
     change = np.linalg.solve(equations.information + prior, equations.gradient)
     far = float(change @ equations.gradient) > FAR
-    for blur in BLURS_FAR if far else BLURS:
-        equations = evidence.equations(theta, blur)
+    for number, blur in enumerate(BLURS_FAR if far else BLURS):
+        if far or number:
+            equations = evidence.equations(theta, blur)
         change = np.linalg.solve(equations.information + prior, equations.gradient - prior @ theta)
         theta = theta + change / max(1.0, float(np.abs(change / LARGEST_STEP).max()))
     last = evidence.equations(theta, BLURS[-1])

@@ -16,6 +16,7 @@ import numpy as np
 
 from worldline_core.calibration.observation import (
     CELL_PX,
+    LONGEST_STEP_PX,
     Arm,
     Motion,
     Observation,
@@ -246,7 +247,7 @@ def frozen_views(observation: Observation, reading: Reading) -> list[str]:
         if len(observation.gray.get(view, ())) <= MIN_IMAGE_PAIRS:
             continue
         states, images = reading.steps(observation.num_images, view)
-        same = observation.motion(view).change[images].max(axis=(1, 2)) < FROZEN_CHANGE
+        same = observation.motion(view).largest_change[images] < FROZEN_CHANGE
         own = observation.wrists.get(view)
         speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
         travel = longest = 0.0
@@ -276,23 +277,26 @@ def still_view_agreement(observation: Observation, reading: Reading, view: str) 
         smaller where it hardly follows, and 0 where it does not.
     """
     states, images = reading.steps(observation.num_images, view)
-    motion, vector = observation.motion(view), reading.predicted(view)[states]
-    step = lengths(vector)
-    flow, change = motion.flow[images], motion.change[images]
-    moving = step > MIN_STEP_PX
+    motion, predicted = observation.motion(view), reading.predicted(view)
+    moving = predicted.length[states] > MIN_STEP_PX
     if moving.sum() < 20:
         return 0.0, 0.0, 0.0
-    measured, expected = flow[moving], vector[moving]
-    # One outlier of a hundred pixels must not outweigh a thousand cells.
-    expected = expected * np.minimum(1.0, 20.0 / np.maximum(lengths(expected)[:, None], 1e-9))
+    measured, expected = motion.flow[images][moving], predicted.shortened[states][moving]
     agreement = cosine(measured, expected)
     across = cosine(measured, np.stack([-expected[:, 1], expected[:, 0]], axis=-1))
     follows = (np.hypot(agreement, across) - FOLLOWS_CORRELATION) / (FOLLOWS_WELL - FOLLOWS_CORRELATION)
     turn_deg = float(np.degrees(np.arctan2(across, agreement)) * np.sqrt(np.clip(follows, 0.0, 1.0)))
-    x, y = np.log1p(np.minimum(step, 20.0)).ravel(), np.log1p(change).ravel()
-    if x.std() < 1e-9 or y.std() < 1e-9:
-        return agreement, 0.0, turn_deg
-    return agreement, float(np.corrcoef(x, y)[0, 1]), turn_deg
+    change = correlation(predicted.log_length[states].ravel(), motion.log_change[images].ravel())
+    return agreement, change, turn_deg
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's correlation of two series; 0 where one does not vary. np.corrcoef takes longer for the same bits."""
+    both = np.array([a, b], dtype=np.float64)
+    both -= both.mean(axis=1, keepdims=True)
+    covariance = both @ both.T * (1 / (len(a) - 1))
+    one, two = np.sqrt(covariance.diagonal())
+    return float(np.clip(covariance[0, 1] / one / two, -1.0, 1.0)) if min(one, two) > 1e-9 else 0.0
 
 
 def cosine(a: np.ndarray, b: np.ndarray) -> float:
@@ -329,7 +333,7 @@ def _wrist_flow_agreement(camera: CameraTrack, motion: Motion, states: slice, im
         step = np.where(ahead, moved[..., :2] / np.where(ahead, moved[..., 2:], 1.0) - centres[cells], 0.0)
         error = np.minimum(lengths(step - flow[cells]), LARGEST_FLOW_ERROR_PX).sum(axis=1)
         best = step[error.argmin()]
-        expected.append(best * np.minimum(1.0, 20.0 / np.maximum(lengths(best)[:, None], 1e-9)))
+        expected.append(best * np.minimum(1.0, LONGEST_STEP_PX / np.maximum(lengths(best)[:, None], 1e-9)))
         measured.append(flow[cells])
     if sum(len(cells) for cells in measured) < 50:
         return 0.0
@@ -342,9 +346,7 @@ def energy_correlation(observation: Observation, reading: Reading, view: str) ->
     own = observation.wrists.get(view)
     speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
     change = observation.motion(view).mean_change[images]
-    if len(speed) < 8 or speed.std() < 1e-9 or change.std() < 1e-9:
-        return 0.0
-    return float(np.corrcoef(speed, change)[0, 1])
+    return correlation(speed, change) if len(speed) >= 8 else 0.0
 
 
 def gripper_terms(observation: Observation, reading: Reading) -> dict[str, float]:

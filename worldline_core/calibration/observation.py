@@ -35,6 +35,8 @@ _TOOL_POINTS_M = np.array([0.0, 0.05, 0.1, 0.15])
 _TOOL_RADIUS_M = 0.05
 _NEAR_M = 0.03
 _STILL_PX = 0.05
+LONGEST_STEP_PX = 20.0
+"""One outlier of a hundred pixels must not outweigh a thousand cells."""
 _SUBCELL_BITS = 4
 _SUBCELL = 2**_SUBCELL_BITS
 
@@ -64,8 +66,16 @@ class Motion:
     """Cached agreements with wrist cameras: most readings leave the camera as it is."""
 
     @cached_property
+    def largest_change(self) -> np.ndarray:
+        return self.change.max(axis=(1, 2))
+
+    @cached_property
+    def log_change(self) -> np.ndarray:
+        return np.log1p(self.change)
+
+    @cached_property
     def moves(self) -> bool:
-        return bool((self.change.max(axis=(1, 2)) > STILL_CHANGE).sum() >= 4)
+        return bool((self.largest_change > STILL_CHANGE).sum() >= 4)
 
     @cached_property
     def mean_change(self) -> np.ndarray:
@@ -183,14 +193,19 @@ def measured_motion(gray: np.ndarray, *, exact: bool = False) -> Motion:
     # Cells alone are kept of an episode: flow of every pixel of some minutes would fill gigabytes.
     for begin in range(0, len(gray) - 1, _STEPS_AT_ONCE):
         part = gray[begin : begin + _STEPS_AT_ONCE + 1]
-        value = part.astype(np.float32)
         flow = np.stack([engine.calc(a, b, None) for a, b in pairwise(part)])  # type: ignore[call-overload]
-        across = np.abs(np.diff(value[:-1], axis=2, append=value[:-1, :, -1:]))
-        down = np.abs(np.diff(value[:-1], axis=1, append=value[:-1, -1:]))
-        change = np.abs(np.diff(value, axis=0))
+        across, down = np.zeros((2, *part[1:].shape), np.uint8)
+        across[:, :, :-1] = _apart(part[:-1, :, 1:], part[:-1, :, :-1])
+        down[:, :-1] = _apart(part[:-1, 1:], part[:-1, :-1])
+        change = _apart(part[1:], part[:-1])
         parts.append((cell_means(flow), cell_means(change), cell_means(np.maximum(across, down))))
     flow, change, texture = (np.concatenate(part) for part in zip(*parts, strict=True))
     return Motion(flow, change, texture)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Absolute differences of uint8 values."""
+    return np.maximum(a, b) - np.minimum(a, b)
 
 
 def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ...]:
@@ -223,11 +238,31 @@ def arms_of_embodiment(kinematics: ArmKinematics) -> tuple[Arm, ...]:
 
 
 @dataclass(frozen=True)
+class PredictedMotion:
+    """Motion of the robot's points in the cells of one view: `step` (n - 1, r, c, 2) [px]."""
+
+    step: np.ndarray
+
+    @cached_property
+    def length(self) -> np.ndarray:
+        return lengths(self.step)
+
+    @cached_property
+    def log_length(self) -> np.ndarray:
+        return np.log1p(np.minimum(self.length, LONGEST_STEP_PX))
+
+    @cached_property
+    def shortened(self) -> np.ndarray:
+        return self.step * np.minimum(1.0, LONGEST_STEP_PX / np.maximum(self.length[..., None], 1e-9))
+
+
+@dataclass(frozen=True)
 class Reading:
     """An episode read under given conventions.
 
     Attributes:
         tools: (n, a, 4, 4) T_base_tool; action_tools: the same of the commands, None where unknown.
+        tool_speed: (n - 1, a) `tool_travel` of the tools.
         kinematic_tools: (n, a, 4, 4) from joints where the recording also has tool poses, else None.
         cameras: by view, K at the size of the grey images.
         gripper, gripper_command: (n, a) openings, None where the state has no gripper columns.
@@ -240,6 +275,7 @@ class Reading:
     conventions: RecordedConventions
     episode: Episode
     tools: np.ndarray
+    tool_speed: np.ndarray
     action_tools: np.ndarray | None
     kinematic_tools: np.ndarray | None
     cameras: dict[str, CameraTrack]
@@ -250,7 +286,7 @@ class Reading:
     shape: Literal["surfaces", "capsules", "hands"]
     capsules: tuple[np.ndarray, np.ndarray]
     first: int
-    _predicted: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    _predicted: dict[str, PredictedMotion] = field(default_factory=dict, repr=False)
 
     def with_image_lag(self, frames: int) -> Reading:
         """The same geometry with images that trail the states by so many frames."""
@@ -264,14 +300,10 @@ class Reading:
         stop = max(start, min(len(self.tools), num_images - first) - 1)
         return slice(start, stop), slice(start + first, stop + first)
 
-    @cached_property
-    def tool_speed(self) -> np.ndarray:
-        return tool_travel(self.tools)
-
-    def predicted(self, view: str) -> np.ndarray:
-        """`predict_motion` in a view, cached."""
+    def predicted(self, view: str) -> PredictedMotion:
+        """`predict_motion` in a view, cached: readings that differ by a lag of the images share it."""
         if view not in self._predicted:
-            self._predicted[view] = predict_motion(self.points, self.radii, self.cameras[view])
+            self._predicted[view] = PredictedMotion(predict_motion(self.points, self.radii, self.cameras[view]))
         return self._predicted[view]
 
 
@@ -313,6 +345,7 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
         conventions,
         episode,
         tools,
+        tool_travel(tools),
         action,
         kinematic,
         cameras,

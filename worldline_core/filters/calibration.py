@@ -24,7 +24,6 @@ from worldline_core.calibration.evidence import (
     fields_of_view_deg,
     mount_offset,
     principal_point_offset,
-    rms_hand_eye,
 )
 from worldline_core.calibration.observation import tool_travel
 from worldline_core.data.episodes.episode import Episode
@@ -39,7 +38,7 @@ from worldline_core.filters.signals import Signals, known_kinematics
 from worldline_core.filters.verdict import Finding, Numbers, Verdict, bad_frames, runs
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.transforms import hand_eye_residual
+from worldline_core.geometry.transforms import hand_eye_residual, lengths, rigid_inverse
 
 
 def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> tuple[float, float, float]:
@@ -113,9 +112,13 @@ def pose_lag(T_base_tool: np.ndarray, T_base_camera: np.ndarray, max_lag: int) -
     Returns: (lag in frames, hand-eye residual [m] there, residual at 0), residuals as root mean squares.
     """
 
+    T_tool_base = rigid_inverse(T_base_tool)
+
     @cache
     def residual(lag: int) -> float:
-        return rms_hand_eye(*lagged(T_base_tool, T_base_camera, lag))[1]
+        inverse, cameras = lagged(T_tool_base, T_base_camera, lag)
+        place = (inverse @ cameras)[:, :3, 3]
+        return float(np.sqrt((lengths(place - np.median(place, axis=0)) ** 2).mean()))
 
     coarse = max(1, max_lag // 6)
     tried = [*range(0, max_lag + 1, coarse), *range(-coarse, -max_lag - 1, -coarse)]

@@ -172,7 +172,7 @@ def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
     fitted = found.fitted
     scale = np.append(SCALE[:-1], recorded.every)
     _, _, ahead, slope = projected(np.zeros((1, 1, 3)), fitted.camera)
-    shown = 100 / fitted.camera.width * np.c_[slope[0, 0], np.zeros(2)] / scale
+    shown = 100 / fitted.camera.width * np.c_[slope[:, :, 0, 0], np.zeros(2)] / scale
     information = fitted.information / np.outer(scale, scale)
     error = CameraError(
         recorded.view, np.zeros(PARAMETERS), information, SHARED_WRIST_CAMERA, shown, len(recorded.episodes)
