@@ -137,6 +137,22 @@ def test_readings_that_break_are_jumps_and_no_reset(arms, frames, joints, off, j
     assert set() < set(jumps(broken)) <= jumped
 
 
+def test_two_readings_that_break_together_while_the_arm_rests_are_no_reset() -> None:
+    rest = np.full((40, 6), 0.2) + np.random.default_rng(0).normal(0, 1e-3, (40, 6))
+    broken, dead = rest.copy(), rest.copy()
+    broken[12:30, [1, 3]] += 1.1  # away, and back after more than a second
+    dead[:, [1, 3]] += np.clip(np.arange(40) / 10, 0, 1)[:, None]  # two joints move, and then read as at the start
+    commands = dead.copy()
+    dead[25:, [1, 3]] = rest[0, [1, 3]]
+    for values, wanted, jumped in (
+        (broken, rest, list(range(12, 31))), (broken, None, list(range(12, 31))), (dead, commands, [25]),
+    ):  # fmt: skip
+        assert cut(detectors.detect_reset(values, FPS, configs.ResetConfig(), wanted)) == []
+        assert jumps(values) == jumped
+    for home in (None, dead):  # the commands go home as well, or are unknown
+        assert cut(detectors.detect_reset(dead, FPS, configs.ResetConfig(), home))[0] == 25
+
+
 def test_joint_readings_that_jump_run_away_or_ignore_their_commands() -> None:
     config, joints = configs.JointMotionConfig(), 1.5 * swing()
     spike, slipped, fast, stuck, idle = (joints.copy() for _ in range(5))

@@ -259,11 +259,13 @@ def find_static(signals: Signals, config: FilterConfig, _: Sequence[Finding]) ->
     return [Finding("static", view, 1, verdict)]
 
 
-def return_home(joints: np.ndarray, fps: float, config: ResetConfig) -> tuple[int, int] | None:
+def return_home(
+    joints: np.ndarray, fps: float, config: ResetConfig, commands: np.ndarray | None = None
+) -> tuple[int, int] | None:
     """Frames (last before, first after) of the first return to the first pose, or None.
 
     Args:
-        joints: (n, j) [rad].
+        joints, commands: (n, j) [rad].
     """
     steps = np.abs(np.diff(joints, axis=0)).max(axis=1)
     from_home = np.abs(joints - joints[0]).max(axis=1)
@@ -271,7 +273,7 @@ def return_home(joints: np.ndarray, fps: float, config: ResetConfig) -> tuple[in
     for i, j in _candidates(from_home, steps, longest, config):
         usual = _usual(np.concatenate([steps[:i], steps[j:]]))
         quick = (from_home[i] - from_home[j]) / (j - i) > _least(j - i, config) * usual
-        if quick and not _broken_readings(joints, i, j, usual):
+        if quick and not _broken_readings(joints, commands, i, j, usual):
             # The return may have begun before the part of it that leads straight home.
             begin = i
             while begin > max(j - longest, 0) and steps[begin - 1] > usual:
@@ -300,21 +302,38 @@ _STILL_RAD = 0.03
 """Joints that are no further from their first positions have not moved: encoder noise is smaller."""
 
 
-def _broken_readings(joints: np.ndarray, i: int, j: int, usual: float) -> bool:
+def _broken_readings(joints: np.ndarray, commands: np.ndarray | None, i: int, j: int, usual: float) -> bool:
     """True when the robot does not go home with its readings: only one of them, or few of those that are away, go home
-    between the frames i and j, or they jump back soon.
+    between the frames i and j; they jump back soon; they had jumped away and rested there; their commands stay away.
 
     Args:
-        joints: (n, j) [rad].
+        joints, commands: (n, j) [rad].
         usual: step of the episode [rad].
     """
-    before, after = np.abs(joints[[i, j]] - joints[0])
+    home = joints[0]
+    before, after = np.abs(joints[[i, j]] - home)
     away = before > _STILL_RAD
-    if len(before) > 1 and ((away & (after <= 0.5 * before)).sum() <= max(1, away.sum() / 2)):
+    back = np.flatnonzero(away & (after <= 0.5 * before))
+    if len(before) > 1 and len(back) <= max(1, away.sum() / 2):
         return True
     furthest = before.argmax()
     steps = np.abs(np.diff(joints[j : j + 1 + _WINDOW, furthest]))
-    return bool((steps > max(0.5 * before[furthest], 2 * usual)).any())
+    if (steps > max(0.5 * before[furthest], 2 * usual)).any():
+        return True
+    half = 0.5 * before[back]
+    if all(_jumped_away(joints[: i + 1, k], max(least, 2 * usual)) for k, least in zip(back, half, strict=True)):
+        return True
+    if commands is None:
+        return False
+    followed = np.abs(commands[i] - joints[i])[back] <= half
+    stay = np.abs(commands[j : j + 1 + _WINDOW] - home)[:, back].min(axis=0) > half
+    return bool((followed & stay).all())
+
+
+def _jumped_away(readings: np.ndarray, least: float) -> bool:
+    """True when readings (n,) left their first value in one step of more than `least`, and then rested."""
+    left = np.flatnonzero(np.abs(readings - readings[0]) <= least)[-1] + 1
+    return len(readings) > left and bool(abs(readings[left] - readings[left - 1]) > least > np.ptp(readings[left:]))
 
 
 def _usual(steps: np.ndarray) -> float:
@@ -325,13 +344,13 @@ def _least(span: int, config: ResetConfig) -> float:
     return config.min_relative_step if span == 1 else config.min_relative_speed
 
 
-def detect_reset(joints: np.ndarray, fps: float, config: ResetConfig) -> Verdict:
+def detect_reset(joints: np.ndarray, fps: float, config: ResetConfig, commands: np.ndarray | None = None) -> Verdict:
     """Frames from the first return to the first pose on; the attempt before it stays.
 
     Args:
-        joints: (n, j) joint positions [rad], without grippers.
+        joints, commands: (n, j) joint positions [rad], without grippers.
     """
-    found = return_home(joints, fps, config)
+    found = return_home(joints, fps, config, commands)
     bad = np.zeros(len(joints), dtype=bool)
     if found is not None:
         bad[found[0] + 1 :] = True
@@ -360,7 +379,7 @@ def jump_steps(joints: np.ndarray, config: JointMotionConfig) -> np.ndarray:
 
 
 def detect_joint_jump(joints: np.ndarray, config: JointMotionConfig) -> Verdict:
-    """Frames at which a reading jumps, and those between a jump and its way back.
+    """Frames at which a reading jumps, and those between a jump and its way back, if that is soon or the reading rests.
 
     Args:
         joints: (n, j) joint positions [rad], without grippers.
@@ -372,8 +391,9 @@ def detect_joint_jump(joints: np.ndarray, config: JointMotionConfig) -> Verdict:
         at = np.flatnonzero(jumps[:, joint])
         bad[at + 1] = True
         for first, second in pairwise(at):
-            returned = abs(joints[second + 1, joint] - joints[first, joint]) < 0.5 * steps[first, joint]
-            if returned and second - first <= _WINDOW:
+            half = 0.5 * steps[first, joint]
+            returned = abs(joints[second + 1, joint] - joints[first, joint]) < half
+            if returned and (second - first <= _WINDOW or np.ptp(joints[first + 1 : second + 1, joint]) < half):
                 bad[first + 1 : second + 1] = True
     largest = Curve(np.concatenate([[0.0], steps.max(axis=1)]), config.min_jump_rad)
     return frame_verdict("joint_jump", True, bad, {"largest_step_rad": largest})
@@ -421,7 +441,7 @@ def find_joint_faults(signals: Signals, config: FilterConfig, _: Sequence[Findin
     joints, fps = signals.joints, signals.episode.fps
     if joints is None or not joints.shape[1]:
         return []
-    reset = Finding("reset", None, 1, detect_reset(joints, fps, config.reset))
+    reset = Finding("reset", None, 1, detect_reset(joints, fps, config.reset, signals.commands))
     last = np.flatnonzero(~bad_frames([reset], len(joints)))[-1]
     held = joints[np.minimum(np.arange(len(joints)), last)]
     verdicts = [detect_joint_jump(held, config.joint_motion), detect_joint_speed(held, fps, config.joint_motion)]
