@@ -1,14 +1,32 @@
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tools.corrupted import lerobot_v21
+from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.encoder import encode_video
+
+
+@contextmanager
+def rejected(reason: str, match: str) -> Iterator[None]:
+    with pytest.raises(RejectedInputError, match=match) as caught:
+        yield
+    assert caught.value.reason == reason
+
+
+@pytest.fixture(scope="session")
+def layouts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    """A small recording of every layout, by its name: the entry of `curate.sources` that reads it."""
+    pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
+    return write_one_of_each(tmp_path_factory.mktemp("layouts"))
 
 
 @pytest.fixture

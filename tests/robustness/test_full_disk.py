@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import subprocess
 import sys
-import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,49 +27,57 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def leave(disk: Path, free: int) -> None:
+LEAVE = '''
+import os
+
+def leave(disk, free):
     """Fill a disk up to so many bytes."""
     fill = disk / "fill"
     fill.unlink(missing_ok=True)
     fill.touch()
     state = os.statvfs(disk)
     fill.write_bytes(b"x" * max(0, state.f_bavail * state.f_frsize - free))
+'''
 
 
 ENCODE = """
-    import sys
-    from pathlib import Path
-    import numpy as np
-    from worldline_core.data.video.encoder import concatenate_videos, encode_video
+import sys
+from pathlib import Path
+import numpy as np
+from worldline_core.data.video.encoder import concatenate_videos, encode_video
 
-    disk, part = Path(sys.argv[1]), Path(sys.argv[2])
-    frames = np.random.default_rng(0).integers(0, 256, (12, 64, 96, 3), dtype=np.uint8)
-    encode_video(part, frames, 8.0, preset="ultrafast")
-    for write in (
-        lambda path: encode_video(path, frames, 8.0, preset="ultrafast"),
-        lambda path: concatenate_videos(path, [(part, 12)], 8.0),
-    ):
-        write(part.with_name("whole.mp4"))
-        size = part.with_name("whole.mp4").stat().st_size
-        for free in [0, *range(1, size + 12000, size // 14)]:
-            leave(disk, free)
-            try:
-                write(disk / "a.mp4")
-                print("whole", (disk / "a.mp4").stat().st_size == size)
-            except OSError as error:
-                print("full", error.errno)
-            (disk / "a.mp4").unlink(missing_ok=True)
+disk, part = Path(sys.argv[1]), Path(sys.argv[2])
+frames = np.random.default_rng(0).integers(0, 256, (12, 64, 96, 3), dtype=np.uint8)
+encode_video(part, frames, 8.0, preset="ultrafast")
+for write in (
+    lambda path: encode_video(path, frames, 8.0, preset="ultrafast"),
+    lambda path: concatenate_videos(path, [(part, 12)], 8.0),
+):
+    write(part.with_name("whole.mp4"))
+    size = part.with_name("whole.mp4").stat().st_size
+    for free in [0, *range(1, size + 12000, size // 14)]:
+        leave(disk, free)
+        try:
+            write(disk / "a.mp4")
+            print("whole", (disk / "a.mp4").stat().st_size == size)
+        except OSError as error:
+            print("full", error.errno)
+        (disk / "a.mp4").unlink(missing_ok=True)
 """
+
+
+def python(project_root: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=project_root, env=os.environ | {"PYTHONPATH": str(project_root)},
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
 
 
 def test_a_video_is_whole_or_an_error_however_little_space_is_left(
     disk: Path, tmp_path: Path, project_root: Path
 ) -> None:
     """FFmpeg crashed where not even the header could be written."""
-    ended = subprocess.run(
-        [sys.executable, "-c", "import os\nfrom pathlib import Path\n" + inspect.getsource(leave) + textwrap.dedent(ENCODE), str(disk), str(tmp_path / "part.mp4")], cwd=project_root,
-        env=os.environ | {"PYTHONPATH": str(project_root)}, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    ended = python(project_root, "-c", LEAVE + ENCODE, disk, tmp_path / "part.mp4")
     assert ended.returncode == 0, ended.stderr
     said = ended.stdout.splitlines()
     assert set(said) == {"whole True", "full 28"}
@@ -83,26 +89,15 @@ def test_a_video_is_whole_or_an_error_however_little_space_is_left(
 @pytest.mark.parametrize(
     "command",
     [
-        ["pipeline"],
-        [
-            "task",
-            "curate",
-            "--runner",
-            "processes",
-            "--set",
-            "runner.workers=2",
-            "--set",
-            "runner.episodes_per_shard=4",
-        ],
+        ("pipeline",),
+        ("task", "curate", "--runner", "processes", "--set", "runner.workers=2", "--set", "runner.episodes_per_shard=4"),
     ],
     ids=["pipeline", "shards in processes"],
-)
-def test_a_full_disk_is_one_message_of_any_command(disk: Path, project_root: Path, command: list[str]) -> None:
-    leave(disk, 300_000)
-    ended = subprocess.run(
-        [sys.executable, "-m", "flows.command_line", *command, "--preset", "smoke", "--artifacts", str(disk / "store")],
-        cwd=project_root, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+)  # fmt: skip
+def test_a_full_disk_is_one_message_of_any_command(disk: Path, project_root: Path, command: tuple[str, ...]) -> None:
+    python(project_root, "-c", f"{LEAVE}\nimport pathlib\nleave(pathlib.Path({str(disk)!r}), 300_000)")
+    store = disk / "store"
+    ended = python(project_root, "-m", "flows.command_line", *command, "--preset", "smoke", "--artifacts", store)
     assert ended.returncode == 1, ended.stderr
     assert "Traceback" not in ended.stderr
     assert [line for line in ended.stderr.splitlines() if line.startswith("error:")] == ["error: No space left"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematic_tree import read_mjcf, read_urdf
+from worldline_core.geometry.kinematics import ArmKinematics
 
 
 def bomb(levels: int, one: Callable[[str], str]) -> str:
@@ -23,31 +25,23 @@ def bomb(levels: int, one: Callable[[str], str]) -> str:
 YAML = {
     "aliases": bomb(12, lambda name: "[" + ", ".join([name] * 10) + "]"),
     "aliases in mappings": bomb(12, lambda name: "{" + ", ".join(f"k{i}: {name}" for i in range(10)) + "}"),
-    "an alias of itself": "a: &a [*a]\n",
-    "deep lists": "a: " + "[" * 5000 + "]" * 5000,
-    "deep mappings": "a: " + "{a: " * 5000 + "1" + "}" * 5000,
-    "a python object": "a: !!python/object/apply:os.system ['touch harmed']\n",
-    "no date": "a: 2001-99-99\n",
-    "no integer": "a: !!int x\n",
-    "no number": "a: !!float x\n",
-    "no time": "a: !!timestamp x\n",
-    "no truth": "a: !!bool maybe\n",
-    "an integer of 5000 digits": "a: " + "9" * 5000 + "\n",
-    "a list as a key": "? [a]\n: 1\n",
-    "a mapping as a key": "? {a: 1}\n: 1\n",
-    "other bytes": b"a: \xff\xfe\n",
-    "a null byte": b"a: \0\n",
-}
+    "an alias of itself": "a: &a [*a]\n", "deep lists": "a: " + "[" * 2000 + "]" * 2000,
+    "deep mappings": "a: " + "{a: " * 2000 + "1" + "}" * 2000, "a key twice": "a: 1\na: 2\n",
+    "a python object": "a: !!python/object/apply:os.system ['touch harmed']\n", "no date": "a: 2001-99-99\n",
+    "no integer": "a: !!int x\n", "no number": "a: !!float x\n", "no time": "a: !!timestamp x\n", "no truth": "a: !!bool maybe\n",
+    "an integer of 5000 digits": "a: " + "9" * 5000 + "\n", "a list as a key": "? [a]\n: 1\n",
+    "a mapping as a key": "? {a: 1}\n: 1\n", "other bytes": "a: \udcff\udcfe\n", "a null byte": "a: \0\n",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("text", YAML.values(), ids=YAML)
-def test_hostile_yaml_is_refused_by_name(text: str | bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_yaml_is_refused_by_name(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "x.yaml"
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    path.write_bytes(os.fsencode(text))
     for read in (lambda: load_config(CurateConfig, path=path, section="curate"), lambda: load_embodiment(path)):
         began = time.monotonic()
-        with pytest.raises(ConfigError, match="Not valid YAML"):
+        with pytest.raises(ConfigError, match=r"Not valid YAML|given twice"):
             read()
         assert time.monotonic() - began < 30
     assert not (tmp_path / "harmed").exists()
@@ -65,20 +59,17 @@ def test_hostile_overrides_are_refused(value: str) -> None:
 
 
 def test_a_mistake_in_a_long_file_is_told_in_few_words(tmp_path: Path) -> None:
-    (tmp_path / "x.yaml").write_text(
-        "sources: [" + ", ".join(["{kind: nothing}"] * 5000) + "]\n" + "name: " + "x" * 10**6
-    )
+    text = f"sources: [{', '.join(['{kind: nothing}'] * 2000)}]\nname: {'x' * 10**6}"
+    (tmp_path / "x.yaml").write_text(text)
     with pytest.raises(ConfigError, match=r"and \d+ more|characters") as caught:
         load_config(CurateConfig, path=tmp_path / "x.yaml")
     assert len(str(caught.value)) < 6000
 
 
 def chain(links: int) -> str:
-    parts = "".join(f"<link name='l{i}'/>" for i in range(links)) + "".join(
-        f"<joint name='j{i}' type='revolute'><parent link='l{i}'/><child link='l{i + 1}'/></joint>"
-        for i in range(links - 1)
-    )
-    return f"<robot name='x'>{parts}</robot>"
+    parts = "".join(f"<link name='l{i}'/>" for i in range(links))
+    joint = "<joint name='j{0}' type='revolute'><parent link='l{0}'/><child link='l{1}'/></joint>"
+    return f"<robot name='x'>{parts}{''.join(joint.format(i, i + 1) for i in range(links - 1))}</robot>"
 
 
 def urdf(inside: str) -> str:
@@ -108,40 +99,30 @@ MJCF = {
 }
 
 
-@pytest.mark.parametrize("text", URDF.values(), ids=URDF)
-def test_hostile_urdf_is_refused_by_name(text: str) -> None:
+@pytest.mark.parametrize(
+    ("read", "text"),
+    [(read_urdf, text) for text in URDF.values()] + [(read_mjcf, f"<mujoco>{text}</mujoco>") for text in MJCF.values()],
+    ids=[*URDF, *MJCF],
+)
+def test_hostile_robots_are_refused_by_name(read: Callable[[str, str], object], text: str) -> None:
     began = time.monotonic()
-    with pytest.raises(DataError) as caught:  # each says its own
-        read_urdf(text, "robot.urdf")
+    with pytest.raises(DataError, match=r"robot\.file") as caught:
+        read(text, "robot.file")
     assert time.monotonic() - began < 10
     assert len(str(caught.value)) < 10_000
-    assert "robot.urdf" in str(caught.value)
 
 
-@pytest.mark.parametrize("text", MJCF.values(), ids=MJCF)
-def test_hostile_mjcf_is_refused_by_name(text: str) -> None:
-    with pytest.raises(DataError) as caught:  # each says its own
-        read_mjcf(f"<mujoco>{text}</mujoco>", "robot.xml")
-    assert "robot.xml" in str(caught.value)
+@pytest.mark.parametrize("inside", ['SYSTEM "file:///etc/passwd"', '[<!ENTITY % a SYSTEM "file:///etc/passwd"> %a;]'])
+def test_entities_of_files_are_not_read(inside: str) -> None:
+    assert [body.name for body in read_urdf(f"<!DOCTYPE r {inside}>" + chain(2), "x").walk()] == ["l0", "l1"]
 
 
-def test_entities_of_files_are_not_read() -> None:
-    for declared in (
-        '<!DOCTYPE r SYSTEM "file:///etc/passwd">',
-        '<!DOCTYPE r [<!ENTITY % a SYSTEM "file:///etc/passwd"> %a;]>',
-    ):
-        assert [body.name for body in read_urdf(declared + chain(2), "x").walk()] == ["l0", "l1"]
-
-
-def test_a_description_of_gigabytes_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from worldline_core.geometry.kinematics import ArmKinematics
-
+def test_a_description_of_gigabytes_is_not_read(tmp_path: Path) -> None:
     large = tmp_path / "large.xml"
     with large.open("wb") as stream:
         stream.truncate(1 << 33)
     with pytest.raises(DataError, match="too large"):
         ArmKinematics(load_embodiment("ur5e_pair", large))
-    large.unlink()
     large.write_bytes(b"<robot>\xff</robot>")
     with pytest.raises(DataError, match="not UTF-8"):
         ArmKinematics(load_embodiment("ur5e_pair", large))

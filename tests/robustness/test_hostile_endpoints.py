@@ -66,13 +66,18 @@ def serve(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Callable[[socke
         endpoint.close()
 
 
-def ask(endpoint: Endpoint, attempts: int = 1) -> tuple[str, float]:
-    """What the user is told, and after how many seconds."""
-    config = VLMConfig(url=endpoint.url, timeout_s=0.5, attempts=attempts, api_key_variable="JUDGE")
+def ask(endpoint: Endpoint) -> str:
+    """What the user is told, within a few seconds."""
+    config = VLMConfig(url=endpoint.url, timeout_s=0.3, attempts=1, api_key_variable="JUDGE")
     began = time.monotonic()
     with pytest.raises(UnavailableError) as caught:
         OpenAICompatibleModel(config, backoff_s=0.01).answer([Text("?")])
-    return str(caught.value), time.monotonic() - began
+    assert time.monotonic() - began < 4
+    return str(caught.value)
+
+
+def answer(content: bytes) -> Callable[[socket.socket], None]:
+    return lambda connection: connection.sendall(content)
 
 
 def trickle(connection: socket.socket, start: bytes) -> None:
@@ -92,23 +97,37 @@ def hang(connection: socket.socket) -> None:
     time.sleep(10)
 
 
-@pytest.mark.parametrize(
-    "behave", [hang, lambda c: trickle(c, b""), lambda c: trickle(c, OK + b"X: "), lambda c: trickle(c, OK + b"\r\n")]
-)
-def test_an_answer_that_does_not_end_is_given_up_in_time(serve: Callable, behave: Callable) -> None:
-    told, seconds = ask(serve(behave))
-    assert "no whole answer within 0.5 s" in told
-    assert seconds < 4
-
-
-def test_a_flood_is_cut(serve: Callable) -> None:
-    told, seconds = ask(serve(flood))
-    assert "more than 1,048,576 bytes" in told
-    assert seconds < 4
+def promise(connection: socket.socket) -> None:
+    """Answers to come, for as long as somebody listens."""
+    while True:
+        connection.sendall(b"HTTP/1.1 100 Continue\r\n\r\n" * 1000)
 
 
 @pytest.mark.parametrize(
-    "answer",
+    ("behave", "said"),
+    [
+        (hang, "no whole answer within 0.3 s"),
+        *((lambda c, start=start: trickle(c, start), "no whole answer within 0.3 s") for start in (b"", OK + b"X: ", OK + b"\r\n")),
+        (flood, "more than 1,048,576 bytes"),
+        (promise, ""),
+    ],
+)  # fmt: skip
+def test_an_answer_that_does_not_end_is_given_up_in_time(serve: Callable, behave: Callable, said: str) -> None:
+    ended = threading.Event()
+
+    def watched(connection: socket.socket) -> None:
+        try:
+            behave(connection)
+        finally:
+            ended.set()
+
+    assert said in ask(serve(watched))
+    # Given up and not closed, the connection would go on in a thread of its own.
+    assert behave is hang or ended.wait(2)
+
+
+@pytest.mark.parametrize(
+    "content",
     [
         b"", b"\r\n\r\n", b"\xff\xfe nonsense\r\n\r\n", OK + b"Content-Length: 100\r\n\r\n{}",
         OK + b"Transfer-Encoding: chunked\r\n\r\nzz\r\n", OK + b"X: " + b"y" * 70_000 + b"\r\n\r\n",
@@ -118,63 +137,38 @@ def test_a_flood_is_cut(serve: Callable) -> None:
         OK + b"\r\n" + b"[" * 100_000, OK + b"\r\n\xff\xfe", OK + b"\r\n" + b"9" * 5000, OK + b"\r\n[]", OK + b"\r\nnull",
     ],
 )  # fmt: skip
-def test_answers_that_are_none_are_named(serve: Callable, answer: bytes) -> None:
-    told, seconds = ask(serve(lambda connection: connection.sendall(answer)))
-    assert "The judge's server" in told
-    assert seconds < 4
-
-
-def promise(connection: socket.socket) -> None:
-    """Answers to come, for as long as somebody listens."""
-    while True:
-        connection.sendall(b"HTTP/1.1 100 Continue\r\n\r\n" * 1000)
-
-
-def test_the_connection_ends_with_the_patience(serve: Callable) -> None:
-    """Given up and not closed, it would go on in a thread of its own."""
-    ended = threading.Event()
-
-    def behave(connection: socket.socket) -> None:
-        try:
-            promise(connection)
-        finally:
-            ended.set()
-
-    _, seconds = ask(serve(behave))
-    assert seconds < 4
-    assert ended.wait(2)
+def test_answers_that_are_none_are_named(serve: Callable, content: bytes) -> None:
+    endpoint = serve(answer(content))
+    assert "The judge's server" in ask(endpoint)
+    # And the verdict is null, and counted.
+    config = VLMConfig(url=endpoint.url, timeout_s=0.3, attempts=1, api_key_variable="JUDGE")
+    if content.startswith(OK + b"\r\n[1,"):
+        assert ask_model(OpenAICompatibleModel(config), [Text("?")], GraspEvidence) == (GraspEvidence(), False)
 
 
 @pytest.mark.parametrize("status", [301, 302, 303, 307, 308])
 def test_the_key_goes_nowhere_else(serve: Callable, status: int) -> None:
-    thief = serve(lambda connection: connection.sendall(OK + b"\r\n{}"))
-    told, _ = ask(serve(lambda c: c.sendall(f"HTTP/1.1 {status} Moved\r\nLocation: {thief.url}/x\r\n\r\n".encode())))
-    assert f"HTTP {status}" in told
+    thief = serve(answer(OK + b"\r\n{}"))
+    moved = f"HTTP/1.1 {status} Moved\r\nLocation: {thief.url}/x\r\n\r\n".encode()
+    assert f"HTTP {status}" in ask(serve(answer(moved)))
     assert thief.requests == []
 
 
-def test_a_key_that_a_server_repeats_is_not_shown(serve: Callable) -> None:
-    reply = json.dumps({"error": f"Incorrect API key provided: {KEY}"}).encode()
-    told, _ = ask(serve(lambda c: c.sendall(b"HTTP/1.1 401 No\r\n\r\n" + reply)))
-    assert "HTTP 401" in told
-    assert KEY not in told
-
-
-@pytest.mark.parametrize("form", [KEY, "key\\/of\\/the judge's".replace(" ", "")])
+@pytest.mark.parametrize("key", [KEY, "key\\/of\\/thejudge's"])
 @pytest.mark.parametrize("written", [str, repr, json.dumps, quote, lambda key: " " * 485 + key])
 def test_a_key_is_hidden_in_whatever_form_it_is_repeated(
-    serve: Callable, monkeypatch: pytest.MonkeyPatch, form: str, written: Callable[[str], str]
+    serve: Callable, monkeypatch: pytest.MonkeyPatch, key: str, written: Callable[[str], str]
 ) -> None:
-    monkeypatch.setenv("JUDGE", form)
-    told, _ = ask(serve(lambda c: c.sendall(b"HTTP/1.1 401 No\r\n\r\nwrong: " + written(form).encode() + b" here")))
+    monkeypatch.setenv("JUDGE", key)
+    told = ask(serve(answer(b"HTTP/1.1 401 No\r\n\r\nwrong: " + written(key).encode() + b" here")))
     assert "HTTP 401" in told
-    assert written(form).strip()[:8] not in told
+    assert written(key).strip()[:8] not in told
 
 
 @pytest.mark.parametrize("around", ["{}\r", " {}\r\n", "{}\n", "\t{}"])
 def test_white_space_around_a_key_is_not_sent(serve: Callable, monkeypatch: pytest.MonkeyPatch, around: str) -> None:
     monkeypatch.setenv("JUDGE", around.format(KEY))
-    endpoint = serve(lambda c: c.sendall(OK + b"\r\n[]"))
+    endpoint = serve(answer(OK + b"\r\n[]"))
     ask(endpoint)
     assert f"bearer {KEY}\r\n".encode() in endpoint.requests[0].lower()
 
@@ -187,22 +181,15 @@ def test_a_key_that_no_request_carries_is_refused_unseen(monkeypatch: pytest.Mon
     assert key[:3] not in str(caught.value).replace("The judge's key cannot be sent", "")
 
 
-def test_every_hostile_reply_is_null_and_counted(serve: Callable) -> None:
-    endpoint = serve(lambda c: c.sendall(OK + b"\r\n" + b"[1," * 50_000))
-    config = VLMConfig(url=endpoint.url, timeout_s=0.5, attempts=1, api_key_variable="JUDGE")
-    assert ask_model(OpenAICompatibleModel(config), [Text("?")], GraspEvidence) == (GraspEvidence(), False)
-
-
-def test_a_hostile_answer_is_no_evidence() -> None:
-    for text in (
-        "[1," * 50_000,
-        '{"a":[1,' * 50_000,
-        '{"a":' * 900 + "x",
-        '{"a": "' * 5000,
-        '{"a": ' * 3000,
-        "{" * 100_000,
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[1," * 50_000, '{"a":[1,' * 50_000, '{"a":' * 900 + "x", '{"a": "' * 5000, '{"a": ' * 3000, "{" * 100_000,
         '{"a": ' + "9" * 5000 + "}",
-    ):
-        began = time.monotonic()
-        assert parse_answer(GraspEvidence, text) == (GraspEvidence(), False)
-        assert time.monotonic() - began < 5
+    ],
+    ids=lambda text: text[:9],
+)  # fmt: skip
+def test_a_hostile_answer_is_no_evidence(text: str) -> None:
+    began = time.monotonic()
+    assert parse_answer(GraspEvidence, text) == (GraspEvidence(), False)
+    assert time.monotonic() - began < 5
