@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
 
 import av
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
-from tests.report.conftest import EPISODES, write_episode_set  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import ArtifactError
 from worldline_core.pictures import COLUMN_GAP_PX, LABEL_HEIGHT_PX
-from worldline_core.report.context import ReportConfig, ReportContext
-from worldline_core.report.data import data_section
+from worldline_core.report.context import ReportConfig
 from worldline_core.report.report import report
 from worldline_core.report.results import block_costs
 
@@ -52,13 +47,6 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-def digest(folder: Path) -> dict[str, str]:
-    files = (
-        path for path in sorted(folder.rglob("*")) if path.is_file() and "run" not in path.relative_to(folder).parts
-    )
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
 def pages(folder: Path) -> dict[str, str]:
     """The text of every page by its name."""
     found = {path.stem: path.read_text() for path in sorted(folder.glob("*.html"))}
@@ -71,7 +59,8 @@ def run_parts(folder: Path) -> dict[str, str]:
     return json.loads(text.removeprefix("window.WORLDLINE_RUN = ").rstrip(";\n"))
 
 
-def test_pages_are_well_formed_and_complete(full_report: Path) -> None:
+def test_pages_are_whole_and_need_nothing_else(full_report: Path) -> None:
+    references = set()
     for name, text in pages(full_report).items():
         page = Page(text)
         assert page.open == []
@@ -79,44 +68,24 @@ def test_pages_are_well_formed_and_complete(full_report: Path) -> None:
         assert ("summary" if name == "index" else name) in page.identities
         assert "Missing:" not in text
         assert {f"{anchor}.html" for anchor in SECTIONS} <= set(page.references)  # every page leads to every other
-
-
-def test_nothing_comes_from_a_network(full_report: Path) -> None:
-    for text in pages(full_report).values():
-        assert [r for r in Page(text).references if re.match(r"^[a-z]+:|^//", r)] == []
         assert not re.search(r"url\(|@import|https?://", text)
         assert "default-src 'none'" in text
-
-
-def test_every_referenced_file_exists_and_every_medium_is_referenced(full_report: Path) -> None:
-    found = {r for text in pages(full_report).values() for r in Page(text).references}
-    references = {r for r in found if not r.startswith("#")}
+        references |= {r for r in page.references if not r.startswith("#")}
     assert [r for r in references if not (full_report / r).is_file()] == []
     assert {f"media/{path.name}" for path in (full_report / "media").iterdir()} <= references
 
 
 def test_hostile_text_stays_text(full_report: Path) -> None:
-    for text in pages(full_report).values():
+    found = pages(full_report)
+    for text in found.values():
         page = Page(text)
         assert page.scripts == 2  # the run's facts and the page's own script
         assert page.handlers == []
         assert "<script>alert" not in text
-    shown = [name for name, text in pages(full_report).items() if "&lt;script&gt;alert(" in text]
-    assert set(shown) >= {"data", "provenance", "videos"}
+    shown = {name: text.count("&lt;script&gt;alert(") for name, text in found.items()}
+    assert min(shown[name] for name in ("provenance", "videos")) > 0
+    assert shown["data"] >= 5  # an instruction, names and reasons of what was refused, a detector
     assert "</script>" not in (full_report / "run" / "run.js").read_text()
-
-
-def test_hostile_names_and_reasons_of_what_was_refused_stay_text(hostile_text: str, tmp_path: Path) -> None:
-    inputs = {name: tmp_path / name for name in ("curate", "filter")}
-    for folder in inputs.values():
-        write_episode_set(folder, EPISODES[:1], name=hostile_text, reason=hostile_text)
-    finding = {"episode_id": hostile_text, "detector": hostile_text, "cut_frames": 3}
-    pq.write_table(pa.Table.from_pylist([finding]), inputs["filter"] / "findings.parquet")
-    section = data_section(ReportContext(ReportConfig(), inputs, tmp_path / "out"))
-    page = Page(str(section.body))
-    assert (page.scripts, page.handlers, page.open) == (0, [], [])
-    assert str(section.body).count("&lt;script&gt;alert(") >= 4
-    assert "&lt;b&gt;12&lt;/b&gt; of 33 frames" in str(section.body)
 
 
 def test_videos_play_in_browsers(full_report: Path) -> None:
@@ -134,14 +103,16 @@ def test_videos_play_in_browsers(full_report: Path) -> None:
 
 @pytest.mark.slow
 def test_bytes_are_the_same_again(run_artifacts: dict[str, Path], full_report: Path, tmp_path: Path) -> None:
-    report(ReportConfig(tile_height=64), run_artifacts, tmp_path)
-    again, before = digest(tmp_path), digest(full_report)
-    assert again == before
-    # A killed call leaves half-written files; they must not enter the digest of the next one.
+    def content(folder: Path) -> dict[str, bytes]:
+        files = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
+        return {str(name): path.read_bytes() for name, path in files.items() if "run" not in name.parts}
+
+    (tmp_path / "media").mkdir()
+    # A killed call leaves half-written files.
     (tmp_path / "media" / ".episode0.123.tmp.mp4").write_bytes(b"half")
     (tmp_path / ".index.123.tmp.html").write_bytes(b"half")
     report(ReportConfig(tile_height=64), run_artifacts, tmp_path)
-    assert digest(tmp_path) == again
+    assert content(tmp_path) == content(full_report)
 
 
 def test_times_and_versions_stay_out_of_the_reproducible_page(full_report: Path) -> None:
@@ -190,16 +161,13 @@ def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
 
 
 def test_missing_parts_are_said_to_be_missing(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
-    some = {name: run_artifacts[name] for name in ("curate", "train_stage1")}
-    metrics = report(ReportConfig(), some, tmp_path)
+    metrics = report(ReportConfig(), {name: run_artifacts[name] for name in ("curate", "train_stage1")}, tmp_path)
     found = pages(tmp_path)
     assert [name for name, text in found.items() if Page(text).open] == []
     assert metrics["missing"] == ["videos", "quality", "decisions"]
-    for anchor in metrics["missing"]:
-        assert "Missing:" in found[anchor]
+    assert all("Missing:" in found[anchor] for anchor in metrics["missing"])
     assert "6 of 7 episodes were kept; no prediction was measured yet." in found["index"]
     assert "Stage II: action-driven, three views, Distillation" in found["training"]
-    assert "filtered EpisodeSet is missing" in found["data"]
     assert "No action tracks were given" in found["data"]
 
 
@@ -211,9 +179,7 @@ def test_a_report_of_nothing_is_a_page(tmp_path: Path) -> None:
     assert [name for name, text in found.items() if Page(text).open] == []
 
 
-def test_a_damaged_artifact_is_named(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
-    broken = tmp_path / "scores"
-    broken.mkdir()
-    (broken / "summary.json").write_text("{")
+def test_a_damaged_artifact_is_named(tmp_path: Path) -> None:
+    (tmp_path / "summary.json").write_text("{")
     with pytest.raises(ArtifactError, match=r"(?s)JSON file is damaged.*summary\.json"):
-        report(ReportConfig(), {"evaluate_video": broken}, tmp_path / "out")
+        report(ReportConfig(), {"evaluate_video": tmp_path}, tmp_path / "out")

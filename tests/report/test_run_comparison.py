@@ -24,21 +24,19 @@ NUMBER = 24
 
 def evaluation(folder: Path, better_by: float, method: str = "model", first: int = 0) -> Path:
     """SSIM and tool error of recordings that are easier or harder for every run alike."""
-    random = np.random.default_rng(0)
-    difficulty, noise = random.uniform(0.4, 0.9, 64), np.random.default_rng(first + 1).normal(0, 0.01, 64)
+    difficulty = np.random.default_rng(0).uniform(0.4, 0.9, 64)
+    ssim = difficulty + better_by + np.random.default_rng(first + 1).normal(0, 0.01, 64)
+    values = {"ssim": ssim, "end_effector_error_px": 10 * (1 - difficulty - better_by)}
     scores = []
     for number in range(first, first + NUMBER):
         robot, outcome = ("ur5e_pair", "viperx_pair")[number % 2], ("success", "failure")[number % 3 == 0]
-        for metric, value in (
-            ("ssim", difficulty[number] + better_by + noise[number]),
-            ("end_effector_error_px", 10 * (1 - difficulty[number] - better_by)),
-        ):
-            scores.append(Score(method, f"e{number}", robot, "test", "head", 1, metric, float(value), outcome=outcome))
+        for metric, of_all in values.items():
+            value = float(of_all[number])
+            scores.append(Score(method, f"e{number}", robot, "test", "head", 1, metric, value, outcome=outcome))
     folder.mkdir(parents=True)
     write_scores(folder, scores)
-    (folder / "summary.json").write_text(
-        json.dumps(summarise(scores, comparisons=(), resamples=100, seed=0, by_view=True))
-    )
+    summary = summarise(scores, comparisons=(), resamples=100, seed=0, by_view=True)
+    (folder / "summary.json").write_text(json.dumps(summary))
     return folder
 
 
@@ -87,32 +85,30 @@ def test_reports_and_nights_are_runs(tmp_path: Path, capsys: pytest.CaptureFixtu
     direct = {(row.group, row.metric): row for row in compare_runs(f"{a}", f"{b}")}
     assert rows["test", "ssim@head"]["difference"] == direct["test", "ssim@head"].difference
     main(["compare", str(report), str(b)])
-    heading, *lines = capsys.readouterr().out.splitlines()
-    assert heading.split() == ["metric", "group", "method", "first", "second", "difference", "95", "%", "n", "better"]
-    assert any(line.startswith("ssim@head") and line.endswith("first") for line in lines)
+    assert re.search(r"(?m)^ssim@head .* first$", capsys.readouterr().out)
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
     a = evaluation(tmp_path / "a", 0.0)
-    with pytest.raises(ArtifactError, match="Nothing to compare here"):
-        compare_runs(f"{tmp_path}", f"{a}")
     with pytest.raises(ArtifactError, match="No such night"):
         compare_runs(f"{tmp_path}:friday", f"{a}")
+    with pytest.raises(ArtifactError, match="Nothing to compare here"):
+        compare_runs(f"{tmp_path}", f"{a}")
+    for inputs in (None, [], {"evaluate_video": {"path": 5}}, {"evaluate_video": {"path": "x"}}):
+        (tmp_path / "manifest.json").write_text(json.dumps({"inputs": inputs}))
+        with pytest.raises(ArtifactError, match="Nothing to compare here"):
+            compare_runs(f"{tmp_path}", f"{a}")
 
 
-def _value(table: pa.Table, value: object) -> pa.Table:
-    """The table with another value in its first row."""
-    values = [value, *table["value"].to_pylist()[1:]]
-    return table.set_column(table.column_names.index("value"), "value", pa.array(values))
+def first_value(value: float | None) -> Callable[[pa.Table], pa.Table]:
+    return lambda table: table.set_column(7, "value", pa.array([value, *table["value"].to_pylist()[1:]]))
 
 
 @pytest.mark.parametrize(
     ("change", "match"),
     [
         # One NaN made every test of the same run significant: "first" was better in all metrics.
-        (lambda table: _value(table, math.nan), "values that are none"),
-        (lambda table: _value(table, -math.inf), "values that are none"),
-        (lambda table: _value(table, None), "values that are none"),
+        *((first_value(value), "values that are none") for value in (math.nan, -math.inf, None)),
         (lambda table: table.set_column(6, "metric", pa.nulls(len(table), pa.string())), "values that are none"),
         (lambda table: table.drop(["value"]), "Not a table of scores"),
         (lambda table: table.set_column(7, "value", pa.array(["a"] * len(table))), "Not a table of scores"),
@@ -125,22 +121,12 @@ def test_scores_that_are_none_are_refused(tmp_path: Path, change: Callable[[pa.T
     record_night(tmp_path / "history", "monday", {"evaluate_video": b})
     kept = next((tmp_path / "history" / "scores").iterdir())
     for path, place in ((b / SCORES_FILE, f"{b}"), (kept, f"{tmp_path / 'history'}:monday")):
-        if path == kept and match != "Parquet file is damaged":
-            continue  # other columns
-        changed = change(pq.read_table(path))
+        changed = change(pq.read_table(path)) if path != kept else b"PAR1 and no more"
         path.write_bytes(changed) if isinstance(changed, bytes) else pq.write_table(changed, path)
-        with pytest.raises(ArtifactError, match=match):
+        with pytest.raises(ArtifactError, match=match if path != kept else "Parquet file is damaged"):
             compare_runs(f"{a}", place)
-        with pytest.raises(ArtifactError, match=match):
+        with pytest.raises(ArtifactError, match=match if path != kept else "Parquet file is damaged"):
             record_night(tmp_path / "history", "tuesday", {"evaluate_video": b if path != kept else a})
-
-
-@pytest.mark.parametrize("inputs", [None, [], {"evaluate_video": {"path": 5}}, {"evaluate_video": {"path": "x"}}])
-def test_a_manifest_of_another_form_is_no_run(tmp_path: Path, inputs: object) -> None:
-    a = evaluation(tmp_path / "a", 0.0)
-    (tmp_path / "manifest.json").write_text(json.dumps({"inputs": inputs}))
-    with pytest.raises(ArtifactError, match="Nothing to compare here"):
-        compare_runs(f"{tmp_path}", f"{a}")
 
 
 def test_odd_names_of_methods_stay_names(tmp_path: Path) -> None:
@@ -151,18 +137,17 @@ def test_odd_names_of_methods_stay_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("step", "expected"),
+    ("step", "figures"),
     [
-        ("evaluate_video", ["group", "method", "robot_iou_exact@head", "robot_iou@head", "ssim@head", "psnr@head"]),
-        ("evaluate_policy", ["group", "method", "accuracy"]),
-        ("evaluate_planning", ["group", "method", "success"]),
+        ("evaluate_video", ["robot_iou_exact@head", "robot_iou@head", "ssim@head", "psnr@head"]),
+        ("evaluate_policy", ["accuracy"]),
+        ("evaluate_planning", ["success"]),
     ],
 )
 def test_an_evaluation_prints_its_headline_figures(
-    run_artifacts: dict[str, Path], step: str, expected: list[str]
+    run_artifacts: dict[str, Path], step: str, figures: list[str]
 ) -> None:
-    lines = figures_of(step, run_artifacts[step]).splitlines()
-    assert lines[0].split() == expected
-    first = next(line for line in lines if "shipped_" in line or "banks_" in line)
-    assert re.search(r"\d\.\d{3} \[\d\.\d{3}, \d\.\d{3}\] n=\d+", first)
+    heading, *lines = figures_of(step, run_artifacts[step]).splitlines()
+    assert heading.split() == ["group", "method", *figures]
+    assert any(re.search(r"(shipped|banks)_.*\d\.\d{3} \[\d\.\d{3}, \d\.\d{3}\] n=\d+", line) for line in lines)
     assert not any(line.startswith(("lift", "N=2 ", "test/")) for line in lines)  # splits, and the most candidates
