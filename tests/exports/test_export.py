@@ -1,25 +1,35 @@
-"""Exports of an EpisodeSet: read by LeRobot's own class and edited by its own tools, by MCAP and Rerun readers."""
+"""Exports: LeRobot's own class and tools, MCAP and Rerun readers open them, and find what was put in."""
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.reader import read_ros2_messages
+from PIL import Image
+from rerun.chunk import RrdReader
 
-from worldline_core.data.episodes.episode import REPEATS_STATE, CameraTrack, Episode
+from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImports]
+from tests.exports.conftest import COUNT  # pyright: ignore[reportMissingImports]
+from worldline_core.data.episodes.episode import REPEATS_STATE, VIEWS
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.mcap.exported import read_exported_episode
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.errors import ArtifactError, ConfigError, DataError
-from worldline_core.exports.export import export, shown_tracks
+from worldline_core.exports.export import export, export_rollout, shown_tracks, write_prediction_mcap
+from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.publishing import set_files
@@ -34,25 +44,14 @@ def linked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("sets")
     with EpisodeSetWriter(root / "curated") as writer:
         for number in range(3):
-            time = np.arange(FRAMES) / 10
-            state = np.stack([np.sin(time + number), np.cos(time)], axis=1).astype(np.float32)
-            rows, columns = np.mgrid[:32, :48]
-            shade = (columns[None] * 3 + rows[None] * 2 + 6 * np.arange(FRAMES)[:, None, None] + 30 * number) % 200
-            frames = np.stack([shade, 200 - shade, shade // 2], axis=-1).astype(np.uint8)
-            moving = np.tile(np.eye(4), (FRAMES, 1, 1))
-            moving[:, 0, 3] = time
-            cameras = {"head": CameraTrack("head", np.diag([40.0, 41.0, 1.0]), moving, 48, 32)}
-            episode = Episode(
-                episode_id=f"e{number}", source="toy", embodiment="toy", scene="s", task_family="lift", instruction=f"lift {number}",
-                outcome="success", split="train", fps=10.0, state=state, action=state + 1, timestamps=time, cameras=cameras,
-                state_names=("right/a", "right/gripper"),
-            )  # fmt: skip
-            writer.add(episode, {"head": frames}, {"head": shade < 60})
+            named = {"episode_id": f"e{number}", "embodiment": "toy", "instruction": f"lift {number}"}
+            rate = {"fps": 10.0, "timestamps": np.arange(FRAMES) / 10}
+            writer.add(*make_sample(number, num_frames=FRAMES, views=("head",), **named, **rate))
     (root / "curated/sources.json").write_text(json.dumps([{"label": "toy", "license": "MIT"}]))
     (root / "filtered").mkdir()
     rows = [replace(row, dataset=f"../curated/{row.dataset}") for row in read_index(root / "curated")]
-    whole, segment = rows[0], replace(rows[1], episode_id="e1#5-15", start=5, stop=15, num_frames=10, video_frames=10)
-    write_index(root / "filtered", [whole, segment, rows[2]])
+    segment = replace(rows[1], episode_id="e1#5-15", start=5, stop=15, num_frames=10, video_frames=10)
+    write_index(root / "filtered", [rows[0], segment, rows[2]])
     return root / "filtered"
 
 
@@ -114,8 +113,6 @@ def test_episodes_as_mcap_and_rerun(linked: Path, tmp_path: Path) -> None:
         assert np.array_equal(read.frames("head"), episodes.frames(1, "head"))
         assert np.array_equal(read.robot_masks("head"), episodes.robot_masks(1, "head"))
         assert np.array_equal(read.episode.state, episodes.episode(1).state)
-    from rerun.chunk import RrdReader
-
     reader = RrdReader(tmp_path / f"{stem}.rrd")
     assert len(reader.blueprints()) == 1
     assert {"/world/cameras/head/true", "/signals/action/right_gripper"} <= {c.entity_path for c in reader.stream()}
@@ -124,29 +121,22 @@ def test_episodes_as_mcap_and_rerun(linked: Path, tmp_path: Path) -> None:
 def test_a_rerun_export_holds_the_tools_and_names_what_they_are(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from rerun.chunk import RrdReader
-
     poses = np.tile(np.diag([1.0, -1, -1, 1]), (6, 1, 1, 1))
     poses[:, 0, :3, 3] = np.linspace([-0.2, 0, 0.8], [0.2, 0.1, 0.6], 6)
-    cameras = {"head": CameraTrack("head", np.diag([40.0, 41.0, 1.0]), np.eye(4)[None], 48, 32)}
     state = np.linspace(0, 1, 12, dtype=np.float32).reshape(6, 2)
+    arm = {"embodiment": "nobody", "state": state, "action": state, "state_names": ("right/a", "right/gripper")}
     with EpisodeSetWriter(tmp_path / "set") as writer:
-        for name, tools in (("recorded", poses), ("unknown", None)):
-            episode = Episode(
-                episode_id=name, source="toy", embodiment="nobody", scene="s", task_family="lift", instruction="lift", outcome="success",
-                split="train", fps=10.0, state=state, action=state, timestamps=np.arange(6) / 10, cameras=cameras, T_base_ee=tools,
-                gripper=None if tools is None else state[:, 1:], state_names=("right/a", "right/gripper"),
-            )  # fmt: skip
-            writer.add(episode, {"head": np.full((6, 32, 48, 3), 90, np.uint8)})
+        for name, tools in (("recorded", {"T_base_ee": poses, "gripper": state[:, 1:]}), ("unknown", {})):
+            writer.add(*make_sample(num_frames=6, views=("head",), episode_id=name, **arm, **tools)[:2])
     export(tmp_path / "set", tmp_path / "out", ["rrd"])
-    recorded = {
-        chunk.entity_path: chunk.to_record_batch() for chunk in RrdReader(tmp_path / "out/recorded.rrd").stream()
-    }
+    recorded, unknown = (
+        {chunk.entity_path: chunk.to_record_batch() for chunk in RrdReader(tmp_path / f"out/{name}.rrd").stream()}
+        for name in ("recorded", "unknown")
+    )
     assert {"/world/tools/arm0", "/world/tool_paths/arm0", "/world/cameras/head/actions"} <= set(recorded)
     # No commands are projected without kinematics: what is drawn is named, here and on the page of `inspect`.
     assert "tools and action maps: measured tool poses" in str(recorded["/description"].to_pylist())
     # Nobody describes this robot, so nothing tells where its tools are.
-    unknown = {chunk.entity_path for chunk in RrdReader(tmp_path / "out/unknown.rrd").stream()}
     assert "/world/cameras/head/true" in unknown
     assert not any(path.startswith("/world/tool") for path in unknown)
     assert "unknown.rrd has no tool poses" in caplog.text
@@ -155,18 +145,12 @@ def test_a_rerun_export_holds_the_tools_and_names_what_they_are(
 def test_controls_are_drawn_from_the_commands_where_tool_poses_are_recorded_too() -> None:
     """As in AgiBot World: joints with commands beside measured tool poses."""
     kinematics = ArmKinematics(load_embodiment("ur5e_pair"))
-    state = np.linspace(-0.3, 0.3, 4 * 14, dtype=np.float32).reshape(4, 14)
-    state[:, [6, 13]] = 0.5
+    state = make_sample()[0].state
     action = state + np.float32(0.1)
     measured, commanded = (
-        kinematics.tools_of(kinematics.link_poses(np.asarray(values, dtype=np.float64))).numpy()
-        for values in (state, action)
+        kinematics.tools_of(kinematics.link_poses(values.astype(np.float64))).numpy() for values in (state, action)
     )
-    episode = Episode(
-        episode_id="e", source="toy", embodiment="ur5e_pair", scene="s", task_family="lift", instruction="", outcome="unknown",
-        split="train", fps=10.0, state=state, action=action, timestamps=np.arange(4) / 10, T_base_ee=measured,
-        gripper=state[:, [6, 13]], cameras={"head": CameraTrack("head", np.diag([40.0, 41.0, 1.0]), np.eye(4)[None], 48, 32)},
-    )  # fmt: skip
+    episode = make_sample(action=action, T_base_ee=measured, gripper=state[:, [6, 13]])[0]
     tracks = shown_tracks(episode)
     assert tracks.controls == "action"
     assert np.allclose(tracks.T_base_tool, commanded, atol=1e-5)
@@ -185,9 +169,6 @@ def test_a_damaged_set_is_not_exported(linked: Path, tmp_path: Path) -> None:
     os.utime(video, ns=(facts.st_atime_ns, facts.st_mtime_ns))
     with pytest.raises(ArtifactError, match=rf"{video.name}: sha256"):
         export(folder, tmp_path / "out", ["lerobot"])
-
-
-def test_what_cannot_be_exported(linked: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"(?s)Not a format of EpisodeSet.*lerobot, mcap, mcap-ros2, rrd.*mp4"):
         export(linked, tmp_path, ["mp4"])
     with pytest.raises(DataError, match=r"(?s)No such episode.*nothing"):
@@ -196,15 +177,89 @@ def test_what_cannot_be_exported(linked: Path, tmp_path: Path) -> None:
 
 def test_demonstrations_alone_are_exported(linked: Path, tmp_path: Path) -> None:
     """Recordings that ended in success; their datasets have these episodes and no others."""
-    (tmp_path / "mixed").mkdir()
-    rows = [
-        replace(row, dataset=f"{linked.parent}/mixed/../curated/datasets/toy", outcome=outcome)
-        for row, outcome in zip(read_index(linked), ("success", "failure", "success"), strict=True)
-    ]
-    relative = [replace(row, dataset=os.path.relpath(row.dataset, tmp_path / "mixed")) for row in rows]
-    write_index(tmp_path / "mixed", relative)
-    export(tmp_path / "mixed", tmp_path / "out", ["lerobot"], outcome="success")
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    dataset = os.path.relpath(linked.parent / "curated/datasets/toy", mixed)
+    outcomes = ("success", "failure", "success")
+    rows = [replace(row, dataset=dataset, outcome=o) for row, o in zip(read_index(linked), outcomes, strict=True)]
+    write_index(mixed, rows)
+    export(mixed, tmp_path / "out", ["lerobot"], outcome="success")
     assert [row.episode_id for row in EpisodeSet.open(tmp_path / "out").rows] == ["e0", "e2"]
     assert json.loads((tmp_path / "out/datasets/toy/meta/info.json").read_text())["total_episodes"] == 2
     with pytest.raises(DataError, match=r"(?s)No episode is exported.*failure.*success.*partial"):
-        export(tmp_path / "mixed", tmp_path / "other", ["lerobot"], outcome="partial")
+        export(mixed, tmp_path / "other", ["lerobot"], outcome="partial")
+
+
+@pytest.fixture(scope="module")
+def chunks(content: RecordingContent, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list]:
+    """Record batches by entity, read by Rerun's own reader."""
+    path = tmp_path_factory.mktemp("rerun") / "episode.rrd"
+    write_rerun_recording(path, content)
+    reader = RrdReader(path)
+    assert len(reader.blueprints()) == 1
+    found: dict[str, list] = {}
+    for chunk in reader.stream():
+        found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return found
+
+
+def column(batches: list, name: str) -> list:
+    return [row for batch in batches if name in batch.schema.names for row in batch.column(name).to_pylist()]
+
+
+def test_rerun_holds_frames_of_every_view_and_method(chunks: dict[str, list], content: RecordingContent) -> None:
+    for view in VIEWS:
+        for entity in (f"/world/cameras/{view}/true", f"/world/cameras/{view}/actions", f"/predicted/stage2/{view}"):
+            assert len(column(chunks[entity], "EncodedImage:blob")) == COUNT
+    blob = column(chunks["/world/cameras/head/true"], "EncodedImage:blob")[2][0]
+    with Image.open(io.BytesIO(bytes(blob))) as picture:
+        error = np.abs(np.asarray(picture, dtype=int) - content.true_frames["head"][2]).mean()
+    assert error < 12  # JPEG of noise
+
+
+def test_rerun_poses_are_those_of_the_cameras(chunks: dict[str, list], content: RecordingContent) -> None:
+    for view, count in (("head", 1), ("left_wrist", COUNT)):
+        batches, expected = chunks[f"/world/cameras/{view}"], content.episode.cameras[view].T_base_camera
+        stored = np.array(column(batches, "Transform3D:mat3x3")).reshape(count, 3, 3).transpose(0, 2, 1)  # column-major
+        places = np.array(column(batches, "Transform3D:translation")).reshape(count, 3)
+        assert np.allclose(stored, expected[:, :3, :3], atol=1e-6)
+        assert np.allclose(places, expected[:, :3, 3], atol=1e-6)
+    pinhole = np.array(column(chunks["/world/cameras/head"], "Pinhole:image_from_camera")).reshape(3, 3).T
+    assert pinhole[:2, 2] == pytest.approx([24.0, 16.0])  # counted from the corner, not from the first pixel's centre
+
+
+def test_rerun_signals_are_named_and_timed_and_the_robot_lies_along_its_capsules(
+    chunks: dict[str, list], content: RecordingContent
+) -> None:
+    values = np.array(column(chunks["/signals/action/right_gripper"], "Scalars:scalars"))[:, 0]
+    assert np.allclose(values, content.episode.action[:, 13])
+    times = column(chunks["/signals/state/left_j0"], "time")
+    assert [time.total_seconds() for time in times] == pytest.approx([0, 0.125, 0.25, 0.375, 0.5])
+    strips = column(chunks["/world/robot"], "LineStrips3D:strips")
+    assert len(strips) == COUNT
+    assert np.allclose(strips[2][0], content.tracks.capsules[2, 0])
+    assert column(chunks["/world/robot"], "LineStrips3D:radii")[0] == pytest.approx([0.01])
+
+
+def test_mcap_holds_images_calibration_and_transforms(content: RecordingContent, tmp_path: Path) -> None:
+    path, again, ros2 = (tmp_path / f"{name}.mcap" for name in ("episode", "again", "ros2"))
+    for file in (path, again):
+        write_prediction_mcap(file, content, "stage2", "protobuf")
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        found = [(channel.topic, message.log_time) for _, channel, message in reader.iter_messages()]
+        facts = next(m.metadata for m in reader.iter_metadata() if m.name == "worldline.rollout")
+    topics = {f"/{v}/{name}": count for v in VIEWS for name, count in (("image", COUNT), ("calibration", 1))}
+    assert Counter(topic for topic, _ in found) == topics | {"/tf": 1 + 2 * COUNT + 2 * COUNT}
+    assert found[-1][1] == round((COUNT - 1) / 8.0 * 1e9)
+    assert json.loads(facts["method"]) == "stage2"
+    assert again.read_bytes() == path.read_bytes()
+    write_prediction_mcap(ros2, content, "stage2", "ros2")
+    counts = Counter(message.channel.topic for message in read_ros2_messages(str(ros2)))
+    assert counts == topics | {"/tf": 4 * COUNT, "/tf_static": 1}
+
+
+def test_an_episode_without_a_prediction_is_named(tmp_path: Path) -> None:
+    rollouts: Any = {"stage2": SimpleNamespace(method="stage2", episode_ids=("robot/1",))}
+    with pytest.raises(DataError, match=r"(?s)robot/2.*stage2"):
+        export_rollout(rollouts, None, None, "robot/2", tmp_path, ("mp4",))  # type: ignore[arg-type]

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.data.conftest import FPS, make_sample  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.overlays import write_overlay_video
-from worldline_core.config import validate
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.mcap.exported import read_exported_episode
 from worldline_core.data.mcap.file import McapFile
@@ -30,7 +30,6 @@ from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 SHORT, LONG = 80, 240
 HEIGHT, WIDTH = 96, 128
 FRAME_BYTES = 3 * HEIGHT * WIDTH
-FPS = 10.0
 
 
 def write_set(root: Path, count: int) -> None:
@@ -38,31 +37,24 @@ def write_set(root: Path, count: int) -> None:
     time = np.arange(count) / FPS
     poses = np.tile(np.diag([1.0, -1, -1, 1]), (count, 1, 1, 1))
     poses[:, 0, :3, 3] = np.stack([0.2 * np.sin(time), 0.1 * np.cos(time), np.full(count, 0.8)], axis=1)
-    K = np.array([[90.0, 0, 63.5], [0, 91.0, 47.5], [0, 0, 1]])
     state = np.stack([np.sin(time), 0.5 + 0.5 * np.cos(time)], axis=1).astype(np.float32)
-    episode = Episode(
-        episode_id="long", source="toy", embodiment="none", scene="s", task_family="lift", instruction="lift the red cube",
-        outcome="success", split="test", fps=FPS, state=state, action=state, timestamps=time, T_base_ee=poses, gripper=state[:, 1:],
-        cameras={view: CameraTrack(view, K, np.eye(4)[None], WIDTH, HEIGHT) for view in VIEWS}, state_names=("right/a", "right/gripper"),
+    episode, clips, masks = make_sample(
+        num_frames=count, height=HEIGHT, width=WIDTH, episode_id="long", embodiment="none", split="test", state=state,
+        action=state, state_names=("right/a", "right/gripper"), T_base_ee=poses, gripper=state[:, 1:],
     )  # fmt: skip
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    shade = ((columns + rows)[None] + 3 * np.arange(count)[:, None, None]) % 200
-    frames = np.stack([shade, 200 - shade, shade // 2], axis=-1).astype(np.uint8)
     with EpisodeSetWriter(root / "episodes", video_preset="ultrafast", pixel_format="yuv444p") as writer:
-        writer.add(
-            episode, dict.fromkeys(VIEWS, frames), {"head": shade < 60}, None, {"head": (shade < 20).astype(np.uint8)}
-        )
-    writer = RolloutSetWriter(root / "rollouts", "stage2", FPS)
-    writer.add("long", 0, dict.fromkeys(VIEWS, frames))
-    writer.close()
+        writer.add(episode, clips, {"head": masks["head"]}, None, {"head": masks["head"].astype(np.uint8)})
+    predictions = RolloutSetWriter(root / "rollouts", "stage2", FPS)
+    predictions.add("long", 0, clips)
+    predictions.close()
 
 
 class Recorded:
     """A set that `write_set` wrote, as the outputs below take it."""
 
     def __init__(self, root: Path) -> None:
-        self.root = root
-        self.episodes, self.rollouts = EpisodeSet.open(root / "episodes"), RolloutSet.open(root / "rollouts")
+        self.set, self.predictions = root / "episodes", root / "rollouts"
+        self.episodes, self.rollouts = EpisodeSet.open(self.set), RolloutSet.open(self.predictions)
         self.tracks_of_episode = shown_tracks(self.episodes.episode(0))
         self.videos = {view: VideoFrames(self.episodes.clip(0, view)) for view in VIEWS}
 
@@ -80,26 +72,22 @@ class Still(ColourSegmenter):
         return lambda video, _: video[..., 0] < 60
 
 
-def measured(recorded: Recorded, _: Path) -> None:
-    tracks: Any = recorded
-    measurement = EpisodeMeasurement(
-        recorded.episodes, tracks, recorded.episodes.rows[0], ("head",), {"": Still()}, None, {}
-    )
+def measured(recorded: Any, _: Path) -> None:
+    row = recorded.episodes.rows[0]
+    measurement = EpisodeMeasurement(recorded.episodes, recorded, row, ("head",), {"": Still()}, None, {})
     values = measurement.measure({"stage2": recorded.rollouts})["true"]["measured"][0]["frames"]
     assert len(values["robot_iou_exact"]) == len(recorded.videos["head"])
 
 
 def curated(recorded: Recorded, output: Path) -> None:
-    source = {"kind": "episode_set", "name": "again", "path": str(recorded.root / "episodes")}
-    curate(validate(CurateConfig, {"sources": [source], "image_size": [48, 64]}, where="test"), {}, output)
+    source = {"kind": "episode_set", "name": "again", "path": str(recorded.set)}
+    curate(CurateConfig.model_validate({"sources": [source], "image_size": [48, 64]}), {}, output)
     assert EpisodeSet.open(output).robot_masks(0, "head") is not None
 
 
 def read_mcap(recorded: Recorded, output: Path) -> None:
-    (path,) = export(recorded.root / "episodes", output, ["mcap"])
-    loaded = read_exported_episode(McapFile(path))
-    exact = recorded.episodes.robot_masks(0, "head")
-    read = loaded.robot_masks("head")
+    (path,) = export(recorded.set, output, ["mcap"])
+    exact, read = recorded.episodes.robot_masks(0, "head"), read_exported_episode(McapFile(path)).robot_masks("head")
     assert exact is not None
     assert read is not None
     for one, other in zip(exact, read, strict=True):
@@ -110,24 +98,19 @@ WITH_THUMBNAILS = "episode as lerobot"
 """Keeps grey thumbnails of 72 x 96 until the episode is whole, 0.19 of a view's frames each: those of three views, one of them
 twice while it is stacked, and what they are packed into: 0.97 when measured."""
 SLOW = ("episode as mcap", "episode as rrd", "rollout as mcap and rrd", "inspect", "overlay", "curate", "exact masks")
+
 OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
-    "side by side": lambda recorded, output: write_side_by_side(
-        output / "a.mp4", {"true": recorded.videos["head"], "again": recorded.videos["head"]}, FPS, tile_height=96
+    "side by side": lambda r, out: write_side_by_side(
+        out / "a.mp4", {"true": r.videos["head"], "again": r.videos["head"]}, FPS, tile_height=96
     ),
-    "overlay": lambda recorded, output: write_overlay_video(
-        output / "a.mp4", recorded.videos, recorded.tracks_of_episode, FPS, tile_height=96
-    ),
+    "overlay": lambda r, out: write_overlay_video(out / "a.mp4", r.videos, r.tracks_of_episode, FPS, tile_height=96),
     "episode as mcap": read_mcap,
-    "episode as rrd": lambda recorded, output: export(recorded.root / "episodes", output, ["rrd"]),
-    "episode as lerobot": lambda recorded, output: export(recorded.root / "episodes", output, ["lerobot"]),
-    "rollout as mcap and rrd": lambda recorded, output: export(
-        recorded.root / "rollouts", output, ["mcap", "rrd"], episodes=recorded.root / "episodes"
-    ),
-    "worldarena": lambda recorded, output: export(
-        recorded.root / "rollouts", output, ["worldarena"], episodes=recorded.root / "episodes"
-    ),
-    "sheet of a rollout": lambda recorded, output: inspect(recorded.root / "rollouts", output),
-    "inspect": lambda recorded, output: inspect(recorded.root / "episodes", output, episode_id="long"),
+    "episode as rrd": lambda r, out: export(r.set, out, ["rrd"]),
+    "episode as lerobot": lambda r, out: export(r.set, out, ["lerobot"]),
+    "rollout as mcap and rrd": lambda r, out: export(r.predictions, out, ["mcap", "rrd"], episodes=r.set),
+    "worldarena": lambda r, out: export(r.predictions, out, ["worldarena"], episodes=r.set),
+    "sheet of a rollout": lambda r, out: inspect(r.predictions, out),
+    "inspect": lambda r, out: inspect(r.set, out, episode_id="long"),
     "exact masks": measured,
     "curate": curated,
 }

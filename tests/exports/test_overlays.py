@@ -1,15 +1,17 @@
-"""The drawer of overlays: what is drawn, where, in which colour; and that nothing is drawn of what is not valid."""
+"""What is drawn: overlays, their places and colours; sheets and side-by-side videos."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from tests.exports.conftest import CAMERA_MATRIX, HEIGHT, WIDTH, tracks_of  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.action_maps import render_action_maps
-from worldline_core.actions.episode_tracks import collate_tracks
+from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
 from worldline_core.actions.overlays import (
     ARM_COLOURS,
     AXIS_COLOURS,
@@ -19,34 +21,46 @@ from worldline_core.actions.overlays import (
     axis_tips,
     draw_overlay,
     gaussian,
-    heat_layer,
     legend_strip,
     overlay_clip,
     overlay_sheet,
     picture_pixel,
     write_overlay_video,
 )
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.video.clip import decode_video
 from worldline_core.errors import DataError
-from worldline_core.pictures import COLUMN_GAP_PX, LABEL_HEIGHT_PX, text_width_px
+from worldline_core.pictures import (
+    COLUMN_GAP_PX,
+    LABEL_HEIGHT_PX,
+    SheetRow,
+    contact_sheet,
+    evenly_spaced,
+    scaled_size,
+    side_by_side,
+    text_width_px,
+    write_side_by_side,
+)
 
-HEIGHT, WIDTH = 32, 48
-"""As `conftest` makes tracks."""
 GREY = 90
 NO_HEAT = OverlayStyle(heat=0.0)
 
 
-def grey(count: int | None = None) -> np.ndarray:
-    shape = (HEIGHT, WIDTH, 3) if count is None else (count, HEIGHT, WIDTH, 3)
-    return np.full(shape, GREY, dtype=np.uint8)
+def grey(count: int) -> np.ndarray:
+    return np.full((count, HEIGHT, WIDTH, 3), GREY, dtype=np.uint8)
 
 
-@pytest.fixture
-def one_arm(hand_tracks):
-    def make(u: float, v: float, gripper: float = 1.0, valid: bool = True):
-        return hand_tracks(np.array([[[[u, v]]]]), np.array([[[valid]]]), gripper, views=("head",))
+FRAME = grey(1)[0]
 
-    return make
+
+def one_arm(u: float = 24, v: float = 16, gripper: float = 1.0, valid: bool = True) -> EpisodeTracks:
+    return tracks_of(np.array([[[[u, v]]]]), np.array([[[valid]]]), gripper, views=("head",))
+
+
+def two_arms(
+    left: tuple[float, float], right: tuple[float, float], valid: tuple[bool, bool], **more: float
+) -> EpisodeTracks:
+    return tracks_of(np.array([[[left, right]]]), np.array([[valid]]), views=("head",), **more)
 
 
 def changed(picture: np.ndarray) -> np.ndarray:
@@ -57,11 +71,10 @@ def near(picture: np.ndarray, colour: tuple[int, int, int], tolerance: int = 40)
     return np.all(np.abs(picture.astype(int) - colour) <= tolerance, axis=-1)
 
 
-def test_heat_is_channel_zero_of_the_action_maps(hand_tracks) -> None:
-    uv = np.array([[[[13.25, 9.5], [40.0, 30.5]]]])
-    tracks = hand_tracks(uv, np.ones((1, 1, 2), bool), views=("head",))
+def test_heat_is_channel_zero_of_the_action_maps() -> None:
+    tracks = two_arms((13.25, 9.5), (40.0, 30.5), (True, True))
     maps = render_action_maps(collate_tracks([tracks]), (HEIGHT, WIDTH), (HEIGHT, WIDTH), 20.0, dtype=torch.float64)
-    both = sum(gaussian(uv[0, 0, arm], HEIGHT, WIDTH, 20.0) for arm in (0, 1))
+    both = sum(gaussian(tracks.uv[0, 0, arm], HEIGHT, WIDTH, 20.0) for arm in (0, 1))
     assert np.abs(maps[0, 0, 0, 0].numpy() - both).max() < 1e-6
 
 
@@ -72,160 +85,155 @@ def test_a_pixel_keeps_its_place_in_an_enlarged_picture() -> None:
     assert np.allclose(corner, [383.5, 255.5])
 
 
-def test_invalid_samples_leave_the_frame_untouched(one_arm) -> None:
-    picture = draw_overlay(grey(), one_arm(20, 16, valid=False), 0, "head", tile_height=HEIGHT)
-    assert np.array_equal(picture, grey())
-
-
-def test_only_the_valid_arm_is_drawn(hand_tracks) -> None:
-    tracks = hand_tracks(np.array([[[[10.0, 16.0], [40.0, 16.0]]]]), np.array([[[True, False]]]), views=("head",))
-    drawn = changed(draw_overlay(grey(), tracks, 0, "head", tile_height=128))
+def test_what_is_not_valid_is_not_drawn() -> None:
+    assert np.array_equal(draw_overlay(FRAME, one_arm(valid=False), 0, "head", tile_height=HEIGHT), FRAME)
+    tracks = two_arms((10.0, 16.0), (40.0, 16.0), (True, False))
+    drawn = changed(draw_overlay(FRAME, tracks, 0, "head", tile_height=128))
     assert drawn[:, :80].any()
     assert not drawn[:, 120:].any()
+    with pytest.raises(DataError, match=r"(?s)do not reach there.*view left_wrist, frame 0"):
+        draw_overlay(FRAME, tracks, 0, "left_wrist")
+    with pytest.raises(DataError, match=r"(?s)frames 0\.\.0.*frame 1"):
+        draw_overlay(FRAME, tracks, 1, "head")
 
 
-@pytest.mark.parametrize(("arm", "name"), [(0, "left"), (1, "right")])
-def test_rings_have_the_arm_s_colour_and_lie_around_the_tool(arm: int, name: str, hand_tracks) -> None:
-    valid = np.zeros((1, 1, 2), bool)
-    valid[0, 0, arm] = True
-    tracks = hand_tracks(np.full((1, 1, 2, 2), 16.0), valid, gripper=0.0, views=("head",))
-    picture = draw_overlay(grey(), tracks, 0, "head", tile_height=256, style=NO_HEAT)
-    rows, columns = np.nonzero(near(picture, ARM_COLOURS[name]))
-    centre = picture_pixel(np.array([16.0, 16.0]), (HEIGHT, WIDTH), (256, 384))
-    assert len(rows) > 10
-    assert np.hypot(columns - centre[0], rows - centre[1]).max() < 12
-    other = ARM_COLOURS["right" if name == "left" else "left"]
-    assert not near(picture, other, 20).any()
+@pytest.mark.parametrize(("arm", "other"), [("left", "right"), ("right", "left")])
+def test_rings_have_the_arm_s_colour_and_lie_around_the_tool(arm: str, other: str) -> None:
+    def radii(gripper: float) -> np.ndarray:
+        """Distances of the ring's pixels from the tool."""
+        tracks = two_arms((16.0, 16.0), (16.0, 16.0), (arm == "left", arm == "right"), gripper=gripper)
+        picture = draw_overlay(FRAME, tracks, 0, "head", tile_height=256, style=NO_HEAT)
+        assert not near(picture, ARM_COLOURS[other], 20).any()
+        rows, columns = np.nonzero(near(picture, ARM_COLOURS[arm]))
+        u, v = picture_pixel(np.array([16.0, 16.0]), (HEIGHT, WIDTH), (256, 384))
+        return np.hypot(columns - u, rows - v)
+
+    closed, half, wide = (radii(gripper) for gripper in (0.0, 0.5, 1.0))
+    assert len(closed) > 10
+    assert closed.max() < 12
+    assert np.median(closed) < np.median(half) < np.median(wide)
+    assert np.array_equal(radii(7.0), wide)
 
 
-def test_an_open_gripper_has_a_wider_ring(one_arm) -> None:
-    def radius(gripper: float) -> float:
-        picture = draw_overlay(grey(), one_arm(24, 16, gripper), 0, "head", tile_height=256, style=NO_HEAT)
-        rows, columns = np.nonzero(near(picture, ARM_COLOURS["right"]))
-        centre = picture_pixel(np.array([24.0, 16.0]), (HEIGHT, WIDTH), (256, 384))
-        return float(np.median(np.hypot(columns - centre[0], rows - centre[1])))
-
-    assert radius(0.0) < radius(0.5) < radius(1.0)
-    assert radius(7.0) == radius(1.0)
-
-
-def test_axes_end_where_the_camera_puts_them(one_arm, camera_matrix) -> None:
-    tracks = one_arm(24, 16)
-    x, y, z = axis_tips(tracks, 0, 0, 0)
-    origin = np.linalg.inv(camera_matrix) @ [24, 16, 1] * 0.8
-    for tip, direction in ((x, [0.06, 0, 0]), (y, [0, 0.06, 0]), (z, [0, 0, 0.06])):
-        expected = camera_matrix @ (origin + direction)
-        assert tip is not None
+def test_axes_end_where_the_camera_puts_them() -> None:
+    tracks = one_arm()
+    tips = axis_tips(tracks, 0, 0, 0)
+    origin = np.linalg.inv(CAMERA_MATRIX) @ [24, 16, 1] * 0.8
+    for tip, direction in zip(tips, 0.06 * np.eye(3), strict=True):
+        expected = CAMERA_MATRIX @ (origin + direction)
         assert np.allclose(tip, expected[:2] / expected[2], atol=1e-4)
-    picture = draw_overlay(grey(), tracks, 0, "head", tile_height=256, style=NO_HEAT)
-    assert x is not None
-    u, v = np.rint(picture_pixel(x, (HEIGHT, WIDTH), (256, 384))).astype(int)
+    picture = draw_overlay(FRAME, tracks, 0, "head", tile_height=256, style=NO_HEAT)
+    u, v = np.rint(picture_pixel(np.array(tips[0]), (HEIGHT, WIDTH), (256, 384))).astype(int)
     assert near(picture, AXIS_COLOURS[0])[v - 2 : v + 3, u - 4 : u + 1].any()
-
-
-def test_an_axis_behind_the_camera_is_left_out(one_arm) -> None:
-    tracks = one_arm(24, 16)
-    tracks.rot6d[..., :3], tracks.rot6d[..., 3:] = (0, 0, -1), (0, 1, 0)  # x points at the camera
+    tracks.rot6d[..., :3], tracks.rot6d[..., 3:] = (0, 0, -1), (0, 1, 0)  # x points at the camera and ends behind it
     tracks.depth[:] = 0.05
-    x, y, z = axis_tips(tracks, 0, 0, 0)
-    assert x is None
-    assert y is not None
-    assert z is not None
-    assert changed(draw_overlay(grey(), tracks, 0, "head")).any()
+    assert [tip is None for tip in axis_tips(tracks, 0, 0, 0)] == [True, False, False]
+    assert changed(draw_overlay(FRAME, tracks, 0, "head")).any()
 
 
-def test_large_frames_are_reduced_and_small_ones_enlarged_by_a_whole_factor(one_arm) -> None:
-    tracks = one_arm(24, 16)
-    assert draw_overlay(grey(), tracks, 0, "head", tile_height=250).shape == (224, 336, 3)
-    large = np.full((640, 960, 3), GREY, dtype=np.uint8)
-    picture = draw_overlay(large, tracks, 0, "head", tile_height=256, style=NO_HEAT)
-    assert picture.shape == (256, 384, 3)
-    small = draw_overlay(grey(), tracks, 0, "head", tile_height=256, style=NO_HEAT)
-    assert np.array_equal(changed(picture), changed(small))
+def test_large_frames_are_reduced_and_small_ones_enlarged_by_a_whole_factor() -> None:
+    tracks = one_arm()
+    assert draw_overlay(FRAME, tracks, 0, "head", tile_height=250).shape == (224, 336, 3)
+    frames = (FRAME, np.full((640, 960, 3), GREY, dtype=np.uint8))
+    small, large = (draw_overlay(f, tracks, 0, "head", tile_height=256, style=NO_HEAT) for f in frames)
+    assert large.shape == (256, 384, 3)
+    assert np.array_equal(changed(large), changed(small))
 
 
-def test_the_outline_encloses_the_capsule(one_arm) -> None:
-    tracks = one_arm(24, 16, valid=False)
-    mask = arm_mask(tracks, 0, "head", (256, 384))
+def test_the_outline_encloses_the_capsule() -> None:
+    tracks = one_arm(valid=False)
     # The capsule spans -0.1..0.1 m at 0.8 m with radius 0.05: 8 by 40 * 0.3 / 0.8 = 15 pixels wide, times 8.
-    rows, columns = np.nonzero(mask)
+    rows, columns = np.nonzero(arm_mask(tracks, 0, "head", (256, 384)))
     assert np.ptp(columns) == pytest.approx(8 * 40 * 0.3 / 0.8, abs=3)
     assert np.ptp(rows) == pytest.approx(8 * 41 * 0.1 / 0.8, abs=3)
-    plain = draw_overlay(grey(), tracks, 0, "head", style=OverlayStyle())
-    assert not changed(plain).any()
-    outlined = draw_overlay(grey(), tracks, 0, "head", style=OverlayStyle(outline=True))
-    drawn = np.argwhere(near(outlined, (255, 255, 255), 20))
-    assert abs(drawn[:, 1].min() - columns.min()) <= 3
-    assert abs(drawn[:, 1].max() - columns.max()) <= 3
+    assert not changed(draw_overlay(FRAME, tracks, 0, "head", style=OverlayStyle())).any()
+    outlined = draw_overlay(FRAME, tracks, 0, "head", style=OverlayStyle(outline=True))
+    drawn = np.nonzero(near(outlined, (255, 255, 255), 20))[1]
+    assert abs(drawn.min() - columns.min()) <= 3
+    assert abs(drawn.max() - columns.max()) <= 3
 
 
-def test_the_heat_layer_is_transparent_where_nothing_is(hand_tracks) -> None:
-    tracks = hand_tracks(np.array([[[[10.0, 10.0], [30.0, 20.0]]]]), np.array([[[True, False]]]), views=("head",))
-    layer = heat_layer(tracks, 0, "head", (HEIGHT, WIDTH))
-    assert layer[10, 10, 3] > 150
-    assert tuple(layer[10, 10, :3]) == ARM_COLOURS["left"]
-    assert layer[20, 30, 3] == 0
+MOVING = tracks_of(np.full((4, 3, 1, 2), 16.0) + np.arange(4).reshape(4, 1, 1, 1) * (1, 0), np.ones((4, 3, 1), bool))
+"""One arm that moves to the right in every view."""
 
 
-def test_a_view_or_frame_that_is_not_there_is_named(one_arm) -> None:
-    tracks = one_arm(24, 16)
-    with pytest.raises(DataError, match=r"(?s)do not reach there.*view left_wrist, frame 0"):
-        draw_overlay(grey(), tracks, 0, "left_wrist")
-    with pytest.raises(DataError, match=r"(?s)frames 0\.\.0.*frame 1"):
-        draw_overlay(grey(), tracks, 1, "head")
-
-
-@pytest.fixture
-def four_frames(hand_tracks):
-    """One arm that moves to the right in every view."""
-    uv = np.full((4, 3, 1, 2), 16.0)
-    uv[:, :, 0, 0] += np.arange(4)[:, None]
-    return hand_tracks(uv, np.ones((4, 3, 1), bool))
-
-
-def test_a_clip_shows_all_views_and_moves(four_frames) -> None:
+def test_clips_and_sheets_show_all_views() -> None:
     frames = {"head": grey(4), "right_wrist": grey(3)}
-    clip = np.stack(list(overlay_clip(frames, four_frames, 8.0, tile_height=128, title="robot")))
+    clip = np.stack(list(overlay_clip(frames, MOVING, 8.0, tile_height=128, title="robot")))
     # As long as the shortest; two tiles of 128 x 192, a gap, a heading and a legend; even sides.
     height, width = 128 + LABEL_HEIGHT_PX + LEGEND_HEIGHT_PX, 2 * 192 + COLUMN_GAP_PX
     assert clip.shape == (3, height, width, 3)
-    left, right = (
-        clip[:, LABEL_HEIGHT_PX:-LEGEND_HEIGHT_PX, :192],
-        clip[:, LABEL_HEIGHT_PX:-LEGEND_HEIGHT_PX, -192:],
-    )
-    assert np.array_equal(left, right)
-    assert not np.array_equal(left[0], left[2])
+    body = clip[:, LABEL_HEIGHT_PX:-LEGEND_HEIGHT_PX]
+    assert np.array_equal(body[:, :, :192], body[:, :, -192:])
+    assert not np.array_equal(body[0], body[2])
     assert not np.array_equal(clip[0, -LEGEND_HEIGHT_PX:], clip[1, -LEGEND_HEIGHT_PX:])  # the frame number
+    plain, outlined = (
+        overlay_sheet(dict.fromkeys(frames, grey(2)), MOVING, [0, 3], tile_height=64, style=OverlayStyle(outline=outline)) for outline in (False, True)
+    )  # fmt: skip
+    assert plain.shape == outlined.shape
+    assert plain.shape[0] > 2 * 64 + LEGEND_HEIGHT_PX
     with pytest.raises(DataError, match=r"(?s)No view to draw.*top"):
-        overlay_clip({"top": grey(3)}, four_frames, 8.0)
+        overlay_clip({"top": grey(3)}, MOVING, 8.0)
+    with pytest.raises(DataError, match="no view with a track"):
+        overlay_sheet({"top": grey(2)}, MOVING, [0, 3])
 
 
-def test_the_video_plays_and_repeats_to_the_byte(tmp_path: Path, four_frames) -> None:
-    frames = {"head": grey(4), "left_wrist": grey(4), "right_wrist": grey(4)}
+def test_the_video_plays_and_repeats_to_the_byte(tmp_path: Path) -> None:
     for name in ("a.mp4", "b.mp4"):
-        write_overlay_video(tmp_path / name, frames, four_frames, 8.0, tile_height=64)
+        write_overlay_video(tmp_path / name, dict.fromkeys(VIEWS, grey(4)), MOVING, 8.0, tile_height=64)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
     shown = decode_video(tmp_path / "a.mp4")
     assert shown.shape == (4, 64 + LABEL_HEIGHT_PX + LEGEND_HEIGHT_PX, 3 * 96 + 2 * COLUMN_GAP_PX, 3)
     assert near(shown[0], ARM_COLOURS["right"], 60).any()
 
 
-def test_a_sheet_has_a_row_a_view_and_a_legend(four_frames) -> None:
-    frames = {"head": grey(2), "left_wrist": grey(2)}
-    sheet = overlay_sheet(frames, four_frames, [0, 3], tile_height=64)
-    with_outline = overlay_sheet(frames, four_frames, [0, 3], tile_height=64, style=OverlayStyle(outline=True))
-    assert sheet.shape == with_outline.shape
-    assert sheet.shape[0] > 2 * 64 + LEGEND_HEIGHT_PX
-    with pytest.raises(DataError, match="no view with a track"):
-        overlay_sheet({"top": grey(2)}, four_frames, [0, 3])
-
-
 def test_the_legend_never_loses_its_note() -> None:
-    note = "frame 12"
-    wide, narrow = (legend_strip(("left", "right"), width, note=note) for width in (900, 160))
-    end = text_width_px(note, 13)
+    wide, narrow = (legend_strip(("left", "right"), width, note="frame 12") for width in (900, 160))
+    end = text_width_px("frame 12", 13)
     assert wide.shape == (LEGEND_HEIGHT_PX, 900, 3)
     assert np.array_equal(wide[:, -end - 8 :], narrow[:, -end - 8 :])
-    assert near(wide, ARM_COLOURS["left"], 5).any()
-    assert near(wide, ARM_COLOURS["right"], 5).any()
-    assert not near(narrow, ARM_COLOURS["right"], 5).any()
+    for strip, shown in ((wide, True), (narrow, False)):
+        assert near(strip, ARM_COLOURS["right"], 5).any() == shown
+
+
+def clip(count: int, value: int, size: tuple[int, int] = (64, 96)) -> np.ndarray:
+    return np.full((count, *size, 3), value, dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [((64, 96, 256), (256, 384)), ((480, 640, 256), (256, 342)), ((63, 95, 64), (64, 96)), ((300, 301, 256), (256, 258))],
+)  # fmt: skip
+def test_display_sizes_are_even_and_fit(size: tuple[int, int, int], expected: tuple[int, int]) -> None:
+    assert scaled_size(*size) == expected
+
+
+def test_evenly_spaced_holds_both_ends() -> None:
+    assert evenly_spaced(33, 5) == [0, 8, 16, 24, 32]
+    assert evenly_spaced(2, 5) == [0, 1]
+    assert evenly_spaced(0, 5) == []
+
+
+def test_contact_sheet_holds_every_picture() -> None:
+    rows = [SheetRow("first", clip(3, 200), "note"), SheetRow("second", clip(2, 90, (32, 32)))]
+    sheet = contact_sheet(rows, tile_height=64, title="sheet", column_titles=["a", "b", "c"])
+    assert (sheet == 200).all(axis=-1).sum() == 3 * 64 * 96
+    assert (sheet == 90).all(axis=-1).sum() == 2 * 64 * 64
+    assert np.array_equal(sheet, contact_sheet(rows, tile_height=64, title="sheet", column_titles=["a", "b", "c"]))
+    with pytest.raises(ValueError, match="at least one row"):
+        contact_sheet([])
+
+
+def test_columns_stay_in_step_and_end_with_the_shortest(tmp_path: Path) -> None:
+    columns = {"true": clip(9, 10), "Stage II": clip(5, 20), "causal": clip(7, 30, (32, 48))}
+    frames = np.stack(list(side_by_side(columns, tile_height=64)))
+    assert frames.shape == (5, 64 + LABEL_HEIGHT_PX, 3 * 96 + 2 * COLUMN_GAP_PX, 3)
+    body = frames[:, LABEL_HEIGHT_PX:]
+    starts = (0, 96 + COLUMN_GAP_PX, 2 * (96 + COLUMN_GAP_PX))
+    assert [int(body[:, :, start : start + 96].mean()) for start in starts] == [10, 20, 30]
+    one, two = (write_side_by_side(tmp_path / name, columns, 8.0, tile_height=64) for name in ("a.mp4", "b.mp4"))
+    assert one.video.read_bytes() == two.video.read_bytes()
+    assert np.abs(decode_video(one.video).astype(int) - frames).mean() < 3
+    assert cv2.imread(str(one.poster)).shape == frames[0].shape
+    with pytest.raises(ValueError, match="at least one column"):
+        side_by_side({})
