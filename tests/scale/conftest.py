@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -28,18 +28,13 @@ def store_server() -> Iterator[object]:
     from object_store import CREDENTIALS, ObjectStore
 
     server = ObjectStore()
-    settings = CREDENTIALS | {"AWS_ENDPOINT_URL": server.url}
-    before = {name: os.environ.get(name) for name in settings}
-    os.environ.update(settings)
-    s3fs.S3FileSystem.clear_instance_cache()
-    yield server
-    server.close()
-    s3fs.S3FileSystem.clear_instance_cache()
-    for name, value in before.items():
-        if value is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = value
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (CREDENTIALS | {"AWS_ENDPOINT_URL": server.url}).items():
+            patch.setenv(name, value)
+        s3fs.S3FileSystem.clear_instance_cache()
+        yield server
+        server.close()
+        s3fs.S3FileSystem.clear_instance_cache()
 
 
 @pytest.fixture
@@ -55,19 +50,3 @@ def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote, "PAUSES", (0.01, 0.02, 0.04, 0.08))
     if find_spec("s3fs") is not None:
         monkeypatch.setattr("s3fs.S3FileSystem.retries", 1)
-
-
-@pytest.fixture(scope="session")
-def make_sample() -> Callable[..., tuple]:
-    """The synthetic episodes of the tests of data."""
-    import importlib.util
-
-    spec = importlib.util.spec_from_file_location("data_samples", Path(__file__).parents[1] / "data" / "conftest.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.make_sample
-
-
-@pytest.fixture
-def sample(make_sample: Callable[..., tuple]) -> Callable[..., tuple]:
-    return make_sample

@@ -6,12 +6,11 @@ import os
 import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import batched
 from pathlib import Path
 from typing import Any, ClassVar
 
 from worldline_core.scale.account import InputRow
-from worldline_core.scale.mapping import EpisodeWork, ShardMapper, map_episodes
+from worldline_core.scale.mapping import EpisodeWork
 
 
 @dataclass(frozen=True)
@@ -53,18 +52,10 @@ class NumberFileWork(NumberWork):
     """Writes a file per shard: the ids and reasons of its numbers."""
 
     def remaining(self, number: int, episodes: Sequence[int]) -> Sequence[int]:
-        return () if self._shard_path(number).exists() else episodes
+        return () if self._path(-number - 1).exists() else episodes
 
     def finish_shard(self, number: int, results: Sequence[InputRow]) -> None:
-        self._shard_path(number).write_text(" ".join(f"{row.episode_id}:{row.status}" for row in results))
-
-    def _shard_path(self, number: int) -> Path:
-        return self.output / f"shard-{number}.txt"
-
-
-def do_numbers(mapper: ShardMapper, folder: Path, values: Sequence[int], size: int) -> None:
-    """Do the numbers in shards of `size`."""
-    map_episodes(mapper, NumberWork(folder), list(batched(values, size)))
+        self._path(-number - 1).write_text(" ".join(f"{row.episode_id}:{row.status}" for row in results))
 
 
 def attempts(folder: Path, value: int) -> int:

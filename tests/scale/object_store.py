@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 BUCKET = "recordings"
+ERROR = "<Error><Code>{}</Code><Message>We encountered an error</Message></Error>"
+
 CREDENTIALS = {
     "AWS_ACCESS_KEY_ID": "testing",
     "AWS_SECRET_ACCESS_KEY": "testing",
@@ -43,15 +44,13 @@ class ObjectStore:
         match self.misbehave(method, path):
             case "busy":
                 start_response("503 Service Unavailable", [("Content-Type", "application/xml")])
-                return [b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate</Message></Error>"]
+                return [ERROR.format("SlowDown").encode()]
             case "broken":
                 start_response("500 Internal Server Error", [("Content-Type", "application/xml")])
-                return [b"<Error><Code>InternalError</Code><Message>We encountered an error</Message></Error>"]
+                return [ERROR.format("InternalError").encode()]
             case "hang up":
                 environ["werkzeug.socket"].shutdown(2)
                 return []
-            case "slow":
-                time.sleep(0.3)
         return self._moto(environ, start_response)
 
     def upload(self, folder: Path, prefix: str) -> str:

@@ -1,40 +1,44 @@
-"""Recordings in an S3-compatible store: the same set as from a folder, through every misbehaviour of the store."""
+"""Recordings elsewhere: the same bytes as from a folder, through every misbehaviour of a store; and sets that are pushed there."""
 
 from __future__ import annotations
 
 import errno
 import stat
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
-from object_store import ObjectStore
+from object_store import BUCKET, ObjectStore
 from upath import UPath
 
+from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImports]
+from tools.corrupted import lerobot_v21
+from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import inside, local_file, parse_location
+from worldline_core.errors import ArtifactError
+from worldline_core.publishing import pull, push
 from worldline_core.scale.account import read_account
 from worldline_core.scale.mapping import RunnerConfig, SerialMapper
 from worldline_core.store.artifact_files import digest_folder
 from worldline_core.store.remote import RemoteCache, UnreachableInputError, list_files
 from worldline_core.store.store import ArtifactStore
 
-Make = Callable[..., tuple]
-
 pytestmark = pytest.mark.usefixtures("short_pauses")
 
 
 @pytest.fixture
-def recordings(tmp_path: Path, sample: Make) -> Path:
+def recordings(tmp_path: Path) -> Path:
     with EpisodeSetWriter(tmp_path / "raw", video_crf=8) as writer:
-        for number in range(5):
-            writer.add(*sample(number))
+        for number in range(3):
+            writer.add(*make_sample(number))
     return tmp_path / "raw"
 
 
@@ -69,9 +73,8 @@ def test_a_store_that_flickers_changes_nothing(
         return fault if asked[path] % 3 == 1 else None
 
     store.misbehave = every_third
-    remote = curated_digest(config(url), tmp_path / "remote")
+    assert curated_digest(config(url), tmp_path / "remote") == curated_digest(config(recordings), tmp_path / "local")
     assert len(asked) > 3
-    assert remote == curated_digest(config(recordings), tmp_path / "local")
 
 
 @pytest.mark.slow
@@ -125,25 +128,21 @@ def test_metadata_cannot_lead_out_of_the_location(relative: str) -> None:
 
 
 def test_copies_stay_within_their_bound_in_a_private_folder(tmp_path: Path, store: ObjectStore) -> None:
-    folder = tmp_path / "files"
-    folder.mkdir()
     for number in range(6):
-        (folder / f"{number}.bin").write_bytes(bytes([number]) * 1000)
-    root = parse_location(store.upload(folder, "bound"))
+        (tmp_path / f"{number}.bin").write_bytes(bytes([number]) * 1000)
+    root = parse_location(store.upload(tmp_path, "bound"))
     cache = RemoteCache(max_bytes=2500)
     assert stat.S_IMODE(cache.folder.stat().st_mode) == 0o700
     for number in (0, 1, 0, 2, 3, 0, 4, 5):
-        copy = cache.fetch(root / f"{number}.bin")
-        assert copy.read_bytes() == bytes([number]) * 1000
+        assert cache.fetch(root / f"{number}.bin").read_bytes() == bytes([number]) * 1000
         assert sum(path.stat().st_size for path in cache.folder.rglob("*") if path.is_file()) <= 2500
     asked = [path for method, path in store.requests if method == "GET" and "/bound/" in path]
     assert len(asked) == 7  # 0 was asked for three times: once it was still there
 
 
 def test_a_cut_download_is_noticed(tmp_path: Path, store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "files").mkdir()
-    (tmp_path / "files" / "a.bin").write_bytes(b"x" * 5000)
-    root: Any = parse_location(store.upload(tmp_path / "files", "cut"))
+    (tmp_path / "a.bin").write_bytes(b"x" * 5000)
+    root: Any = parse_location(store.upload(tmp_path, "cut"))
     fetched = 0
     whole = root.fs.get_file
 
@@ -159,16 +158,80 @@ def test_a_cut_download_is_noticed(tmp_path: Path, store: ObjectStore, monkeypat
     assert fetched == 3
 
 
-def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, recordings: Path, store: ObjectStore) -> None:
+def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, store: ObjectStore) -> None:
     artifacts = ArtifactStore(tmp_path / "artifacts")
-    url: Any = parse_location(store.upload(recordings, "key"))
-    first = artifacts.input_digest(url)
-    fetched = [path for method, path in store.requests if method == "GET" and "/key/" in path]
-    assert fetched == []  # the listing says enough
-    store.upload(recordings, "key")
-    url.fs.invalidate_cache()
-    assert artifacts.input_digest(url) == first
-    (recordings / "index.parquet").write_bytes(b"other")
-    store.upload(recordings, "key")
-    url.fs.invalidate_cache()
-    assert artifacts.input_digest(url) != first
+    (tmp_path / "raw").mkdir()
+    digests = []
+    for content in ("one", "one", "two"):
+        (tmp_path / "raw" / "index.parquet").write_text(content)
+        url: Any = parse_location(store.upload(tmp_path / "raw", "key"))
+        url.fs.invalidate_cache()
+        digests.append(artifacts.input_digest(url))
+    assert digests[0] == digests[1] != digests[2]
+    assert not [
+        path for method, path in store.requests if method == "GET" and "/key/" in path
+    ]  # the listing says enough
+
+
+@pytest.mark.parametrize("kind", ["store", "folder"])
+def test_a_set_is_pushed_and_pulled(tmp_path: Path, recordings: Path, store: ObjectStore, kind: str) -> None:
+    where = f"s3://{BUCKET}/there" if kind == "store" else str(tmp_path / "there")
+    store.upload(tmp_path / "nothing", "x")  # makes the bucket
+    pushed = push(recordings, where)
+    assert pull(where, tmp_path / "back") == pushed
+    assert digest_folder(tmp_path / "back") == digest_folder(recordings)
+    with pytest.raises(ArtifactError, match="Folder exists already"):
+        pull(where, tmp_path / "back")
+
+
+@pytest.mark.parametrize("refused", [".json", ".txt"])
+def test_an_interrupted_second_push_goes_on(tmp_path: Path, recordings: Path, store: ObjectStore, refused: str) -> None:
+    """Files that the second set lacks are removed and those of another content sent, also after an interruption."""
+    store.upload(tmp_path / "nothing", "x")
+    where = f"s3://{BUCKET}/again{refused}"
+    (recordings / "first.txt").write_text("of the first push alone")
+    (recordings / "both.txt").write_text("one")
+    push(recordings, where)
+    (recordings / "first.txt").rename(recordings / "second.txt")
+    (recordings / "both.txt").write_text("two")
+    store.misbehave = lambda method, path: "broken" if method == "PUT" and path.endswith(refused) else None
+    with pytest.raises(UnreachableInputError, match="A store could not be reached"):
+        push(recordings, where)
+    store.misbehave = lambda method, path: None
+    push(recordings, where)
+    pull(where, tmp_path / "back")
+    assert digest_folder(tmp_path / "back") == digest_folder(recordings)
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
+    written = write_one_of_each(tmp_path_factory.mktemp("layouts"))
+    for name, suffix in (("mcap", "mcap"), ("video_folder", "mp4")):
+        (Path(written[name]["path"]) / f"broken.{suffix}").write_bytes(b"no recording")
+    root = Path(written["lerobot_v21"]["path"]).parent / "two"
+    _, written["lerobot_v21"] = lerobot_v21.write(root, 2, 0, np.random.default_rng(0))
+    broken = root / "data/chunk-000/episode_000001.parquet"
+    pq.write_table(pq.read_table(broken).drop(["index"]).slice(0, 9), broken)
+    return written
+
+
+@pytest.mark.usefixtures("reading_in_this_process")  # which alone has a file system in memory
+@pytest.mark.parametrize("layout", ["robotwin", "lerobot_v21", "mcap", "video_folder"])
+def test_the_same_bytes_from_a_folder_and_from_elsewhere(
+    sources: dict[str, dict[str, Any]], tmp_path: Path, layout: str
+) -> None:
+    local = Path(sources[layout]["path"])
+    remote = UPath(f"memory://{tmp_path.name}/recordings")
+    for file in (path for path in local.rglob("*") if path.is_file()):
+        place = remote / file.relative_to(local).as_posix()
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(file.read_bytes())
+    made = []
+    for number, path in enumerate((local, remote)):
+        source = sources[layout] | {"path": str(path), "name": "rec"}
+        counts = curate(CurateConfig.model_validate({"sources": [source], "min_frames": 1}), {}, tmp_path / f"{number}")
+        made.append((counts, digest_folder(tmp_path / f"{number}")))
+    assert made[0][0]["kept"] == 1
+    assert made[0][0]["quarantined"] == (layout in ("lerobot_v21", "mcap", "video_folder"))
+    assert made[0] == made[1]

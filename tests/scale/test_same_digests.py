@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,8 @@ import numpy as np
 import pytest
 
 from tasks.execution.shard_mapper import shard_mapper
+from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImports]
+from worldline_core.data.curation import curate as curate_step
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine
@@ -32,7 +32,7 @@ COUNT = 8
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory, make_sample: Callable[..., tuple]) -> Path:
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two sources: an episode with a value that is no number, one whose id the other has as well, one that is a copy."""
     root = tmp_path_factory.mktemp("recordings")
     for name, numbers in (("first", range(COUNT - 4)), ("second", range(COUNT - 5, COUNT - 1))):
@@ -68,15 +68,12 @@ def undisturbed(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> t
     rows = read_account(output / "set")
     assert len(rows) == COUNT + 1
     rejected = {row.episode_id: row.reason for row in read_quarantine(output / "set")}
-    assert rejected["episode-002"] == "nan_state"
-    assert rejected["episode-003#source.1"] == "duplicate_id"
-    assert rejected["a-copy"] == "duplicate"
-    assert {row.episode_id: row.reason for row in rows if row.status == "quarantined"} == rejected
-    assert {row.episode_id for row in rows if row.status == "kept"} == {
-        r.episode_id for r in read_index(output / "set")
-    }
+    expected = {"episode-002": "nan_state", "episode-003#source.1": "duplicate_id", "a-copy": "duplicate"}
+    assert rejected.items() >= expected.items()
+    kept = {row.episode_id: None for row in read_index(output / "set")}
+    assert {row.episode_id: row.reason for row in rows} == rejected | kept
     assert all(row.seconds is not None and row.seconds > 0 for row in rows)
-    assert len(read_account(output / "index")) == len(rows) - len(rejected)
+    assert len(read_account(output / "index")) == len(kept)
     return digests
 
 
@@ -100,29 +97,36 @@ def test_other_runners(recordings: Path, undisturbed: tuple[str, str], tmp_path:
     assert both_digests(recordings, tmp_path, shard_mapper(runner(kind, workers=workers))) == undisturbed
 
 
+CURATE = """
+import sys
+from pathlib import Path
+from tasks.execution.shard_mapper import shard_mapper
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.scale.mapping import RunnerConfig
+
+mapper = shard_mapper(RunnerConfig.model_validate_json(sys.argv[2]))
+curate(CurateConfig.model_validate_json(sys.argv[1]), {}, Path(sys.argv[3]), mapper)
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
 def test_killed_in_the_middle_and_resumed_elsewhere(
-    recordings: Path, undisturbed: tuple[str, str], tmp_path: Path
+    recordings: Path, undisturbed: tuple[str, str], tmp_path: Path, project_root: Path
 ) -> None:
     """The whole group of processes is killed when some episodes are done; other shards in this process do the rest."""
     from prefect.settings import PREFECT_API_URL
 
-    (tmp_path / "config.json").write_text(config(recordings).model_dump_json())
-    settings = runner("processes", workers=2, episodes_per_shard=2)
-    (tmp_path / "runner.json").write_text(settings.model_dump_json())
     output = tmp_path / "set"
-    command = [sys.executable, str(Path(__file__).with_name("curate_command.py"))]
+    settings = runner("processes", workers=2, episodes_per_shard=2).model_dump_json()
     process = subprocess.Popen(
-        [*command, str(tmp_path / "config.json"), str(tmp_path / "runner.json"), str(output)],
-        env=os.environ | {"PREFECT_API_URL": str(PREFECT_API_URL.value())},
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+        [sys.executable, "-c", CURATE, config(recordings).model_dump_json(), settings, str(output)], cwd=project_root,
+        env=os.environ | {"PREFECT_API_URL": str(PREFECT_API_URL.value())}, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
     parts = output / "run" / "episodes" / "parts"
-    wanted = random.Random(3).randrange(1, 4)  # noqa: S311
     deadline = time.monotonic() + 240
-    while not (parts.is_dir() and len([p for p in parts.iterdir() if not p.name.startswith(".")]) >= wanted):
+    while not (parts.is_dir() and len([p for p in parts.iterdir() if not p.name.startswith(".")]) >= 2):
         assert process.poll() is None, "ended before it could be killed"
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -131,17 +135,14 @@ def test_killed_in_the_middle_and_resumed_elsewhere(
     assert not EpisodeSetWriter.finished(output)
     mapper = SerialMapper(RunnerConfig(episodes_per_shard=5))
     assert both_digests(recordings, tmp_path, mapper) == undisturbed
-    rows = read_account(output)
-    assert len(rows) == COUNT + 1
-    assert len({row.episode_id for row in rows}) == COUNT + 1
+    names = [row.episode_id for row in read_account(output)]
+    assert len(names) == len(set(names)) == COUNT + 1
 
 
 @pytest.mark.usefixtures("reading_in_this_process")
 def test_an_unforeseen_error_is_a_quarantined_episode(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from worldline_core.data.curation import curate as curate_step
-
     whole = curate_step.check_episode
 
     def fails_on_one(configured: CurateConfig, loaded: Any) -> None:
@@ -151,12 +152,10 @@ def test_an_unforeseen_error_is_a_quarantined_episode(
 
     monkeypatch.setattr(curate_step, "check_episode", fails_on_one)
     counts = curate(config(recordings), {}, tmp_path / "set")
-    assert counts["reasons"]["crashed"] == 1
     assert counts["kept"] + counts["quarantined"] == counts["found"] == COUNT + 1
     (row,) = (row for row in read_quarantine(tmp_path / "set") if row.reason == "crashed")
     evidence = json.loads(row.evidence)
     assert evidence["type"] == "ZeroDivisionError"
     assert evidence["trace"][-1].endswith("fails_on_one")
     assert any(line.startswith("worldline_core/data/curation/curate.py:") for line in evidence["trace"])
-    assert str(tmp_path) not in row.evidence + row.detail
-    assert "deadbeef" not in row.evidence + row.detail
+    assert not any(secret in row.evidence + row.detail for secret in (str(tmp_path), "deadbeef"))
