@@ -30,12 +30,8 @@ def encode(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: encode(each) for name, each in value.items()}
     if isinstance(value, np.ndarray):
-        return {
-            b"__ndarray__": True,
-            b"data": value.tobytes("C"),
-            b"dtype": value.dtype.str,
-            b"shape": list(value.shape),
-        }
+        shape = list(value.shape)
+        return {b"__ndarray__": True, b"data": value.tobytes("C"), b"dtype": value.dtype.str, b"shape": shape}
     return value
 
 
@@ -85,7 +81,7 @@ def policy_server(
     thread.join(5)
 
 
-def test_a_hundred_chunks() -> None:
+def test_many_chunks() -> None:
     seen: list[dict[str, Any]] = []
 
     def answer(observation: dict[str, Any]) -> dict[str, Any]:
@@ -96,16 +92,14 @@ def test_a_hundred_chunks() -> None:
         with OpenpiPolicy(url, api_key="abc") as policy:
             assert policy.metadata == {"name": "scripted"}
             state = np.zeros(14, np.float32)
-            for chunk in range(100):
+            for chunk in range(20):
                 picture = np.full((4, 6, 3), chunk, np.uint8)
                 reply = policy.infer({"state": state, "images": {"head": picture}, "prompt": "lift it"})
-                assert reply["actions"].shape == (8, 14)
-                assert reply["actions"].dtype == np.float64
+                assert (reply["actions"].shape, reply["actions"].dtype) == ((8, 14), np.float64)
                 assert reply["server_timing"]["infer_ms"] >= 0
                 state = reply["actions"][-1].astype(np.float32)
-        assert state[0] == 700
-        assert len(seen) == 100
-        assert all((found["images"]["head"] == chunk).all() for chunk, found in enumerate(seen))
+        assert state[0] == 140
+        assert [found["images"]["head"].mean() for found in seen] == list(range(20))
         assert seen[3]["prompt"] == "lift it"
         with pytest.raises(UnavailableError, match=r"(?s)refuses the connection.*401.*API key"):
             OpenpiPolicy(url)
@@ -113,25 +107,29 @@ def test_a_hundred_chunks() -> None:
         OpenpiPolicy(url, deadline_s=2)
 
 
-def _fails(_: dict[str, Any]) -> Any:
-    raise RuntimeError("no such camera: cam_high")
+def fails(_: dict[str, Any]) -> Any:
+    raise RuntimeError("no such camera: cam_high; wrong key abc")
+
+
+def actions(array: object) -> Callable[[dict[str, Any]], Any]:
+    return lambda _: {"actions": array}
 
 
 @pytest.mark.parametrize(
     ("answer", "error", "match"),
     [
-        (_fails, UnavailableError, r"(?s)reports an error.*no such camera: cam_high"),
+        (fails, UnavailableError, r"(?s)reports an error.*no such camera: cam_high"),
         (lambda _: None, UnavailableError, r"(?s)closed the connection.*connect again"),
         (lambda _: b"\xc1\xff", DataError, "not understood"),
         (lambda _: msgpack.packb([1, 2]), DataError, r"(?s)message is no map.*list"),
         (lambda _: {}, DataError, r"(?s)actions are no chunk.*NoneType"),
-        (lambda _: {"actions": np.zeros(8)}, DataError, r"(?s)actions are no chunk.*float64 \(8,\)"),
-        (lambda _: {"actions": np.zeros((0, 14))}, DataError, "actions are no chunk"),
-        (lambda _: {"actions": np.zeros((1025, 14))}, DataError, r"(?s)no chunk.*1 to 1024.*\(1025, 14\)"),
-        (lambda _: {"actions": np.zeros((2, 0))}, DataError, "actions are no chunk"),
-        (lambda _: {"actions": np.array([["a"]])}, DataError, r"(?s)actions are no chunk.*<U1"),
-        (lambda _: {"actions": np.array([[0.0, np.nan]])}, DataError, r"not finite\n.*step 0, column 1"),
-        (lambda _: {"actions": np.zeros((1 << 16, 14))}, DataError, r"(?s)too large.*1,000,000 bytes"),
+        (actions(np.zeros(8)), DataError, r"(?s)actions are no chunk.*float64 \(8,\)"),
+        (actions(np.zeros((0, 14))), DataError, "actions are no chunk"),
+        (actions(np.zeros((1025, 14))), DataError, r"(?s)no chunk.*1 to 1024.*\(1025, 14\)"),
+        (actions(np.zeros((2, 0))), DataError, "actions are no chunk"),
+        (actions(np.array([["a"]])), DataError, r"(?s)actions are no chunk.*<U1"),
+        (actions(np.array([[0.0, np.nan]])), DataError, r"not finite\n.*step 0, column 1"),
+        (actions(np.zeros((1 << 16, 14))), DataError, r"(?s)too large.*1,000,000 bytes"),
     ],
 )
 def test_bad_servers_are_named(answer: Callable[[dict[str, Any]], Any], error: type[Exception], match: str) -> None:
@@ -173,27 +171,18 @@ def test_a_deadline_begins_before_names_are_resolved(client: str, monkeypatch: p
     stop.set()
 
 
-@pytest.mark.parametrize(
-    ("key", "sent"), [("abc\r", "abc"), ("abc\r\nX-Evil: 1", None), ("\0", None), ("schl\u00fcssel", None)]
-)
-def test_a_key_that_no_header_can_carry_is_refused_unseen(
-    key: str, sent: str | None, caplog: pytest.LogCaptureFixture
-) -> None:
-    with policy_server(_fails_with_the_key, key="abc") as url:
-        if sent is None:
-            with pytest.raises(ConfigError, match="The header Authorization cannot be sent") as caught:
-                OpenpiPolicy(url, api_key=key)
-        else:
-            with (
-                OpenpiPolicy(url, api_key=key) as policy,
-                pytest.raises(UnavailableError, match=r"wrong key \*\*\*") as caught,
-            ):
-                policy.infer({})
-        assert "abc" not in str(caught.value) + caplog.text
+@pytest.mark.parametrize("key", ["abc\r\nX-Evil: 1", "\0", "schl\u00fcssel"])
+def test_a_key_that_no_header_can_carry_is_refused_unseen(key: str) -> None:
+    with pytest.raises(ConfigError, match="The header Authorization cannot be sent") as caught:
+        OpenpiPolicy("ws://127.0.0.1:9", api_key=key)
+    assert key[:3] not in str(caught.value)
 
 
-def _fails_with_the_key(_: dict[str, Any]) -> Any:
-    raise RuntimeError("wrong key abc")
+def test_a_key_is_sent_without_white_space_and_never_shown(caplog: pytest.LogCaptureFixture) -> None:
+    refused = pytest.raises(UnavailableError, match=r"wrong key \*\*\*")
+    with policy_server(fails, key="abc") as url, OpenpiPolicy(url, api_key="abc\r") as policy, refused as caught:
+        policy.infer({})
+    assert "abc" not in str(caught.value) + caplog.text
 
 
 @pytest.mark.parametrize("url", ["ws://[half", "ws://127.0.0.1:99999", f"ws://{'a' * 70}", "ws://\ud800", "ws://"])

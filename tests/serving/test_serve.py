@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import socket
-import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -15,13 +18,13 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from flows.command_line import main
 from worldline_core import WorldLine
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import unpack
-from worldline_core.rollout.observation import Camera
 from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.serving import app
-from worldline_core.serving.app import server_token
+from worldline_core.serving.app import listening_socket, server_token
 from worldline_core.serving.client import RemoteSimulation, SimulatorClient
 from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig
 from worldline_core.serving.session_host import SessionHost
@@ -48,14 +51,17 @@ def drive(simulation: RemoteSimulation, steps: int, seed: int) -> str:
     return digest.hexdigest()
 
 
-def test_a_session_is_the_simulation_of_one_process(url: str, small_world: WorldLine, shipped) -> None:
-    here = SessionHost(small_world, ServeConfig(episodes=shipped / "recordings")).simulate(EPISODE, [3])  # pyright: ignore[reportCallIssue]
+def test_a_session_is_the_simulation_of_one_process(url: str, small_world: WorldLine, shipped: Path) -> None:
+    host = SessionHost(small_world, ServeConfig.model_validate({"episodes": shipped / "recordings"}))
+    unseen = ["ood_test" in row["id"] for row in host.metadata()["episodes"]]
+    assert 0 < sum(unseen) < len(unseen)
+    assert unseen == sorted(unseen)  # what no model has seen is listed last
+    here = host.simulate(EPISODE, [3])
     with SimulatorClient(url) as client:
         assert httpx.get(url.replace("ws", "http") + "/healthz").text == "OK\n"
-        assert client.metadata["views"] == list(small_world.views)
-        assert client.metadata["fps"] == 8
-        assert EPISODE in {row["id"] for row in client.metadata["episodes"]}
         assert httpx.get(url.replace("ws", "http") + "/v1").json() == client.metadata
+        assert (client.metadata["views"], client.metadata["fps"]) == (list(small_world.views), 8)
+        assert EPISODE in {row["id"] for row in client.metadata["episodes"]}
         there = client.start(EPISODE, seeds=[3])
         assert there.frames_per_step == here.frames_per_step == 4
         for step in range(3):
@@ -64,15 +70,14 @@ def test_a_session_is_the_simulation_of_one_process(url: str, small_world: World
             for view in here.views:
                 assert np.array_equal(frames[0][view], expected[0][view]), view
                 assert np.array_equal(there.pictures[0][view], here.pictures[0][view])
-            assert np.array_equal(there.states, here.states)
-            assert np.array_equal(there.commands, here.commands)
-            assert np.array_equal(there.tool_poses, here.tool_poses)
+            for name in ("states", "commands", "tool_poses"):
+                assert np.array_equal(getattr(there, name), getattr(here, name)), name
         assert there.num_frames == here.num_frames == 13
+        controls = np.repeat(here.state[:, None], 4, axis=1)
         for seeds, same in ((None, True), ([3], False)):  # the clip's own seed, begun anew
-            branch, onward, controls = there.fork(1, seeds), there.fork(1), np.repeat(here.state[:, None], 4, axis=1)
+            branch, onward = there.fork(1, seeds), there.fork(1)
             assert np.array_equal(branch.step(controls)[0]["head"], onward.step(controls)[0]["head"]) is same
         branches = there.fork(2)
-        controls = np.repeat(here.state[:, None], 4, axis=1)
         both, one = branches.step(np.concatenate((controls, controls + 0.1))), there.step(controls)
         assert all(np.array_equal(both[0][view], one[0][view]) for view in here.views)
         assert not np.array_equal(both[1]["head"], one[0]["head"])
@@ -86,101 +91,85 @@ def test_a_session_is_the_simulation_of_one_process(url: str, small_world: World
             there.step(controls)
 
 
-def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world: WorldLine, shipped) -> None:
+def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world: WorldLine, shipped: Path) -> None:
     start = RecordedStarts(shipped / "recordings", view_sets=small_world.view_sets, fps=8).named(EPISODE)[1]
-    given = {
-        "images": start.images,
-        "cameras": start.cameras,
-        "embodiment": "ur5e_silver",
-        "state": start.state,
-    }
+    given: dict[str, Any] = {
+        "images": start.images, "cameras": start.cameras, "embodiment": "ur5e_silver", "state": start.state,
+    }  # fmt: skip
 
-    def posed(**values: np.ndarray) -> dict[str, Camera]:
+    def posed(**values: Any) -> dict[str, Any]:
         """The cameras with other values of the head's."""
-        return start.cameras | {"head": replace(start.cameras["head"], **values)}
+        return {"cameras": start.cameras | {"head": replace(start.cameras["head"], **values)}}
 
+    refused: list[tuple[dict[str, Any], str]] = [
+        ({"embodiment": "/etc/passwd"}, "Unknown embodiment"),
+        ({"embodiment": "../ur5e.yaml"}, "Unknown embodiment"),
+        ({"images": {"head": start.images["head"].astype(np.float32)}}, r"(?s)images.head.*uint8.*float32"),
+        *(({"state": state}, "wrong length") for state in (np.zeros(3), np.array(0.0))),
+        ({"state": np.full(14, np.nan)}, "not finite"),
+        ({"state": np.array(["a"] * 14)}, r"(?s)state.*array of numbers"),
+        (posed(T_base_camera=np.array([["a"] * 4] * 4)), r"(?s)T_base_camera.*array of numbers"),
+        (posed(T_base_camera=np.diag([1.0, 1.0, -1.0, 1.0])), r"(?s)not a rigid transform.*T_base_camera"),
+        (posed(T_base_camera=np.full((4, 4), np.nan)), "not a rigid transform"),
+        (posed(K=np.full((3, 3), np.nan)), "camera matrix is not usable"),
+        (posed(K=np.diag([-80.0, 80.0, 1.0])), "camera matrix is not usable"),
+        ({"episode": EPISODE}, r"(?s)starts at a recording, or at an observation.*got: images, cameras"),
+        ({"state": None}, "starts at a recording, or at an observation"),
+        ({"cameras": None}, "No camera of the view head, left_wrist, right_wrist"),
+        ({"seeds": [-1]}, r"(?s)seeds.0.*greater than or equal to 0"),
+        ({"seeds": []}, "not understood"),
+        ({"seeds": [0] * 10_000}, "Too many clips"),
+    ]
     with SimulatorClient(url) as client:
         recorded, sent = client.start(EPISODE, seeds=[1, 2]), client.start(**given, seeds=[1, 2])
         assert drive(recorded, 2, 0) == drive(sent, 2, 0)
-        for change, match in (
-            ({"embodiment": "/etc/passwd"}, "Unknown embodiment"),
-            ({"embodiment": "../ur5e.yaml"}, "Unknown embodiment"),
-            ({"images": {"head": start.images["head"].astype(np.float32)}}, r"(?s)images.head.*uint8.*float32"),
-            ({"state": np.zeros(3)}, "wrong length"),
-            ({"state": np.full(14, np.nan)}, "not finite"),
-            ({"state": np.array(["a"] * 14)}, r"(?s)state.*array of numbers"),
-            ({"state": np.array(0.0)}, "wrong length"),
-            (
-                {"cameras": posed(T_base_camera=np.array([["a"] * 4] * 4))},
-                r"(?s)T_base_camera.*array of numbers",
-            ),
-            (
-                {"cameras": posed(T_base_camera=np.diag([1.0, 1.0, -1.0, 1.0]))},
-                r"(?s)not a rigid transform.*T_base_camera",
-            ),
-            ({"cameras": posed(T_base_camera=np.full((4, 4), np.nan))}, "not a rigid transform"),
-            ({"cameras": posed(K=np.full((3, 3), np.nan))}, "camera matrix is not usable"),
-            ({"cameras": posed(K=np.diag([-80.0, 80.0, 1.0]))}, "camera matrix is not usable"),
-            ({"episode": EPISODE}, r"(?s)starts at a recording, or at an observation.*got: images, cameras"),
-            ({"state": None}, "starts at a recording, or at an observation"),
-            ({"cameras": None}, "No camera of the view head, left_wrist, right_wrist"),
-            ({"seeds": [-1]}, r"(?s)seeds.0.*greater than or equal to 0"),
-            ({"seeds": []}, "not understood"),
-            ({"seeds": [0] * 10_000}, "Too many clips"),
-        ):
+        for change, match in refused:
             with pytest.raises(DataError, match=match):
-                client.start(**(given | change))  # pyright: ignore[reportArgumentType]
+                client.start(**(given | change))
         with pytest.raises(DataError, match="No recording of this name"):
             client.start("nobody")
         with pytest.raises(DataError, match=r"(?s)Controls of a step have another shape.*\(2, 4, 14\)"):
             sent.step(np.zeros((1, 4, 14)))
-        with pytest.raises(DataError, match=r"(?s)controls.*array of numbers"):
-            client.call({"op": "step", "session": sent.session, "controls": np.full((2, 4, 14), "a")})
         with pytest.raises(DataError, match="No such clips"):
             sent.select([7])
         assert len(sent.step(np.repeat(sent.state[:, None], 4, axis=1))) == 2  # as it was before the errors
-        for request, match in (
-            ([1], "not understood"),
-            ({"op": "eval"}, "eval"),
-            ({"op": ["step"]}, "not understood"),
+        step: dict[str, Any] = {"op": "step", "session": sent.session}
+        requests: tuple[tuple[Any, str], ...] = (
+            (step | {"controls": np.full((2, 4, 14), "a")}, r"(?s)controls.*array of numbers"),
+            ([1], "not understood"), ({"op": "eval"}, "eval"), ({"op": ["step"]}, "not understood"),
             ({"op": "step", "session": "x"}, "not understood"),
-        ):
+        )  # fmt: skip
+        for request, match in requests:
             with pytest.raises(DataError, match=match):
-                client.call(request)  # type: ignore[arg-type]
+                client.call(request)
     with SimulatorClient(url) as other, pytest.raises(DataError, match="no such session"):
-        other.call({"op": "step", "session": sent.session, "controls": np.zeros((2, 4, 14))})
+        other.call(step | {"controls": np.zeros((2, 4, 14))})
 
 
 @pytest.mark.slow
 def test_many_sessions_at_once_are_neither_lost_nor_mixed_up(serving: Callable) -> None:
     """The short version of `benchmarks/serving.py`; one client in four vanishes in the middle."""
-    episodes = [EPISODE, "aloha_viperx-test-s1-00000"]
-
-    def alone(client: SimulatorClient, number: int) -> str:
-        return drive(client.start(episodes[number % 2], seeds=[number]), 2, number)
-
     with serving() as url:
         with SimulatorClient(url) as client:
-            names = {row["id"] for row in client.metadata["episodes"]}
-            episodes[1] = next(name for name in sorted(names) if "viperx" in name)
+            other = min(row["id"] for row in client.metadata["episodes"] if "viperx" in row["id"])
+
+            def alone(client: SimulatorClient, number: int) -> str:
+                return drive(client.start((EPISODE, other)[number % 2], seeds=[number]), 2, number)
+
             expected = [alone(client, number) for number in range(8)]
         assert len(set(expected)) == 8
-        found: dict[int, str] = {}
 
-        def work(number: int) -> None:
+        def work(number: int) -> str | None:
             with SimulatorClient(url) as client:
                 if number % 4 == 3:
-                    drive(client.start(episodes[0], seeds=[99]), 1, 0)
+                    drive(client.start(EPISODE, seeds=[99]), 1, 0)
                     client._connection.socket.shutdown(socket.SHUT_RDWR)
-                    return
-                found[number] = alone(client, number)
+                    return None
+                return alone(client, number)
 
-        threads = [threading.Thread(target=work, args=(number,)) for number in range(8)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(60)
-        assert found == {number: digest for number, digest in enumerate(expected) if number % 4 != 3}
+        with ThreadPoolExecutor(8) as threads:
+            found = list(threads.map(work, range(8)))
+        assert found == [None if number % 4 == 3 else digest for number, digest in enumerate(expected)]
 
 
 @pytest.mark.slow
@@ -198,53 +187,50 @@ def test_limits_refuse_and_free_again(serving: Callable) -> None:
         with SimulatorClient(url) as client:
             client.start(EPISODE)
             pair = client.start(EPISODE, seeds=[1, 2])
-            with pytest.raises(UnavailableError, match=r"(?s)no room for another session.*2 sessions with 3 clips"):
-                client.start(EPISODE)
-            with pytest.raises(UnavailableError, match="no room"):
-                pair.fork(1)
-            with (
-                SimulatorClient(url),
-                pytest.raises(UnavailableError, match=r"(?s)closed the connection.*1013.*too many"),
-            ):
+            for begin in (lambda: client.start(EPISODE), lambda: pair.fork(1)):
+                with pytest.raises(UnavailableError, match=r"(?s)no room for another session.*2 sessions with 3 clips"):
+                    begin()
+            with SimulatorClient(url), pytest.raises(UnavailableError, match=r"(?s)closed the connection.*1013"):
                 SimulatorClient(url)
             with pytest.raises(UnavailableError, match="closed the connection"):
                 client.request({"op": "x" * (2 << 20)})  # larger than a message may be
         with SimulatorClient(url) as client:
             again = client.start(EPISODE, seeds=[1, 2])  # the sessions of the closed connection are gone
-            again.step(np.repeat(again.state[:, None], 4, axis=1))
+            controls = np.repeat(again.state[:, None], 4, axis=1)
+            again.step(controls)
             time.sleep(1.2)
             with pytest.raises(UnavailableError, match="closed the connection"):  # idle
-                again.step(np.repeat(again.state[:, None], 4, axis=1))
+                again.step(controls)
 
 
 def test_who_may_connect(serving: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     def status(url: str, **headers: str) -> int:
-        host = headers.pop("host", None)
-        given = {name.title(): value for name, value in headers.items()} | ({} if host is None else {"Host": host})
-        codes = {httpx.get(url.replace("ws", "http") + "/v1", headers=given).status_code}
-        if host is None:
+        given = {name.title(): value for name, value in headers.items()}
+        code = httpx.get(url.replace("ws", "http") + "/v1", headers=given).status_code
+        if "host" not in headers:
             try:
                 with connect(url + "/v1", additional_headers=given, proxy=None):
-                    codes.add(200)
+                    assert code == 200
             except InvalidStatus:  # a refused websocket is always 403
-                codes |= set() if codes == {401} else {403}
-        assert len(codes) == 1
-        return codes.pop()
+                assert code in (401, 403)
+        return code
 
     with serving(origins=["http://friend:1"]) as url:
         assert status(url) == 200
-        assert status(url, origin=url.replace("ws", "http")) == 200
-        assert status(url, origin="http://friend:1") == 200
-        assert status(url, origin="http://attacker.example") == 403
-        assert status(url, origin="null") == 403
-        assert status(url, host="attacker.example") == 403  # a name bound anew to this machine
+        for origin, expected in {
+            url.replace("ws", "http"): 200,
+            "http://friend:1": 200,
+            "http://evil.example": 403,
+            "null": 403,
+        }.items():
+            assert status(url, origin=origin) == expected, origin
+        assert status(url, host="evil.example") == 403  # a name bound anew to this machine
         assert status(url, host="localhost:1") == 200
     with serving(token=TOKEN) as url:
         assert status(url) == 401
-        assert status(url, authorization="Bearer wrong") == 401
-        assert status(url, authorization="Bearer correct hors") == 401
-        assert status(url, authorization=f"Bearer {TOKEN}") == 200
-        assert status(url, authorization=f"Bearer {TOKEN}", origin="http://attacker.example") == 403
+        for word, expected in {"wrong": 401, "correct hors": 401, TOKEN: 200}.items():
+            assert status(url, authorization=f"Bearer {word}") == expected, word
+        assert status(url, authorization=f"Bearer {TOKEN}", origin="http://evil.example") == 403
         assert httpx.get(url.replace("ws", "http") + "/healthz").text == "OK\n"
         with pytest.raises(UnavailableError, match=r"(?s)403.*token"):
             SimulatorClient(url)
@@ -253,16 +239,20 @@ def test_who_may_connect(serving: Callable, monkeypatch: pytest.MonkeyPatch) -> 
         with connect(url + "/v1?token=correct%20horse", proxy=None) as page:
             page.recv()
             page.send("no bytes")
-            assert "not understood" in unpack(page.recv(), "server")["error"]["what"]  # pyright: ignore[reportArgumentType]
+            told: Any = page.recv()
+            assert "not understood" in unpack(told, "server")["error"]["what"]
             with pytest.raises(ConnectionClosed, match="1007"):
                 page.recv()
+
+    def token(**settings: str) -> str | None:
+        return server_token(ServeConfig.model_validate(settings))
+
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
-    assert server_token(ServeConfig()) is None  # pyright: ignore[reportCallIssue]
-    assert server_token(ServeConfig(host="::1")) is None  # pyright: ignore[reportCallIssue]
+    assert token() is token(host="::1") is None
     with pytest.raises(ConfigError, match=r"(?s)needs a token.*0\.0\.0\.0.*WORLDLINE_TOKEN="):
-        server_token(ServeConfig(host="0.0.0.0"))  # noqa: S104  # pyright: ignore[reportCallIssue]
+        token(host="0.0.0.0")  # noqa: S104
     monkeypatch.setenv(TOKEN_VARIABLE, "abc\r\n")  # no header can carry the end of a line
-    assert server_token(ServeConfig(host="0.0.0.0")) == "abc"  # noqa: S104  # pyright: ignore[reportCallIssue]
+    assert token(host="0.0.0.0") == "abc"  # noqa: S104
 
 
 def test_connections_that_say_nothing_are_closed_and_bounded(
@@ -298,3 +288,16 @@ def test_a_text_that_is_no_utf8_ends_its_connection_alone(
     assert not [record for record in caplog.records if record.exc_info]
     with SimulatorClient(url) as client:
         client.start(EPISODE)
+
+
+def test_a_port_is_known_or_refused_before_the_model_is_loaded(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(SystemExit, match="1"):
+            main(["serve", "--set", f"port={port}", "--set", "model=nowhere"])
+    assert re.search(rf"(?s)127\.0\.0\.1:{port}.*take another port", capsys.readouterr().err)
+    with listening_socket(ServeConfig.model_validate({"port": 0, "host": "localhost"})) as bound:
+        host, port = bound.getsockname()[:2]
+        assert (host, port > 0) == ("127.0.0.1", True)
+        with pytest.raises(ConnectionRefusedError, match=r".+"):  # nobody waits for a server that is not there yet
+            socket.create_connection((host, port), timeout=5)

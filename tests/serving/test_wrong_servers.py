@@ -30,22 +30,6 @@ OPENED = STATE | {
 STEPPED = STATE | {"frames": {"head": np.zeros((1, 4, 4, 6, 3), np.uint8)}, "seconds": 0.1}
 
 
-@contextmanager
-def server_of_bytes(answer: bytes, *, hears: bool) -> Iterator[str]:
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-
-        def once() -> None:
-            with listening.accept()[0] as connection:
-                if hears:
-                    connection.recv(4096)
-                connection.sendall(answer)
-
-        thread = threading.Thread(target=once)
-        thread.start()
-        yield f"ws://127.0.0.1:{listening.getsockname()[1]}"
-        thread.join(5)
-
-
 @pytest.mark.parametrize(
     "answer",
     [
@@ -56,12 +40,21 @@ def server_of_bytes(answer: bytes, *, hears: bool) -> Iterator[str]:
 )  # fmt: skip
 @pytest.mark.parametrize("hears", [True, False])
 def test_servers_of_something_else(answer: bytes, hears: bool, caplog: pytest.LogCaptureFixture) -> None:
-    with (
-        server_of_bytes(answer, hears=hears) as url,
-        pytest.raises(UnavailableError, match=r"No server answers|refuses the connection"),
-    ):
-        SimulatorClient(url, deadline_s=5)
-    assert not caplog.records
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def once() -> None:
+            with listening.accept()[0] as connection:
+                if hears:
+                    connection.recv(4096)
+                connection.sendall(answer)
+
+        thread = threading.Thread(target=once)
+        thread.start()
+        with pytest.raises(UnavailableError, match=r"No server answers|refuses the connection"):
+            SimulatorClient(f"ws://127.0.0.1:{listening.getsockname()[1]}", deadline_s=5)
+        thread.join(5)
+    # Other tests' tasks may end here with a word of asyncio's.
+    assert not [record for record in caplog.records if record.name.startswith(("worldline_core", "websockets"))]
 
 
 def changed(reply: dict[str, Any], **changes: object) -> bytes:
@@ -102,10 +95,8 @@ def test_servers_that_answer_otherwise(replies: list[bytes]) -> None:
     [b"\x81\x02hi", b"\x81\x02\xff\xfe", b"\x85\x00", b"\xc2\x01\x80", b"\x82\x7f" + struct.pack("!Q", 1 << 62)],
 )
 def test_frames_that_are_no_messages(frame: bytes) -> None:
-    with (
-        answering(lambda connection: connection.socket.sendall(frame)) as url,
-        pytest.raises((UnavailableError, DataError), match=r"reports an error|closed the connection|too large"),
-    ):
+    refused = pytest.raises((UnavailableError, DataError), match=r"reports an error|closed the connection|too large")
+    with answering(lambda connection: connection.socket.sendall(frame)) as url, refused:
         drive(url)
 
 
@@ -118,9 +109,9 @@ def test_a_server_that_takes_nothing_is_given_up() -> None:
             stop.wait(10)
 
     with answering(handle) as url:
-        client, begin = SimulatorClient(url, deadline_s=0.5), time.monotonic()
+        client, begin = SimulatorClient(url, deadline_s=0.3), time.monotonic()
         with pytest.raises(UnavailableError, match="did not answer in time"):
-            client.request({"x": np.zeros(60_000_000, np.uint8)})
+            client.request({"x": np.zeros(30_000_000, np.uint8)})
         assert time.monotonic() - begin < 4
         stop.set()
 
