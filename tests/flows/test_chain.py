@@ -1,14 +1,14 @@
-"""The chain: what feeds what, which calls need training, how a step run alone finds its inputs, and how a step is added."""
+"""The chain: what feeds what, which calls need training, how a step run alone finds its inputs, how a step is added, and its deployments."""
 
 from __future__ import annotations
 
+import importlib
 import sys
-import textwrap
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from prefect import flow
+from prefect import Flow, flow
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 import tasks
@@ -17,7 +17,7 @@ from tasks.curate import curate
 from tasks.execution.artifact_task import TaskCall, find_task, task_names
 from tasks.execution.chain import find_artifacts, find_call, load_chain, outline, ready_inputs
 from tasks.execution.prefect_run import PrefectRun
-from worldline_core.config import load_config
+from worldline_core.config import load_config, preset_names, read_yaml
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.scale.mapping import RunnerConfig
@@ -46,13 +46,14 @@ def test_every_preset_is_valid_and_every_input_comes_before_its_use(preset: str)
 
 def test_the_chain_is_the_one_that_the_readme_draws(calls: dict[str, TaskCall]) -> None:
     order = ["curate", "filter", "render_actions", "train_stage2", "distill", "rollout.causal"]
-    for name in order[1:]:
-        assert calls[name].upstream, name
     arrows = {(source.name, call.name) for call in calls.values() for source in call.upstream}
     assert set(pairwise(order)) <= arrows
     evaluations = {"evaluate_video", "evaluate_policy", "evaluate_planning"}
     assert {target for source, target in arrows if source.startswith("rollout.")} == evaluations | {"report"}
     assert all((evaluation, "report") in arrows for evaluation in evaluations)
+    # Labels of the banks are an input of planning alone.
+    assert [name for name, call in calls.items() if "sealed" in call.inputs] == ["evaluate_planning"]
+    assert load_chain() is chain
 
 
 def test_every_task_loads() -> None:
@@ -65,9 +66,7 @@ def test_every_task_loads() -> None:
 
 def test_nightly_leaves_training_out_but_keeps_the_shipped_models() -> None:
     calls = outline(nightly, PipelineConfig.load("tiny"))
-    assert {"rollout.shipped_stage2", "rollout.banks_shipped_causal", "evaluate_video", "evaluate_planning"} <= set(
-        calls
-    )
+    assert {"rollout.shipped_stage2", "rollout.banks_shipped_causal", "evaluate_planning"} <= set(calls)
     assert not set(calls) & {"train_stage1", "train_stage2", "distill", "rollout.stage2", "rollout.causal"}
     assert "rollouts.stage2" not in calls["evaluate_video"].inputs
     PipelineConfig.load("tiny").check_night()
@@ -82,11 +81,6 @@ def test_a_night_that_measures_no_model_is_refused(changes: tuple[str, ...]) -> 
     PipelineConfig.load("smoke", None, shipped).check_night()
 
 
-def test_labels_of_the_banks_are_not_an_input_of_curation(calls: dict[str, TaskCall]) -> None:
-    assert isinstance(calls["evaluate_planning"].inputs["sealed"], Path)
-    assert not any("sealed" in call.inputs for call in calls.values() if call.name != "evaluate_planning")
-
-
 def test_missing_artifacts_and_calls_are_named(calls: dict[str, TaskCall], tmp_path: Path) -> None:
     store = ArtifactStore(tmp_path)
     assert find_artifacts(calls, store) == {}
@@ -99,14 +93,21 @@ def test_missing_artifacts_and_calls_are_named(calls: dict[str, TaskCall], tmp_p
     assert find_call(calls, "rollout", "rollout.causal") is calls["rollout.causal"]
 
 
-def test_shipped_rollout_needs_a_shipped_model() -> None:
+def test_rollouts_of_a_preset_go_with_their_models_and_banks(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN)
+    config = PipelineConfig.load(None, path)
+    assert list(config.rollouts) == ["copy_first_frame", "stage2", "stage2_shuffled", "causal"]
+    assert "rollout.stage2" in outline(chain, config)
+    mine = "rollouts: {mine: {checkpoint: shipped_stage2, config: {method: mine, sampler: {kind: full_clip}}}}"
+    path.write_text(OWN + mine)
+    with pytest.raises(ConfigError, match=r"rollouts\.mine needs models\.stage2"):  # what the user wrote is not dropped
+        PipelineConfig.load(None, path)
     with pytest.raises(ConfigError, match=r"rollouts\.shipped_stage2 needs models\.stage2"):
         load_config(PipelineConfig, preset="tiny", overrides=["models.stage2=null"])
 
 
-def test_rollouts_of_a_preset_go_with_their_models_and_banks(tmp_path: Path) -> None:
-    path = tmp_path / "own.yaml"
-    own = """extends: tiny
+OWN = """extends: tiny
 models: {stage2: null, causal: null}
 curate: {sources: [{kind: video_folder, path: mine}]}
 curate_banks: null
@@ -114,15 +115,6 @@ evaluate_planning: null
 filter: {required_views: [head]}
 encode_latents: {views: [head]}
 """
-    path.write_text(own)
-    config = PipelineConfig.load(None, path)
-    assert list(config.rollouts) == ["copy_first_frame", "stage2", "stage2_shuffled", "causal"]
-    assert "rollout.stage2" in outline(chain, config)
-    path.write_text(
-        own + "rollouts: {mine: {checkpoint: shipped_stage2, config: {method: mine, sampler: {kind: full_clip}}}}"
-    )
-    with pytest.raises(ConfigError, match=r"rollouts\.mine needs models\.stage2"):  # what the user wrote is not dropped
-        PipelineConfig.load(None, path)
 
 
 @pytest.mark.parametrize(
@@ -134,29 +126,26 @@ encode_latents: {views: [head]}
     ],
 )
 def test_views_of_distillation_are_checked_before_any_training(override: str, message: str) -> None:
+    def load(*more: str) -> PipelineConfig:
+        return PipelineConfig.load("smoke", overrides=[override, *more])
+
     with pytest.raises(ConfigError, match=message):
-        load_config(
-            PipelineConfig, preset="smoke", overrides=[override, "distill.views=[head, left_wrist, right_wrist]"]
-        )
-    load_config(PipelineConfig, preset="smoke", overrides=[override, "distill.views=[head]"])
+        load("distill.views=[head, left_wrist, right_wrist]")
+    load("distill.views=[head]")
     # A run for one robot need not name them again.
-    views = ["head", "left_wrist"] if "left_wrist]" in override else ["head"]
-    assert load_config(PipelineConfig, preset="smoke", overrides=[override]).distill.views == views
+    assert load().distill.views == (["head", "left_wrist"] if "left_wrist]" in override else ["head"])
 
 
 def test_a_run_of_recordings_without_cameras_draws_nothing() -> None:
     with pytest.raises(ConfigError, match=r"render_actions: without it nothing is drawn"):
-        load_config(PipelineConfig, preset="smoke", overrides=["render_actions=null"])
+        PipelineConfig.load("smoke", overrides=["render_actions=null"])
     changes = ["render_actions=null", "curate_banks=null", "evaluate_planning=null", "train_stage2.native_size=14"]
-    config = PipelineConfig.load("smoke", overrides=changes + [f"rollouts.{name}=null" for name in _of_banks("smoke")])
-    made = outline(chain, config)
+    for name, run in PipelineConfig.load("smoke").rollouts.items():
+        if run.episodes == "banks" or str(run.checkpoint).startswith("shipped_"):
+            changes.append(f"rollouts.{name}=null")
+    made = outline(chain, PipelineConfig.load("smoke", overrides=changes))
     assert "render_actions" not in made
     assert not any("tracks" in call.inputs for call in made.values())
-
-
-def _of_banks(preset: str) -> list[str]:
-    runs = PipelineConfig.load(preset).rollouts.items()
-    return [name for name, run in runs if run.episodes == "banks" or str(run.checkpoint).startswith("shipped_")]
 
 
 def test_inputs_are_checked_where_a_task_is_called() -> None:
@@ -167,42 +156,36 @@ def test_inputs_are_checked_where_a_task_is_called() -> None:
         curate.submit(config.curate)
 
 
-def test_the_installed_chain_is_the_pipeline_s() -> None:
-    assert load_chain() is chain
+COUNTING = """
+from worldline_core.config import StrictModel
+
+class CountConfig(StrictModel):
+    factor: int = 1
+
+def count_files(config, inputs, output):
+    (output / "count").write_text(str(config.factor * len(list(inputs["episodes"].iterdir()))))
+    return {}
+"""
+TASK = """
+from tasks.execution.artifact_task import ArtifactTask
+
+count_files = ArtifactTask(
+    name="count_files", summary="count the files", version=1,
+    function="counting:count_files", config="counting:CountConfig", inputs=("episodes",),
+)
+"""
 
 
 @pytest.mark.slow
 def test_a_step_needs_a_core_function_a_task_file_and_a_line(
     prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "counting.py").write_text(
-        textwrap.dedent("""
-        from worldline_core.config import StrictModel
-
-        class CountConfig(StrictModel):
-            factor: int = 1
-
-        def count_files(config, inputs, output):
-            (output / "count").write_text(str(config.factor * len(list(inputs["episodes"].iterdir()))))
-            return {}
-    """)
-    )
-    (tmp_path / "tasks").mkdir()
-    (tmp_path / "tasks" / "count_files.py").write_text(
-        textwrap.dedent("""
-        from tasks.execution.artifact_task import ArtifactTask
-
-        count_files = ArtifactTask(
-            name="count_files", summary="count the files", version=1,
-            function="counting:count_files", config="counting:CountConfig", inputs=("episodes",),
-        )
-    """)
-    )
+    for name, text in {"counting.py": COUNTING, "tasks/count_files.py": TASK, "episodes/one": "1"}.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(tasks, "__path__", [*tasks.__path__, str(tmp_path / "tasks")])
     task = find_task("count_files")
-    (tmp_path / "episodes").mkdir()
-    (tmp_path / "episodes" / "one").write_text("1")
 
     @flow
     def longer_chain() -> Path:
@@ -215,3 +198,24 @@ def test_a_step_needs_a_core_function_a_task_file_and_a_line(
         assert (longer_chain() / "count").read_text() == "7"
     assert "count_files" in task_names()
     del sys.modules["tasks.count_files"], sys.modules["counting"]
+
+
+DEPLOYMENT_KEYS = {"name", "description", "entrypoint", "parameters", "schedules", "work_pool"}
+
+
+def test_deployments_are_the_flows_and_every_step_with_parameters_that_exist(project_root: Path) -> None:
+    content = read_yaml(project_root / "prefect.yaml")
+    assert set(content) == {"name", "prefect-version", "definitions", "deployments"}
+    deployments = content["deployments"]
+    steps = dict.fromkeys(call.task.name for call in outline(chain, PipelineConfig.load("tiny")).values())
+    assert [deployment["name"] for deployment in deployments] == ["pipeline", "nightly-evaluation", *steps]
+    for deployment in deployments:
+        assert set(deployment) <= DEPLOYMENT_KEYS
+        assert set(deployment["work_pool"]) == {"name", "job_variables"}
+        assert all(set(schedule) == {"cron", "timezone", "active"} for schedule in deployment.get("schedules", ()))
+        path, _, function = deployment["entrypoint"].partition(":")
+        flow = getattr(importlib.import_module(path.removesuffix(".py").replace("/", ".")), function)
+        assert isinstance(flow, Flow)
+        parameters = {"config": None, "overrides": (), "artifacts": "artifacts", **deployment["parameters"]}
+        flow.validate_parameters(parameters)
+        assert deployment["parameters"]["preset"] in preset_names()

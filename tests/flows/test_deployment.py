@@ -9,9 +9,9 @@ import socket
 import subprocess
 import sys
 import time
-import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,54 +29,40 @@ def environment(tmp_path_factory: pytest.TempPathFactory, project_root: Path) ->
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     home = tmp_path_factory.mktemp("prefect")
-    variables = {
-        **os.environ,
-        "PREFECT_HOME": str(home),
-        "PREFECT_API_URL": f"http://127.0.0.1:{port}/api",
+    variables = os.environ | {
+        "PREFECT_HOME": str(home), "PREFECT_API_URL": f"http://127.0.0.1:{port}/api", "NO_COLOR": "1",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         "PREFECT_WORKER_QUERY_SECONDS": "1",  # runs are picked up at once, not within ten seconds
-        "NO_COLOR": "1",
-    }
-    log = (home / "server.log").open("w")
-    server = subprocess.Popen(
-        [*PREFECT, "server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-ui"],
-        env=variables, cwd=project_root, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
-    )  # fmt: skip
-    try:
-        _wait_until_healthy(f"{variables['PREFECT_API_URL']}/health", server)
+    }  # fmt: skip
+    with _started(
+        variables, project_root, home / "server.log", "server", "start", "--port", f"{port}", "--no-ui"
+    ) as server:
+        deadline = time.time() + 180
+        while True:
+            assert time.time() < deadline and server.poll() is None, "the Prefect server did not answer"
+            try:
+                with urllib.request.urlopen(f"{variables['PREFECT_API_URL']}/health", timeout=2):
+                    break
+            except OSError:
+                time.sleep(0.5)
         yield variables
-    finally:
-        os.killpg(server.pid, signal.SIGTERM)
-        server.wait(timeout=30)
-        log.close()
 
 
-def _wait_until_healthy(url: str, server: subprocess.Popen[bytes]) -> None:
-    deadline = time.time() + 180
-    while time.time() < deadline and server.poll() is None:
+@contextmanager
+def _started(environment: dict[str, str], cwd: Path, log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    with log.open("w") as stream:
+        process = subprocess.Popen(
+            [*PREFECT, *arguments], env=environment, cwd=cwd, stdout=stream, stderr=stream, start_new_session=True
+        )
         try:
-            with urllib.request.urlopen(url, timeout=2):
-                return
-        except (urllib.error.URLError, TimeoutError, ConnectionError):
-            time.sleep(0.5)
-    pytest.fail(f"the Prefect server did not answer at {url}")
-
-
-def _prefect(environment: dict[str, str], cwd: Path, *arguments: str, timeout: int = 200) -> str:
-    result = subprocess.run(
-        [*PREFECT, *arguments], env=environment, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    return result.stdout
-
-
-def _stop(worker: subprocess.Popen[bytes]) -> None:
-    os.killpg(worker.pid, signal.SIGTERM)
-    try:
-        worker.wait(timeout=20)
-    except subprocess.TimeoutExpired:  # Prefect's worker now and then loses the signal and polls on
-        os.killpg(worker.pid, signal.SIGKILL)
-        worker.wait()
+            yield process
+        finally:
+            os.killpg(process.pid, signal.SIGTERM)
+            try:
+                process.wait(timeout=20)
+            except subprocess.TimeoutExpired:  # Prefect's worker now and then loses the signal and polls on
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
 
 
 @pytest.fixture(scope="module")
@@ -84,27 +70,24 @@ def worker_log(
     environment: dict[str, str], project_root: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Path]:
     """What a worker says that serves all deployments."""
-    _prefect(environment, project_root, "work-pool", "create", "worldline", "--type", "process")
-    _prefect(environment, project_root, "--no-prompt", "deploy", "--all")
+    for command in ("work-pool create worldline --type process", "--no-prompt deploy --all"):
+        done = subprocess.run(
+            [*PREFECT, *command.split()], env=environment, cwd=project_root, capture_output=True, text=True, timeout=200, check=False
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
     log = tmp_path_factory.mktemp("worker") / "worker.log"
-    worker = subprocess.Popen(
-        [*PREFECT, "worker", "start", "--pool", "worldline"],
-        env=environment, cwd=project_root, stdout=log.open("w"), stderr=subprocess.STDOUT, start_new_session=True,
-    )  # fmt: skip
-    try:
+    with _started(environment, project_root, log, "worker", "start", "--pool", "worldline"):
         yield log
-    finally:
-        _stop(worker)
 
 
-def _run(
-    environment: dict[str, str], cwd: Path, deployment: str, parameters: dict[str, Any], wait_s: int = 420
-) -> subprocess.CompletedProcess[str]:
+def _run(environment: dict[str, str], cwd: Path, deployment: str, parameters: dict[str, Any], status: int = 0) -> None:
     """A deployed run, watched to its end."""
-    return subprocess.run(
-        [*PREFECT, "deployment", "run", deployment, "--params", json.dumps(parameters), "--watch", "--watch-timeout", f"{wait_s}"],
-        env=environment, cwd=cwd, capture_output=True, text=True, timeout=wait_s + 30, check=False,
+    watched = ["--params", json.dumps(parameters), "--watch", "--watch-timeout", "420"]
+    done = subprocess.run(
+        [*PREFECT, "deployment", "run", deployment, *watched],
+        env=environment, cwd=cwd, capture_output=True, text=True, timeout=450, check=False,
     )  # fmt: skip
+    assert done.returncode == status, done.stdout + done.stderr
 
 
 def _ask(environment: dict[str, str], path: str, body: dict[str, Any]) -> Any:
@@ -123,14 +106,11 @@ def test_nightly_guards_on_a_real_server_and_worker(
     source = {"kind": "episode_set", "path": "artifacts/shipped/recordings", "name": "shipped", "license": "Apache-2.0",
               "redistribution": "yes", "include": ["*-test-s1-0000[0-1]"]}  # fmt: skip
     # A night needs a model that it does not train itself: banks are not rolled out, so this one costs nothing.
-    own = {
-        "models": {"causal": "artifacts/shipped/models/causal"},
-        "rollouts": {"causal": {"checkpoint": "shipped_causal"}},
-    }
-    config.write_text(json.dumps({"extends": "smoke", "curate": {"sources": [source]}, "evaluate_policy": None, **own}))
+    models = {"causal": "artifacts/shipped/models/causal"}
+    own = {"models": models, "rollouts": {"causal": {"checkpoint": "shipped_causal"}}, "evaluate_policy": None}
+    config.write_text(json.dumps({"extends": "smoke", "curate": {"sources": [source]}, **own}))
     given = {"preset": None, "config": str(config), "artifacts": str(artifacts)}
-    first = _run(environment, project_root, "nightly-evaluation/nightly-evaluation", {**given, "night": "first"})
-    assert first.returncode == 0, first.stdout + first.stderr + worker_log.read_text()
+    _run(environment, project_root, "nightly-evaluation/nightly-evaluation", {**given, "night": "first"})
 
     # The good night was three points of IoU better than what is measured now.
     history = artifacts / "nightly"
@@ -139,13 +119,9 @@ def test_nightly_guards_on_a_real_server_and_worker(
     write_series(scores_file(history, "first"), better)
     metric = "video/test/copy_first_frame/robot_iou@head"
     assert len(scores[metric]) >= 8
-    second = _run(environment, project_root, "nightly-evaluation/nightly-evaluation", {**given, "night": "second"})
-    assert second.returncode == 1, second.stdout + second.stderr
-    runs = _ask(
-        environment,
-        "flow_runs/filter",
-        {"flows": {"name": {"any_": ["nightly-evaluation"]}}, "sort": "START_TIME_DESC"},
-    )
+    _run(environment, project_root, "nightly-evaluation/nightly-evaluation", {**given, "night": "second"}, status=1)
+    wanted = {"flows": {"name": {"any_": ["nightly-evaluation"]}}, "sort": "START_TIME_DESC"}
+    runs = _ask(environment, "flow_runs/filter", wanted)
     assert [run["state"]["type"] for run in runs] == ["FAILED", "COMPLETED"]
     message = runs[0]["state"]["message"]
     for part in (metric, "-0.030", "12 recordings, most on", "pictures/", "worldline nightly --accept second"):
@@ -155,6 +131,4 @@ def test_nightly_guards_on_a_real_server_and_worker(
         kinds = {found["key"]: found["type"] for found in _ask(environment, "artifacts/filter", filters)}
         assert (kinds["report"], kinds["metrics"], kinds["picture"]) == ("markdown", "table", "image")
     assert metric in (history / "index.html").read_text()
-
-    filtered = _run(environment, project_root, "step/filter", given)
-    assert filtered.returncode == 0, filtered.stdout + filtered.stderr
+    _run(environment, project_root, "step/filter", given)

@@ -17,6 +17,8 @@ from flows.fit import with_cameras
 from flows.fit_command import overrides_of
 from worldline_core.calibration.estimate.estimate_config import EstimateConfig
 from worldline_core.data.sources.open import open_source
+from worldline_core.discovery.configuration import write_config
+from worldline_core.discovery.look import discover
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rollout.worldline import WorldLine
 
@@ -33,20 +35,21 @@ def here(tmp_path: Path, project_root: Path, monkeypatch: pytest.MonkeyPatch) ->
     return tmp_path
 
 
-def test_minutes_are_shared_out_and_a_gpu_does_all_of_the_work(here: Path) -> None:
+@pytest.fixture
+def own(here: Path) -> Path:
+    """The configuration that `worldline init` writes of a dataset of a user's."""
     write_so101(here / "raw")
-    from worldline_core.discovery.configuration import write_config
-    from worldline_core.discovery.look import discover
-
     write_config(discover(here / "raw"), here / "my.yaml", "raw")
-    config = PipelineConfig.load(None, here / "my.yaml", overrides_of(8.0, "24GB", 500))
-    distill = config.distill
-    trainers = [stage.trainer for stage in (config.train_stage1, config.train_stage2) if stage is not None]
-    trainers += [
-        distill.teacher_forcing.trainer,
-        distill.trajectory_regression.trainer,
-        distill.distribution_matching.trainer,
-    ]
+    return here / "my.yaml"
+
+
+def test_minutes_are_shared_out_and_a_gpu_does_all_of_the_work(own: Path) -> None:
+    config = PipelineConfig.load(None, own, overrides_of(8.0, "24GB", 500))
+    steps = config.distill
+    stages: tuple[Any, ...] = (
+        config.train_stage1, config.train_stage2, steps.teacher_forcing, steps.trajectory_regression, steps.distribution_matching,
+    )  # fmt: skip
+    trainers = [stage.trainer for stage in stages if stage is not None]
     assert sum(trainer.minutes or 0 for trainer in trainers) == pytest.approx(8.0)
     assert {trainer.device for trainer in trainers} == {config.encode_latents.device} == {"cuda"}
     assert config.train_stage2.action_following is not None
@@ -55,21 +58,15 @@ def test_minutes_are_shared_out_and_a_gpu_does_all_of_the_work(here: Path) -> No
     assert set(predicted) == {"cuda"}
 
 
-def test_cameras_are_estimated_where_a_robot_is_known_and_no_file_is_named(here: Path) -> None:
-    write_so101(here / "raw")
-    from worldline_core.discovery.configuration import write_config
-    from worldline_core.discovery.look import discover
-
-    write_config(discover(here / "raw"), here / "my.yaml", "raw")
-    config = PipelineConfig.load(None, here / "my.yaml")
+def test_cameras_are_estimated_where_a_robot_is_known_and_no_file_is_named(own: Path, here: Path) -> None:
+    config = PipelineConfig.load(None, own)
     assert EstimateConfig.of(config.curate, {}) is not None
     found = with_cameras(config, here / "cameras.json")
     assert found.render_actions is not None and config.render_actions is None
     assert EstimateConfig.of(found.curate, {}) is None
     camera = {"width": 64, "height": 48, "K": [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], "T": np.eye(4).tolist()}
-    (here / "cameras.json").write_text(
-        json.dumps({"views": {"head": camera | {"maps": "camera_to_base", "axes": "opencv"}}})
-    )
+    views = {"head": camera | {"maps": "camera_to_base", "axes": "opencv"}}
+    (here / "cameras.json").write_text(json.dumps({"views": views}))
     source = open_source(found.curate.sources[0], here / "raw")
     assert list(source.load(source.episode_ids()[0]).episode.cameras) == ["head"]
     assert here / "cameras.json" in found.curate.weights_read().values()  # its content counts in the cache key
@@ -103,46 +100,36 @@ def test_it_stops_where_a_person_must_decide_and_goes_on_with_the_answer(
     assert "worldline play --set model=" in capsys.readouterr().out
 
 
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    with pytest.raises(SystemExit, match="1"):
+        main(["fit", *arguments])
+    return capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_card_that_is_too_small_is_named_before_anything_runs(
-    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    own: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_so101(here / "raw")
     monkeypatch.setattr("worldline_core.model.tokenizers.require_device", lambda device: None)
-    with pytest.raises(SystemExit, match="1"):
-        main(["fit", "raw", "--gpu", "10MB"])
-    assert "worldline plan --config my.yaml" in capsys.readouterr().err
+    assert "worldline plan --config my.yaml" in refused(capsys, "raw", "--gpu", "10MB")
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_missing_gpu_is_said_at_once(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_so101(here / "raw")
-    with pytest.raises(SystemExit, match="1"):
-        main(["fit", "raw", "--gpu", "24GB"])
-    assert "cuda" in capsys.readouterr().err
-
-
-def test_another_dataset_and_videos_alone_are_refused_before_anything_runs(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_so101(here / "raw")
-    main(["init", "raw"])
+def test_what_cannot_run_is_refused_at_once(own: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if not torch.cuda.is_available():
+        assert "cuda" in refused(capsys, "raw", "--gpu", "24GB")
     write_so101(here / "other")
-    with pytest.raises(SystemExit, match="1"):
-        main(["fit", "other"])
-    assert "of other recordings" in capsys.readouterr().err
-    frames = pictures(so101_states()[0][:, :5], "still")
-    write_video(here / "videos" / "one.mp4", frames, 30)
-    with pytest.raises(SystemExit, match="1"):
-        main(["fit", "videos", "--config", "videos.yaml"])
-    assert "video_folder" in capsys.readouterr().err and not (here / "artifacts" / "curate").exists()
+    assert "of other recordings" in refused(capsys, "other")
+    write_video(here / "videos" / "one.mp4", pictures(so101_states()[0][:, :5], "still"), 30)
+    assert "video_folder" in refused(capsys, "videos", "--config", "videos.yaml")
+    assert not (here / "artifacts" / "curate").exists()
 
 
 @pytest.mark.slow
 def test_a_dataset_without_cameras_becomes_a_model_that_can_be_driven(prefect_server: None, here: Path) -> None:
     """Seconds of training; that the model is good takes minutes."""
     write_so101(here / "raw")
-    main(["fit", "raw", "--minutes", "0.5", "--set", "distill.trajectory_regression.trajectories.clips=8"])
+    command = ["fit", "raw", "--minutes", "0.5", "--set", "distill.trajectory_regression.trajectories.clips=8"]
+    main(command)
     latest = here / "artifacts" / "latest"
     assert "tool error" in (latest / "report" / "training.html").read_text().lower()
     verdict = (latest / "estimate_cameras" / "estimate.json").read_text()
@@ -154,6 +141,4 @@ def test_a_dataset_without_cameras_becomes_a_model_that_can_be_driven(prefect_se
     videos = world.predict(images, rows[:count], {}, embodiment="so101")
     assert {len(video) for video in videos.values()} == {count}
     assert len(SO_NAMES) == rows.shape[1]
-    main(
-        ["fit", "raw", "--minutes", "0.5", "--set", "distill.trajectory_regression.trajectories.clips=8"]
-    )  # all is there
+    main(command)  # all is there

@@ -1,21 +1,25 @@
-"""Calls of a run: started when their inputs are finished, side by side in processes, with a page that stays true."""
+"""Prefect and the store agree: calls start when their inputs are finished, side by side, cached, rebuilt."""
 
 from __future__ import annotations
 
+import base64
 import errno
 import json
+import pickle
+import shutil
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from PIL import Image
 from prefect import flow
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowFilter, FlowFilterName
-from prefect.client.schemas.sorting import ArtifactSort
+from prefect.client.schemas.sorting import ArtifactSort, TaskRunSort
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from flows.pipeline import prepare
@@ -40,8 +44,8 @@ def two_calls(declare: Any) -> Callable[[str], None]:
     first, following = declare("write_first"), declare("write_next", "before")
 
     def chain(second: str = "b") -> None:
-        one = first.submit(first.load_config()(text="a"))
-        following.submit(following.load_config()(text=second), "write_next.second", before=one)
+        one = first.submit(first.load_config()(text="a"), "one")
+        following.submit(following.load_config()(text=second), "two", before=one)
 
     return chain
 
@@ -57,31 +61,20 @@ def run(store: Path, chain: Callable[..., None], *arguments: str, page: bool = F
     return some_calls()
 
 
-@pytest.mark.parametrize(
-    ("number", "text", "message"), [(errno.EROFS, "broken", "cannot work"), (errno.ENOSPC, "full", "No space left")]
-)
 def test_a_call_starts_when_its_inputs_are_finished_and_is_found_where_nothing_may_be_written(
-    storage: Path,
-    two_calls: Callable[..., None],
-    number: int,
-    text: str,
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    storage: Path, two_calls: Callable[..., None], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     done = run(storage, two_calls)
-    assert list(done) == ["write_first", "write_next.second"]
-    assert (done["write_next.second"].folder / "text").read_text() == "ab"
+    assert list(done) == ["one", "two"]
+    assert (done["two"].folder / "text").read_text() == "ab"
     made = {path: path.stat().st_mtime_ns for path in storage.rglob("text")}
-
-    def refuse(*_: object) -> NoReturn:
-        raise OSError(number, "the page cannot be written")
-
-    monkeypatch.setattr(run_page, "write_progress_page", refuse)
-    assert run(storage, two_calls, page=True) == done
+    for number, text, message in ((errno.EROFS, "broken", "cannot work"), (errno.ENOSPC, "full", "No space left")):
+        refuse = Mock(side_effect=OSError(number, "the page cannot be written"))
+        monkeypatch.setattr(run_page, "write_progress_page", refuse)
+        assert run(storage, two_calls, page=True) == done
+        with pytest.raises(WorldLineError, match=message):
+            run(storage, two_calls, text, page=True)
     assert {path: path.stat().st_mtime_ns for path in storage.rglob("text")} == made
-    with pytest.raises(WorldLineError, match=message):
-        run(storage, two_calls, text, page=True)
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -106,11 +99,9 @@ def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path
     summary = {"methods": {"causal": {"budgets": {"32": {"success": success}}}}}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     scores = ArtifactReference(step="evaluate_planning", path=tmp_path, digest="0" * 64)
-
     pictures = {"e1, causal: ssim became worse by 0.1": tmp_path / "worst.jpg", "second": tmp_path / "second.jpg"}
     for colour, picture in zip(("red", "blue"), pictures.values(), strict=True):
         Image.new("RGB", (8, 6), colour).save(picture)
-
     verdicts = {"video/gone": "missing", "planning/N=32/causal/success": "worse by 0.200"}
 
     @flow
@@ -120,27 +111,18 @@ def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path
     shown()
     with get_client(sync_client=True) as client:
         read = client.read_artifacts(sort=ArtifactSort.CREATED_DESC)[::-1]
-        found = {artifact.key: artifact.data for artifact in read}
-        described = {artifact.key: str(artifact.description) for artifact in read}
-    assert (tmp_path / "latest" / "index.html").as_uri() in str(found["report"])
+    found = {artifact.key: str(artifact.data) for artifact in read}
+    described = {artifact.key: str(artifact.description) for artifact in read}
+    assert (tmp_path / "latest" / "index.html").as_uri() in found["report"]
     row = {"metric": "planning/N=32/causal/success", "verdict": "worse by 0.200", "mean": 0.75, "95 % from": 0.5, "to": 1.0,
            "trajectories": 9}  # fmt: skip
-    assert json.loads(str(found["metrics"])) == [{"metric": "video/gone", "verdict": "missing"}, row]
+    assert json.loads(found["metrics"]) == [{"metric": "video/gone", "verdict": "missing"}, row]
     assert "2 of 2 metrics became worse or are missing" in described["metrics"]
     assert "e1, causal: ssim became worse by 0.1" in described["picture"]
     for key, picture in zip(("picture", "picture-1"), pictures.values(), strict=True):
         # A browser shows it wherever the page comes from: the picture itself is in its address.
-        with urllib.request.urlopen(str(found[key])) as reply:
+        with urllib.request.urlopen(found[key]) as reply:
             assert (reply.headers["Content-type"], reply.read()) == ("image/jpeg", picture.read_bytes())
-
-
-@pytest.mark.slow
-def test_the_page_shows_the_error_that_ended_the_run(storage: Path, two_calls: Callable[..., None]) -> None:
-    with pytest.raises(DataError, match="This task cannot work"):
-        run(storage, two_calls, "broken", page=True)
-    text = (storage / "report" / "latest" / "index.html").read_text()
-    assert "This task cannot work" in text
-    assert "write_first" in text
 
 
 FEW = """
@@ -153,8 +135,16 @@ curate_banks:
 
 
 @pytest.mark.slow
+def test_the_page_shows_the_error_that_ended_the_run(storage: Path, two_calls: Callable[..., None]) -> None:
+    with pytest.raises(DataError, match="This task cannot work"):
+        run(storage, two_calls, "broken", page=True)
+    text = (storage / "report" / "latest" / "index.html").read_text()
+    assert all(fact in text for fact in ("This task cannot work", "one"))
+
+
+@pytest.mark.slow
 def test_steps_side_by_side_give_the_artifacts_of_one_process(
-    prefect_server: None, tmp_path: Path, project_root: Path, monkeypatch: pytest.MonkeyPatch
+    storage: Path, tmp_path: Path, project_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(project_root)
     (tmp_path / "few.yaml").write_text(FEW)
@@ -165,17 +155,15 @@ def test_steps_side_by_side_give_the_artifacts_of_one_process(
 
     @flow(name=tmp_path.name)
     def side_by_side(at_once: int) -> dict[str, ArtifactReference]:
-        store = tmp_path / f"store{at_once}"
-        with PrefectRun(store, RunnerConfig(steps_at_once=at_once), outline(chain)) as run:
+        with PrefectRun(tmp_path / f"store{at_once}", RunnerConfig(steps_at_once=at_once), outline(chain)) as run:
             chain()
         return run.artifacts
 
-    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
-        digests = [{name: made.digest for name, made in side_by_side(n).items()} for n in (1, 2)]
-    assert set(digests[0]) == {"curate", "filter", "render_actions", "curate.banks", "render_actions.banks"}
-    assert digests[0] == digests[1]
+    one, two = ({name: made.digest for name, made in side_by_side(n).items()} for n in (1, 2))
+    assert set(one) == {"curate", "filter", "render_actions", "curate.banks", "render_actions.banks"}
+    assert one == two
     page = (tmp_path / "store2" / "report" / "latest" / "index.html").read_text()
-    assert all(name in page for name in digests[0])
+    assert all(name in page for name in one)
     runs = task_runs(tmp_path.name, 10)
     names = {run.id: run.name for run in runs}
     for run in runs:
@@ -184,15 +172,77 @@ def test_steps_side_by_side_give_the_artifacts_of_one_process(
         assert sources == expected.get(run.name, set()), run.name
 
 
-def task_runs(flow_name: str, count: int) -> list[Any]:
-    """Task runs of a flow; they reach the server as events, later."""
+def task_runs(flow_name: str, count: int, states: dict[str, str] | None = None) -> list[Any]:
+    """Task runs of a flow, the last ones in these states; they reach the server as events, later."""
     deadline = time.monotonic() + 60
+    flows = FlowFilter(name=FlowFilterName(any_=[flow_name]))
     with get_client(sync_client=True) as client:
         while True:
-            found = client.read_task_runs(flow_filter=FlowFilter(name=FlowFilterName(any_=[flow_name])))
-            if len(found) >= count or time.monotonic() > deadline:
+            found: list[Any] = client.read_task_runs(flow_filter=flows, sort=TaskRunSort.EXPECTED_START_TIME_ASC)
+            last = {run.name: str(run.state.name) for run in found if run.state is not None}
+            if len(found) >= count and states in (None, last):
                 return found
+            assert time.monotonic() < deadline, last
             time.sleep(0.2)
 
 
-# The pool's processes import this file, so that the line a minute is a line a step in them too.
+@pytest.mark.slow
+def test_prefect_shows_what_the_store_has(storage: Path, two_calls: Callable[..., None]) -> None:
+    def shown(*states: str) -> None:
+        task_runs(storage.parent.name, 2, dict(zip(("one", "two"), states, strict=True)))
+
+    done = run(storage, two_calls)
+    shown("Completed", "Completed")
+    assert run(storage, two_calls) == done
+    shown("Cached", "Cached")
+    changed = run(storage, two_calls, "c")
+    assert (changed["one"], (changed["two"].path / "text").read_text()) == (done["one"], "ac")
+    shown("Cached", "Completed")
+    shutil.rmtree(done["one"].path)
+    assert run(storage, two_calls) == done
+    assert (done["one"].path / "text").read_text() == "a"
+    shown("Completed", "Cached")
+
+
+class Trap:
+    """Runs code when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.path,)
+
+
+def _records(trap: Path, elsewhere: Path) -> dict[str, Callable[[dict[str, Any]], dict[str, Any]]]:
+    """What somebody may have written in the place of a record."""
+    pickled = base64.b64encode(pickle.dumps(Trap(trap))).decode()
+    lie = json.dumps({"step": "write_one", "path": str(elsewhere), "digest": "0" * 64})
+
+    def change(result: str | None = None, **serializer: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
+        return lambda record: {
+            "metadata": record["metadata"] | {"serializer": record["metadata"]["serializer"] | serializer},
+            "result": record["result"] if result is None else result,
+        }
+
+    return {
+        "pickle": lambda r: {"metadata": r["metadata"] | {"serializer": {"type": "pickle"}}, "result": pickled},
+        "a decoder": change(object_decoder="trap_door.anything"), "another place": change(lie), "no record": lambda r: {},
+    }  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pickle", "a decoder", "another place", "no record", "a folder"])
+def test_prefects_records_are_not_believed(
+    storage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, two_calls: Callable[..., None]
+) -> None:
+    (tmp_path / "trap_door.py").write_text(f"open({str(tmp_path / 'trap')!r}, 'w')")
+    monkeypatch.syspath_prepend(tmp_path)
+    done = run(storage, two_calls)
+    change = _records(tmp_path / "trap", tmp_path / "elsewhere").get(kind)
+    for path in (tmp_path / "prefect").iterdir():
+        record = json.loads(path.read_text())
+        path.unlink()
+        path.mkdir() if change is None else path.write_text(json.dumps(change(record)))
+    assert run(storage, two_calls) == done
+    assert not (tmp_path / "trap").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -31,49 +32,40 @@ class Fit(Objective[Batch]):
         return (self.weight**2).sum(), {}
 
 
-def train_something(output: Path, steps: int) -> None:
-    fit = Fit()
-    train(
-        TrainerConfig(steps=steps, ema_decay=0.5, log_every=10), groups=[ParameterGroup("fit", {"weight": fit.weight})],
-        objective=fit, load=lambda _: Batch(), output=output, identity={}, title="stage II",
-    )  # fmt: skip
-
-
 @pytest.fixture
-def piped(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
-    """The log of loops in which two seconds pass between two looks at the clock."""
+def messages(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
+    """Log lines of loops in which two seconds pass between two looks at the clock."""
     clock = count(0.0, 2.0)
     monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     caplog.set_level("INFO", "worldline_core")
-    return caplog
+    # Other libraries' threads may log meanwhile.
+    return lambda: [record.getMessage() for record in caplog.records if record.name.startswith("worldline_core")]
 
 
-def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """Log lines of the project; other libraries' threads may log meanwhile."""
-    return [record.getMessage() for record in caplog.records if record.name.startswith("worldline_core")]
-
-
-def test_a_training_writes_a_line_a_minute(tmp_path: Path, piped: pytest.LogCaptureFixture) -> None:
-    train_something(tmp_path, 100)
-    assert len(messages(piped)) == 3
+def test_a_training_writes_a_line_a_minute(tmp_path: Path, messages: Callable[[], list[str]]) -> None:
+    fit = Fit()
+    train(
+        TrainerConfig(steps=100, ema_decay=0.5, log_every=10), groups=[ParameterGroup("fit", {"weight": fit.weight})],
+        objective=fit, load=lambda _: Batch(), output=tmp_path, identity={}, title="stage II",
+    )  # fmt: skip
     pattern = r"stage II: (\d+) of 100 steps, loss 0\.\d+, 1\.5 clips/s, (\d\d:\d\d) left"
-    found = [re.fullmatch(pattern, message) for message in messages(piped)]
+    found = [re.fullmatch(pattern, message) for message in messages()]
     assert [match and match.groups() for match in found] == [("30", "02:20"), ("60", "01:20"), ("90", "00:20")]
 
 
-def test_what_was_there_already_does_not_hurry_the_estimate(piped: pytest.LogCaptureFixture) -> None:
+def test_what_was_there_already_does_not_hurry_the_estimate(messages: Callable[[], list[str]]) -> None:
     with Progress("rollout causal", 1000, "clip", done=500) as shown:
         for _ in range(60):
             shown.advance(5, verdict="consistent")
-    assert messages(piped) == [
+    assert messages() == [
         "rollout causal: 650 of 1000 clips, verdict consistent, 2.5 clips/s, 02:20 left",
         "rollout causal: 800 of 1000 clips, verdict consistent, 2.5 clips/s, 01:20 left",
     ]
 
 
-def test_other_processes_of_the_same_loop_are_silent(piped: pytest.LogCaptureFixture) -> None:
+def test_other_processes_of_the_same_loop_are_silent(messages: Callable[[], list[str]]) -> None:
     with Progress("stage II", 100, "step", shown=False) as shown:
         for _ in range(100):
             shown.advance()
     assert list(with_progress("abc", "letters", "letter")) == ["a", "b", "c"]
-    assert messages(piped) == []
+    assert messages() == []
