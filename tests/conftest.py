@@ -68,9 +68,7 @@ def rendering() -> None:
     try:
         mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>")).close()
     except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
-        pytest.skip(
-            f"off-screen OpenGL is not available here ({error}); on Debian: libegl1 libegl-mesa0 libgl1-mesa-dri"
-        )
+        pytest.skip(f"no off-screen OpenGL ({error}); on Debian: libegl1 libegl-mesa0 libgl1-mesa-dri")
 
 
 @pytest.fixture(scope="session")
@@ -81,12 +79,11 @@ def project_root() -> Path:
 @pytest.fixture(scope="session")
 def uv(project_root: Path) -> str:
     """The uv that builds wheels."""
-    for candidate in (shutil.which("uv"), str(project_root / ".bootstrap" / "bin" / "uv")):
+    for candidate in filter(None, (shutil.which("uv"), str(project_root / ".bootstrap" / "bin" / "uv"))):
         # A version manager may leave a uv that only says that it is not there.
         if (
-            candidate
-            and Path(candidate).is_file()
-            and subprocess.run([candidate, "--version"], capture_output=True, check=False).returncode == 0
+            Path(candidate).is_file()
+            and subprocess.run([candidate, "-V"], capture_output=True, check=False).returncode == 0
         ):
             return candidate
     pytest.skip("uv builds the wheels and is not here")
@@ -191,26 +188,19 @@ def _start_prefect_server(folder: Path) -> tuple[int, int]:
 @pytest.fixture(scope="session")
 def make_model() -> Callable[..., WorldModel]:
     """Very small world models (4 latent channels, 9 action channels) whose every weight is random: no path is silent."""
+    import torch
+
+    from worldline_core.model.world_model import WorldModel
+    from worldline_core.model.world_model_config import WorldModelConfig
+
+    small = {
+        "latent_channels": 4, "hidden_size": 24, "num_layers": 2, "num_heads": 2, "num_kv_heads": 1, "head_dim": 12,
+        "intermediate_size": 32, "rope_sections": (2, 2, 2), "towers": "generation",
+    }  # fmt: skip
 
     def make(seed: int = 0, *, scale: float = 0.2, **changes: object) -> WorldModel:
-        import torch
-
-        from worldline_core.model.world_model import WorldModel
-        from worldline_core.model.world_model_config import WorldModelConfig
-
-        values: dict[str, object] = {
-            "latent_channels": 4,
-            "hidden_size": 24,
-            "num_layers": 2,
-            "num_heads": 2,
-            "num_kv_heads": 1,
-            "head_dim": 12,
-            "intermediate_size": 32,
-            "rope_sections": (2, 2, 2),
-            "towers": "generation",
-        }
         generator = torch.Generator().manual_seed(seed)
-        model = WorldModel(WorldModelConfig.model_validate(values | changes))
+        model = WorldModel(WorldModelConfig.model_validate(small | changes))
         with torch.no_grad():
             for parameter in model.parameters():
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
@@ -222,33 +212,19 @@ def make_model() -> Callable[..., WorldModel]:
 @pytest.fixture(scope="session")
 def make_contract() -> Callable[..., ActionContract]:
     """Action contracts of small models."""
+    from worldline_core.model.world_model_config import ActionContract
 
-    def make(**changes: object) -> ActionContract:
-        from worldline_core.model.world_model_config import ActionContract
-
-        values: dict[str, object] = {
-            "controls": "action",
-            "sigma_px_ref": 40.0,
-            "fps": 8.0,
-            "grid_size": (4, 4),
-            "tokenizer": "0123",
-        }
-        return ActionContract.model_validate(values | changes)
-
-    return make
+    small = {"controls": "action", "sigma_px_ref": 40.0, "fps": 8.0, "grid_size": (4, 4), "tokenizer": "0123"}
+    return lambda **changes: ActionContract.model_validate(small | changes)
 
 
 @pytest.fixture(scope="session")
 def make_spec() -> Callable[..., CausalSpec]:
     """Causal blocks of small models: two latent frames, a window of one and three blocks, the paper's nodes."""
+    from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
 
-    def make(**changes: object) -> CausalSpec:
-        from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
-
-        values = {"block_size": 2, "sink_blocks": 1, "recent_blocks": 3, "anchor_blocks": None, "sigmas": CAUSAL_SIGMAS}
-        return CausalSpec.model_validate(values | changes)
-
-    return make
+    small = {"block_size": 2, "sink_blocks": 1, "recent_blocks": 3, "anchor_blocks": None, "sigmas": CAUSAL_SIGMAS}
+    return lambda **changes: CausalSpec.model_validate(small | changes)
 
 
 @pytest.fixture

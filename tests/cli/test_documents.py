@@ -74,19 +74,16 @@ def test_documented_commands_exist(page: str) -> None:
     for program, words in commands(PAGES[page]):
         if program == "worldline":
             check_words(build_parser(), words)
-        elif words[0].startswith(("tasks.", "tools.", "benchmarks.", "flows.", "examples/", "benchmarks/", "tools/")):
+        elif words[0].startswith("tasks."):
+            assert words[0] == "tasks.X" or words[0].removeprefix("tasks.") in task_names()
+            parser = argparse.ArgumentParser()
+            add_task_arguments(parser)
+            check_words(parser, words[1:])
+        elif words[0].startswith(("tools.", "benchmarks.", "flows.", "examples/", "benchmarks/", "tools/")):
             place = ROOT / (words[0] if words[0].endswith(".py") else words[0].replace(".", "/"))
-            script = place / "__main__.py" if place.is_dir() else place.with_suffix(".py")
-            assert script.is_file() or words[0] == "tasks.X", f"no {script}"
-            if words[0].startswith("tasks."):
-                parser = argparse.ArgumentParser()
-                add_task_arguments(parser)
-                check_words(parser, words[1:])
-            else:
-                missing = [
-                    word for word in words[1:] if word.startswith("--") and f'"{word}"' not in script.read_text()
-                ]
-                assert not missing, f"{script.name} has no {missing}"
+            script = (place / "__main__.py" if place.is_dir() else place.with_suffix(".py")).read_text()
+            missing = [word for word in words[1:] if word.startswith("--") and f'"{word}"' not in script]
+            assert not missing, f"{words[0]} has no {missing}"
         else:
             continue
         for name in (word for word in words if re.fullmatch(r"(configs|artifacts/shipped)/[\w/.-]+", word)):
@@ -107,23 +104,20 @@ def test_documented_configurations_are_valid(page: str) -> None:
     """Whole files are not shown: what is missing is no mistake."""
     blocks = "\n---\n".join(block for kind, block in FENCED.findall(PAGES[page]) if kind == "yaml")
     # Alternatives of one key stand below each other.
-    blocks = re.sub(r"\n(?=description: |clips: )", "\n---\n", blocks).replace(
-        "\n  input: {kind: f", "\n---\ninput: {kind: f"
-    )
-    for values in yaml.safe_load_all(blocks.replace(", ...}", "}")):
-        for key, value in (values or {}).items():
-            if key == QUESTIONS:
-                continue
-            model, given = SNIPPETS.get(key, PipelineConfig), {key: value}
-            if page == "embodiments.md":
-                model = Embodiment
-            elif key in ("full", "more_noise"):
-                model, given = Variant, value
-            elif key in task_names() and key not in PipelineConfig.model_fields:
-                model, given = find_task(key).load_config(), value
-            try:
-                model.model_validate(given)
-            except ValidationError as error:
-                wrong = {problem["type"] for problem in error.errors()} - {"missing", "too_short"}
-                if wrong:
-                    pytest.fail(str(error))
+    blocks = re.sub(r"\n(?=description: |clips: )", "\n---\n", blocks)
+    blocks = blocks.replace("\n  input: {kind: f", "\n---\ninput: {kind: f").replace(", ...}", "}")
+    for key, value in (
+        item for values in yaml.safe_load_all(blocks) for item in (values or {}).items() if item[0] != QUESTIONS
+    ):
+        model, given = SNIPPETS.get(key, PipelineConfig), {key: value}
+        if page == "embodiments.md":
+            model = Embodiment
+        elif key in ("full", "more_noise"):
+            model, given = Variant, value
+        elif key in task_names() and key not in PipelineConfig.model_fields:
+            model, given = find_task(key).load_config(), value
+        try:
+            model.model_validate(given)
+        except ValidationError as error:
+            if {problem["type"] for problem in error.errors()} - {"missing", "too_short"}:
+                pytest.fail(str(error))

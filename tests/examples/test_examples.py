@@ -45,21 +45,16 @@ def test_check_calibration(project_root: Path, tmp_path: Path) -> None:
 def test_evaluate_videos_of_another_simulator(project_root: Path, tmp_path: Path) -> None:
     calls = outline(chain, PipelineConfig.load("smoke"))
     store = ArtifactStore(tmp_path / "artifacts")
-    calls["curate"].task.run(store, calls["curate"].config, ready_inputs(calls["curate"], calls, store))
-    kept = calls["filter"].task.run(store, calls["filter"].config, ready_inputs(calls["filter"], calls, store))
-    episodes = EpisodeSet.open(kept.path)
+    for call in (calls["curate"], calls["filter"]):
+        kept = call.task.run(store, call.config, ready_inputs(call, calls, store)).path
+    episodes = EpisodeSet.open(kept)
     number, row = next((i, row) for i, row in enumerate(episodes.rows) if row.split == "test")
     # A simulator that predicts that nothing moves.
     frames = episodes.frames(number, "head")
-    still = frames[:1].repeat(len(frames), axis=0)
     (tmp_path / "videos").mkdir()
-    encode_video(tmp_path / "videos" / f"{row.episode_id}_head.mp4", still, row.fps)
-    printed = _run(
-        project_root, "evaluate_videos.py", tmp_path / "videos", kept.path, "--artifacts", tmp_path / "artifacts"
-    )
-    assert "1 episodes" in printed
-    assert "robot_iou" in printed
-    assert "psnr@head" in printed
+    encode_video(tmp_path / "videos" / f"{row.episode_id}_head.mp4", frames[:1].repeat(len(frames), axis=0), row.fps)
+    printed = _run(project_root, "evaluate_videos.py", tmp_path / "videos", kept, "--artifacts", tmp_path / "artifacts")
+    assert all(word in printed for word in ("1 episodes", "robot_iou", "psnr@head"))
 
 
 def test_plan_over_a_bank(project_root: Path, tmp_path: Path) -> None:

@@ -101,10 +101,7 @@ def imported(project_root: Path) -> dict[str, set[str]]:
 def test_every_import_is_declared_and_every_dependency_imported(project_root: Path, project: dict) -> None:
     declared = names(project["dependencies"])
     extras = project["optional-dependencies"]
-    optional = {
-        *extras,
-        *(name for extra in extras.values() for name in names(extra)),
-    }  # dask comes by the extra `dask`
+    optional = {*extras, *names(text for extra in extras.values() for text in extra)}  # dask comes by the extra `dask`
     distributions: dict[str, set[str]] = {}
     for name in declared | optional:
         for module in modules(name):

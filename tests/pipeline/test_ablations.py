@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,9 @@ def calls() -> dict[str, TaskCall]:
 
 
 def test_what_variants_share_is_one_call(calls: dict[str, TaskCall]) -> None:
-    assert [name for name in calls if name.startswith("train_stage2")] == [
-        "train_stage2", *(f"train_stage2.{name}" for name in VARIANTS)
-    ]  # fmt: skip
-    shared = (
+    trained = ["train_stage2", *(f"train_stage2.{name}" for name in VARIANTS)]
+    assert [name for name in calls if name.startswith("train_stage2")] == trained
+    shared = {
         "curate",
         "filter",
         "render_actions",
@@ -53,18 +53,11 @@ def test_what_variants_share_is_one_call(calls: dict[str, TaskCall]) -> None:
         "train_stage1",
         "curate.banks",
         "render_actions.banks",
-    )
-    assert set(shared) == {
-        name for name, call in calls.items() if call.task.name in {n.partition(".")[0] for n in shared}
     }
+    assert {name for name, call in calls.items() if call.task.name in {n.partition(".")[0] for n in shared}} == shared
     assert not any(name.startswith(("distill", "evaluate_policy", "report")) for name in calls)
-    assert set(calls["ablation_table"].inputs) == {
-        f"{step}.{name}.0" for step in ("evaluate_video", "evaluate_planning") for name in ("full", *VARIANTS)
-    }
-
-
-def test_a_run_that_rolls_out_stage1_has_a_variant_without_it() -> None:
-    assert {f"train_stage2.{name}" for name in VARIANTS} <= set(variants_outline(preset="cosmos3-nano"))
+    names = {f"{step}.{name}.0" for step in ("evaluate_video", "evaluate_planning") for name in ("full", *VARIANTS)}
+    assert set(calls["ablation_table"].inputs) == names
 
 
 def test_each_variant_changes_what_it_says_and_nothing_else(calls: dict[str, TaskCall]) -> None:
@@ -101,7 +94,8 @@ def test_compute_is_matched_by_video_tokens() -> None:
 
 @pytest.mark.parametrize("preset", ["demo", "tiny", "cosmos3-nano"])
 def test_every_preset_has_ablations(preset: str) -> None:
-    assert {f"evaluate_video.{variant}" for variant in VARIANTS} <= set(variants_outline(preset=preset))
+    expected = {f"{step}.{variant}" for step in ("train_stage2", "evaluate_video") for variant in VARIANTS}
+    assert expected <= set(variants_outline(preset=preset))
 
 
 def test_mistakes_are_named() -> None:
@@ -118,22 +112,24 @@ def test_the_paper_s_numbers_are_those_of_its_table(project_root: Path) -> None:
     if not file.is_file():
         pytest.skip(f"the paper's tables are not here (looked in {file})")
     table = json.loads(file.read_text())["ablations"]
-    names = {"full": "full", "no_action_free": "no_action_free", "head_only": "head_only",
-             "success_only": "success_only", "native_film": "native_film", "no_regularization": "no_regularization"}  # fmt: skip
     columns = ("held_out_lpips", "held_out_robot_iou", "ood_lpips", "ood_robot_iou", "success_pi05", "success_lingbot")
     for name, variant in load_variants().items():
-        assert [variant.paper.get(column) for column in columns] == table[names[name]], name
+        assert [variant.paper.get(column) for column in columns] == table[name], name
         for policy, direct in (("pi05", 58.9), ("lingbot", 41.0)):  # gains are over direct execution
             assert variant.paper[f"gain_{policy}"] == pytest.approx(variant.paper[f"success_{policy}"] - direct)
 
 
-def evaluation(folder: Path, values: dict[str, float], split: str = "test") -> Path:
-    scores = [Score("stage2", name, "arm", split, "head", 42, "robot_iou", value) for name, value in values.items()]
+def evaluation(folder: Path, values: dict[str, float]) -> Path:
+    scores = [Score("stage2", name, "arm", "test", "head", 42, "robot_iou", value) for name, value in values.items()]
     write_scores(folder, scores)
-    summary = {**summarise(scores, comparisons=None, resamples=200, seed=0), "methods": ["stage2"],
-               "unavailable": {"lpips": "no folder configured"}}  # fmt: skip
-    write_json_atomic(folder / "summary.json", summary)
+    summary = summarise(scores, comparisons=None, resamples=200, seed=0)
+    unavailable = {"lpips": "no folder configured"}
+    write_json_atomic(folder / "summary.json", summary | {"methods": ["stage2"], "unavailable": unavailable})
     return folder
+
+
+def table_rows(table: Path) -> dict[tuple[str, str], dict[str, Any]]:
+    return {(row["variant"], row["column"]): row for row in pq.read_table(table).to_pylist()}
 
 
 def test_the_table_shows_numbers_counts_intervals_and_reasons(tmp_path: Path) -> None:
@@ -146,38 +142,37 @@ def test_the_table_shows_numbers_counts_intervals_and_reasons(tmp_path: Path) ->
         "evaluate_video.success_only.0": evaluation(tmp_path / "success", {"a": 0.5}),
     }
     planning = {"mean": 0.75, "low": 0.5, "high": 1.0, "count": 4}
-    budget = {"success": planning, "gain": planning | {"mean": 0.25}, "banks": {"x": 1.0, "y": 0.5}}
-    write_json_atomic(
-        tmp_path / "plan/summary.json", {"methods": {"banks_stage2": {"budgets": {"8": {}, "32": budget}}}}
-    )
+    budgets = {"8": {}, "32": {"success": planning, "gain": planning | {"mean": 0.25}, "banks": {"x": 1.0, "y": 0.5}}}
+    write_json_atomic(tmp_path / "plan/summary.json", {"methods": {"banks_stage2": {"budgets": budgets}}})
     counts = ablation_table(config, inputs | {"evaluate_planning.full.0": tmp_path / "plan"}, tmp_path / "out")
     assert (counts["cells"], counts["measured"]) == (21, 5)
-    rows = {(row["variant"], row["column"]): row for row in pq.read_table(tmp_path / "out/table.parquet").to_pylist()}
+    rows = table_rows(tmp_path / "out/table.parquet")
     full, head = rows["full", "held_out_robot_iou"], rows["head_only", "held_out_robot_iou"]
-    assert (full["mean"], full["count"], full["paper"]) == (pytest.approx(0.7), 3, "0.5622")
+    assert (full["mean"], full["count"], full["paper"], full["difference"]) == (pytest.approx(0.7), 3, "0.5622", None)
     assert full["low"] < full["mean"] < full["high"]
-    assert full["difference"] is None
     assert [head[key] for key in ("difference", "difference_low", "difference_high")] == pytest.approx([-0.1] * 3)
     assert rows["success_only", "held_out_robot_iou"]["difference"] == pytest.approx(-0.1)  # of the one in common
-    assert rows["full", "held_out_lpips"]["reason"] == "no folder configured"
-    assert rows["head_only", "held_out_lpips"]["reason"] == "does not compare with the other rows"
-    assert rows["full", "ood_robot_iou"]["reason"] == "no recordings of the split ood_test"
+    assert {cell: rows[cell]["reason"] for cell in REASONS} == REASONS
     assert (rows["full", "success"]["mean"], rows["full", "success"]["paper"]) == (75.0, "78 / 62.4")
-    assert rows["head_only", "gain"]["reason"] == "this run plans over no banks"
     text = (tmp_path / "out/table.md").read_text()
-    assert "| Full WorldLine | not measured (0.1804) | 0.700 [" in text
-    assert "n=3 (0.5622)" in text
-    assert all(word in text for word in ("Success-only trajectories", "0.4348", "less the full model -0.100"))
+    for part in ("| not measured (0.1804) | 0.700 [", "n=3 (0.5622)", "0.4348", "less the full model -0.100"):
+        assert part in text
     with pytest.raises(ArtifactError, match=r"(?s)not those of the variants.*evaluate_video\.head_only"):
         ablation_table(config, {"evaluate_video.full.0": inputs["evaluate_video.full.0"]}, tmp_path / "few")
 
 
+REASONS = {
+    ("full", "held_out_lpips"): "no folder configured",
+    ("head_only", "held_out_lpips"): "does not compare with the other rows",
+    ("full", "ood_robot_iou"): "no recordings of the split ood_test",
+    ("head_only", "gain"): "this run plans over no banks",
+}
+
+
 def test_every_variant_is_trained_with_every_seed_on_the_same_data(tmp_path: Path) -> None:
-    (tmp_path / "own.yaml").write_text(
-        "full: {label: all}\nnoise: {label: noise, changes: [train_stage2.sigma.shift=9]}\n"
-    )
-    chosen = choose_variants(file=tmp_path / "own.yaml")
-    calls = outline(compare_variants, load, chosen, (3, 4))
+    own = tmp_path / "own.yaml"
+    own.write_text("full: {label: all}\nnoise: {label: noise, changes: [train_stage2.sigma.shift=9]}\n")
+    calls = outline(compare_variants, load, choose_variants(file=own), (3, 4))
     trainings = {name: call.config for name, call in calls.items() if call.task.name == "train_stage2"}
     assert {name: (c.trainer.seed, c.sigma.shift) for name, c in trainings.items()} == {
         "train_stage2.seed_3": (3, 1), "train_stage2.noise.seed_3": (3, 9),
@@ -187,30 +182,26 @@ def test_every_variant_is_trained_with_every_seed_on_the_same_data(tmp_path: Pat
     table = calls["ablation_table"]
     assert table.config.seeds == (3, 4)
     assert {"evaluate_video.full.3", "evaluate_video.noise.4"} <= set(table.inputs)
-    (tmp_path / "own.yaml").write_text("noise: {label: noise}\n")
+    own.write_text("noise: {label: noise}\n")
     with pytest.raises(ConfigError, match=r"(?s)own\.yaml.*full: first"):
-        choose_variants(file=tmp_path / "own.yaml")
+        choose_variants(file=own)
 
 
 def test_an_interval_over_seeds_and_recordings_is_wider_than_over_recordings(tmp_path: Path) -> None:
-    config = AblationTableConfig(
-        variants={"full": Variant(label="all"), "less": Variant(label="less")}, seeds=(1, 2), resamples=400
-    )
-    inputs = {
-        f"evaluate_video.{name}.{seed}": evaluation(
-            tmp_path / f"{name}{seed}",
-            {r: base + 0.1 * seed * (name == "full") for r, base in (("a", 0.4), ("b", 0.5), ("c", 0.6))},
-        )
-        for name in config.variants
-        for seed in config.seeds
-    }
+    variants = {"full": Variant(label="all"), "less": Variant(label="less")}
+    config = AblationTableConfig(variants=variants, seeds=(1, 2), resamples=400)
+    inputs = {}
+    for name, seed in product(variants, config.seeds):
+        more = 0.1 * seed * (name == "full")
+        values = {"a": 0.4 + more, "b": 0.5 + more, "c": 0.6 + more}
+        inputs[f"evaluate_video.{name}.{seed}"] = evaluation(tmp_path / f"{name}{seed}", values)
     ablation_table(config, inputs, tmp_path / "out")
-    rows = {(row["variant"], row["column"]): row for row in pq.read_table(tmp_path / "out/table.parquet").to_pylist()}
+    rows = table_rows(tmp_path / "out/table.parquet")
     assert rows["full", "held_out_robot_iou"]["mean"] == pytest.approx(0.65)
     less = rows["less", "held_out_robot_iou"]
-    assert less["difference"] == pytest.approx(-0.15)
     # Differences are equal in all recordings: what is left is between the two seeds.
-    assert (less["difference_low"], less["difference_high"]) == pytest.approx((-0.2, -0.1))
+    found = (less["difference"], less["difference_low"], less["difference_high"])
+    assert found == pytest.approx((-0.15, -0.2, -0.1))
 
 
 @pytest.mark.slow
@@ -220,13 +211,12 @@ def test_all_five_run_on_the_smallest_preset(project_root: Path, tmp_path: Path)
         cwd=project_root, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stdout + run.stderr
-    assert sum(line.startswith("| ") for line in run.stdout.splitlines()) == 3 + len(
-        VARIANTS
-    )  # heading, rule and the full model
-    assert len(list((tmp_path / "train_stage2").glob("*/checkpoint.json"))) == 1 + len(VARIANTS)
-    assert len(list((tmp_path / "train_stage1").glob("*/checkpoint.json"))) == 1
+    # Heading, rule and the full model besides.
+    assert sum(line.startswith("| ") for line in run.stdout.splitlines()) == 3 + len(VARIANTS)
+    for stage, count in (("train_stage2", 1 + len(VARIANTS)), ("train_stage1", 1)):
+        assert len(list((tmp_path / stage).glob("*/checkpoint.json"))) == count
     (table,) = (tmp_path / "ablation_table").glob("*/table.parquet")
-    rows = {(row["variant"], row["column"]): row for row in pq.read_table(table).to_pylist()}
+    rows = table_rows(table)
     for variant in ("full", *VARIANTS):
         assert rows[variant, "held_out_robot_iou"]["count"] == 2
         assert rows[variant, "success"]["count"] == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,10 @@ from worldline_core.store.store import ArtifactStore
 WITHOUT_BANKS = ("curate_banks=null", "evaluate_planning=null", "rollouts.banks_causal=null", "filter={}")
 SPLITS = ("train", "train", "train", "validation", "test", "test")
 SUBSETS = tuple(f"{step}.clips.view_weights={{joint: 0.5, subset: 0.5}}" for step in ("train_stage2", "distill"))
+
 VECTORS = ("train_stage2.native_size=9", "train_stage2.vector_share=0.5")
+BLIND = ("rollouts.blind={checkpoint: stage2, config: {method: blind, sampler: {kind: full_clip, steps: 2}, num_frames: 17, "
+         "splits: [test, ood_test], cameras: false}}")  # fmt: skip
 
 
 def write_single_arm(project_root: Path, root: Path, views: tuple[str, ...], cameras: tuple[str, ...]) -> Path:
@@ -42,10 +46,10 @@ def write_single_arm(project_root: Path, root: Path, views: tuple[str, ...], cam
     ("views", "cameras", "changes"),
     [
         (("head",), ("head",), ()),
-        (("head", "right_wrist"), ("head",), (*VECTORS, *SUBSETS)),
+        (("head", "right_wrist"), ("head",), (*VECTORS, *SUBSETS, BLIND)),
         (("head", "right_wrist"), (), (*VECTORS, "render_actions=null")),
     ],
-)  # fmt: skip
+)
 def test_one_arm_goes_through_every_step(
     project_root: Path,
     tmp_path: Path,
@@ -57,9 +61,6 @@ def test_one_arm_goes_through_every_step(
     made = write_single_arm(project_root, tmp_path / "made", views, cameras)
     monkeypatch.chdir(project_root)
     source = f"curate.sources=[{{kind: episode_set, path: {made}, name: single}}]"
-    if "native_size" in "".join(changes) and cameras:
-        changes = (*changes, "rollouts.blind={checkpoint: stage2, config: {method: blind, sampler: {kind: full_clip, steps: 2}, "
-                   "num_frames: 17, splits: [test, ood_test], cameras: false}}")  # fmt: skip
     config = PipelineConfig.load("smoke", None, (*WITHOUT_BANKS, source, *changes))
     store, folders = ArtifactStore(tmp_path / "artifacts"), dict[str, Path]()
     for name, call in outline(chain, config).items():
@@ -69,15 +70,13 @@ def test_one_arm_goes_through_every_step(
     for step in ("train_stage2", "distill"):
         info = read_checkpoint_info(folders[step])
         assert info.view_sets == ((views, ("head",)) if SUBSETS[0] in changes else (views,))
-        assert (info.vectors is None) == ("native_size" not in "".join(changes))
+        assert (info.vectors is None) == (VECTORS[0] not in changes)
     for method in ("stage2", "causal"):
         found = RolloutSet.open(folders[f"rollout.{method}"])
-        assert {(row.episode_id, row.view) for row in found.rows} == {
-            (episode, view) for episode in found.episode_ids for view in views
-        }
         assert len(found.episode_ids) == 2
+        assert {(row.episode_id, row.view) for row in found.rows} == set(product(found.episode_ids, views))
     assert (folders["report"] / "index.html").is_file()
-    if "rollout.blind" in folders:
+    if BLIND in changes:
         place = str(folders["evaluate_video"])
         assert drawn_and_not(place) == [("stage2", "blind")]
         assert any(row.difference for row in compare_runs(place, place, ("stage2", "blind")))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -52,27 +51,21 @@ def test_sizes_are_the_only_change_and_each_is_listed() -> None:
     assert after.train_stage2.relational is not None
 
 
-@pytest.fixture
-def project(tmp_path: Path) -> Path:
-    for name in FOLDERS:
-        (tmp_path / "weights" / name).mkdir(parents=True)
-        (tmp_path / "weights" / name / "config.json").write_text("{}")
-    return tmp_path
-
-
 @pytest.mark.parametrize("name", FOLDERS)
-def test_a_missing_folder_of_weights_is_named_before_the_first_step(name: str, project: Path) -> None:
+def test_a_missing_folder_of_weights_is_named_before_the_first_step(name: str, tmp_path: Path) -> None:
     config = load_config(PipelineConfig, preset=PRESET)
-    check_weights(config, project)
-    shutil.rmtree(project / "weights" / name)
+    folders = {each: tmp_path / "weights" / each for each in FOLDERS}
+    for folder in folders.values():
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text("{}")
+    check_weights(config, tmp_path)
+    (folders[name] / "config.json").unlink()
+    with pytest.raises(UnavailableError, match=rf"weights/{name}"):  # empty
+        check_weights(config, tmp_path)
+    folders[name].rmdir()
     advice = "import_backbone" if name == "base" else "download"
-    with pytest.raises(
-        UnavailableError, match=rf"(?s)Weights.*not here.*got: [^\n]*weights/{name}.*next step:.*{advice}"
-    ):
-        check_weights(config, project)
-    (project / "weights" / name).mkdir()
-    with pytest.raises(UnavailableError, match=rf"weights/{name}"):
-        check_weights(config, project)
+    with pytest.raises(UnavailableError, match=rf"(?s)got: [^\n]*weights/{name}.*next step:.*{advice}"):
+        check_weights(config, tmp_path)
 
 
 def test_torchrun_hands_the_name_of_a_call_on() -> None:
