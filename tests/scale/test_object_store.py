@@ -211,18 +211,18 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any
         (Path(written[name]["path"]) / f"broken.{suffix}").write_bytes(b"no recording")
     root = Path(written["lerobot_v21"]["path"]).parent / "two"
     _, written["lerobot_v21"] = lerobot_v21.write(root, 2, 0, np.random.default_rng(0))
-    broken = root / "data/chunk-000/episode_000001.parquet"
-    pq.write_table(pq.read_table(broken).drop(["index"]).slice(0, 9), broken)
+    for number, table in enumerate(sorted(root.glob("data/chunk-000/*.parquet"))):  # whole, and cut
+        pq.write_table(pq.read_table(table).drop(["frame_index"]).slice(0, (99, 9)[number]), table)
     return written
 
 
 @pytest.mark.usefixtures("reading_in_this_process")  # which alone has a file system in memory
-@pytest.mark.parametrize("layout", ["robotwin", "lerobot_v21", "mcap", "video_folder"])
+@pytest.mark.parametrize("layout", ["robotwin", "lerobot_v21", "mcap", "video_folder", "droid_annotation"])
 def test_the_same_bytes_from_a_folder_and_from_elsewhere(
     sources: dict[str, dict[str, Any]], tmp_path: Path, layout: str
 ) -> None:
     local = Path(sources[layout]["path"])
-    remote = UPath(f"memory://{tmp_path.name}/recordings")
+    remote = UPath(f"memory://{tmp_path.name}/{local.name}")
     for file in (path for path in local.rglob("*") if path.is_file()):
         place = remote / file.relative_to(local).as_posix()
         place.parent.mkdir(parents=True, exist_ok=True)
