@@ -190,7 +190,7 @@ def test_figures_are_those_of_the_model_s_own_rollouts(store: Path) -> None:
     exact = summary["metrics"]["test"]["stage2"]["robot_iou_exact@head"]  # neither causal's nor of shuffled actions
     evaluations = evaluations_of_store(store)
     found = {(m.what, m.recordings): m for m in measurements(store / "train_stage2" / KEY, evaluations)}
-    iou = found["Robot IoU, exact, head view", "held-out scenes"]
+    iou = found["Robot IoU, exact, head view", "held-out recordings"]
     assert (iou.mean, iou.low, iou.high, iou.count) == tuple(exact[key] for key in ("mean", "low", "high", "count"))
     assert iou.source == f"evaluate_video/{KEY}"
     assert found["plans that succeed, best of 32", "candidate banks"].mean == pytest.approx(0.8)
@@ -214,6 +214,6 @@ def test_the_command_and_the_report_write_the_same_card(
     inputs = {"train_stage2": model, "evaluate_video": store / "evaluate_video" / KEY}
     report(ReportConfig(), inputs, tmp_path / "report")
     written = (tmp_path / "report" / "cards" / "train_stage2.md").read_text()
-    (row,) = re.findall(r"(?m)^\| Robot IoU, exact, head view \| held-out scenes.*$", card.text)
+    (row,) = re.findall(r"(?m)^\| Robot IoU, exact, head view \| held-out recordings.*$", card.text)
     assert row in written
     assert "Parameters" in (tmp_path / "report" / "provenance.html").read_text()

@@ -41,10 +41,10 @@ KINDS = {
 GROUPS = {TRUE_METHOD: "", "shipped": "long-trained", "run": "this run", "baseline": ""}
 """Origin of a method's weights, in the report's order."""
 SPLIT_LABELS = {
-    "test": "held-out scenes",
+    "test": "held-out recordings",
     "ood_test": "held-out embodiment",
     "validation": "validation",
-    "train": "training scenes",
+    "train": "training recordings",
     "bank": "candidate banks",
 }
 """Labels of the splits, in the report's order."""

@@ -24,7 +24,7 @@ from worldline_core.training.training_state import PROBE_LOG
 STAGES = {
     "train_tokenizer": "Video tokenizer",
     "train_stage1": "Stage I: action-free, text-conditioned",
-    "train_stage2": "Stage II: action-driven, three views",
+    "train_stage2": "Stage II: action-driven",
     "distill": "Distillation",
 }
 PHASES = ("", "teacher_forcing", "trajectory_regression", "distribution_matching")
@@ -36,7 +36,7 @@ CURVES = {
 }
 """Held-out values of each chart, by the label of its axis; their names with a condition's suffix are shown as well."""
 CONDITIONS = (
-    ("", "held-out scenes", "c1"),
+    ("", "held-out", "c1"),
     ("_shuffled_actions", "held-out, shuffled actions", "c3"),
     ("_no_actions", "held-out, no actions", "c4"),
     ("_copy", "held-out, copy first frame", "c5"),
