@@ -12,7 +12,8 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from contextvars import copy_context
+from typing import Any, Self
 
 import httpx
 
@@ -146,7 +147,15 @@ def process_runner(workers: int) -> Any:
 
     class ProcessRunner(ProcessPoolTaskRunner):
         """Does not wait for its queue of messages: a worker that was killed while it wrote there never releases the lock,
-        and this process would then never end."""
+        and this process would then never end. Its thread sends them with the settings of the run: without, it would know
+        neither address nor password of a temporary server."""
+
+        def __enter__(self) -> Self:
+            self._context = copy_context()
+            return super().__enter__()
+
+        def _forward_subprocess_messages(self) -> None:
+            self._context.run(super()._forward_subprocess_messages)
 
         def _stop_message_forwarding(self) -> None:
             if self._subprocess_message_queue is not None:

@@ -90,12 +90,28 @@ ATTACKED = """
         print("runs", len(client.read_flow_runs()), flush=True)
 """
 
+SHARDS = """
+    import sys
+    sys.path.append(os.environ["PYTHONPATH"] + "/tests/scale")
+    from number_work import NumberWork
+    from tasks.execution.shard_mapper import PrefectMapper
+    from worldline_core.scale.mapping import RunnerConfig, map_episodes
+
+    map_episodes(PrefectMapper(RunnerConfig(kind="processes", workers=1)), NumberWork(Path.cwd()), [[1, 2], [4]])
+    print("numbers", len(list(Path.cwd().glob("[0-9]"))), flush=True)
+"""
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("program", "printed"),
-    [(KILLED, ["sum", "6"]), (KILLED_EARLY, ["UnavailableError", "continues"]), (ATTACKED, ["sum", "3", "runs", "1"])],
-    ids=["killed at the end", "killed early", "attacked"],
+    [
+        (KILLED, ["sum", "6"]),
+        (KILLED_EARLY, ["UnavailableError", "continues"]),
+        (ATTACKED, ["sum", "3", "runs", "1"]),
+        (SHARDS, ["numbers", "3"]),
+    ],
+    ids=["killed at the end", "killed early", "attacked", "shards in processes"],
 )
 def test_a_temporary_server(tmp_path: Path, project_root: Path, program: str, printed: list[str]) -> None:
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
@@ -105,4 +121,4 @@ def test_a_temporary_server(tmp_path: Path, project_root: Path, program: str, pr
         cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert (ended.returncode, ended.stdout.split()) == (0, printed), ended.stderr
-    assert "Traceback" not in ended.stderr
+    assert "Traceback" not in ended.stderr and "EventsWorker" not in ended.stderr
