@@ -85,6 +85,46 @@ def test_a_video_is_whole_or_an_error_however_little_space_is_left(
     assert len(said) > 30
 
 
+EXPORT = [
+    "export",
+    "artifacts/shipped/recordings",
+    "--episode",
+    "ur5e_silver-test-s1-00000",
+    "--output",
+    "{disk}/out",
+    "--format",
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "free"),
+    [
+        ([*EXPORT, "lerobot"], 0),
+        ([*EXPORT, "rrd"], 0),
+        ([*EXPORT, "rrd"], 60_000),
+        ([*EXPORT, "mcap"], 60_000),
+        (["inspect", "artifacts/shipped/recordings", "--video", "--output", "{disk}/out"], 60_000),
+        (["push", "artifacts/shipped/recordings", "{disk}/out"], 60_000),
+        (["record", "--output", "{disk}/out"], 60_000),
+    ],
+    ids=lambda value: value[0] + " " + value[-1].rpartition("/")[2] if isinstance(value, list) else str(value),
+)
+def test_what_is_handed_on_is_whole_or_one_message(
+    disk: Path, project_root: Path, command: list[str], free: int
+) -> None:
+    leave(disk, free)
+    ended = subprocess.run(
+        [sys.executable, "-m", "flows.command_line", *(part.format(disk=disk) for part in command)],
+        cwd=project_root, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert (ended.returncode, "Traceback" in ended.stderr) == (1, False), ended.stderr
+    said = [line for line in ended.stderr.splitlines() if line.startswith("error:")]
+    assert said == ["error: The store did not finish the push" if command[0] == "push" else "error: No space left"]
+    assert "No space left on device" in ended.stderr or command[-1] == "rrd"
+    assert not [*disk.rglob("manifest.json"), *disk.rglob("*.rrd"), *disk.rglob("*.mcap"), *disk.rglob("info.json")]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "command",

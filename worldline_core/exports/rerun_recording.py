@@ -16,9 +16,12 @@ digested part of an artifact. Importing this module imports Rerun.
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import shutil
 import uuid
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import batched
 from pathlib import Path
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 
 PIECE_FRAMES = 64
 """So many pictures are logged together."""
+_FULL_BELOW_BYTES = 2**16
 FRUSTUM_M = {"fixed": 0.25, "moving": 0.08}
 """Depth at which a frustum ends: wrist cameras are near to what they see."""
 ROBOT_COLOUR = (190, 194, 202)
@@ -70,7 +74,7 @@ def write_rerun_recording(path: Path, content: RecordingContent) -> None:
     episode, tracks = content.episode, content.tracks
     identity = uuid.UUID(bytes=hashlib.sha256(episode.episode_id.encode()).digest()[:16])
     stream = rr.RecordingStream("worldline", recording_id=identity, send_properties=False)
-    with atomic_path(path) as temporary:
+    with atomic_path(path) as temporary, _errors_of_writing(temporary):
         stream.save(temporary, default_blueprint=_blueprint(content))
         stream.send_recording_name(episode.episode_id)
         _log_cameras(stream, content)
@@ -88,7 +92,18 @@ def write_rerun_recording(path: Path, content: RecordingContent) -> None:
                 stream.log(f"world/cameras/{view}/actions", rr.EncodedImage.from_fields(draw_order=10.0), static=True)
         _log_signals(stream, episode)
         _log_description(stream, episode, "none" if tracks is None else tracks.controls_label)
+        stream.flush()  # raises what `disconnect` only logs
         stream.disconnect()
+
+
+@contextmanager
+def _errors_of_writing(path: Path) -> Iterator[None]:
+    """Rerun's errors as those of the operating system; its writing thread does not say why it ended."""
+    try:
+        yield
+    except RuntimeError as error:
+        code = errno.EIO if shutil.disk_usage(path.parent).free > _FULL_BELOW_BYTES else errno.ENOSPC
+        raise OSError(code, str(error), str(path)) from error
 
 
 def _timeline(count: int, fps: float, first: int = 0) -> list[rr.TimeColumn]:

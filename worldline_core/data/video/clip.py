@@ -33,6 +33,7 @@ from worldline_core.data.guards.rejection import (
 from worldline_core.data.guards.source_paths import AnyPath, local_file, regular_file
 from worldline_core.data.video.picture import Picture
 from worldline_core.errors import DataError
+from worldline_core.store.store import disk_full
 
 FRAME_TOLERANCE = 0.25
 """A decoded frame is the wanted one when their times differ by less than this share of a frame's duration."""
@@ -157,6 +158,8 @@ def open_video(path: AnyPath) -> Iterator[tuple[InputContainer, VideoStream]]:
     except av.error.MemoryError:
         raise  # for the process that limits it
     except av.error.FFmpegError as error:
+        if disk_full(error):
+            raise  # of a video that is written inside of the block
         raise undecodable(path, error) from error
 
 
