@@ -50,7 +50,7 @@ FEWEST_FINGER_STEPS = 20
 LARGEST_WRIST_HALVES_APART, LARGEST_WRIST_INTERVAL = 0.05, 10.0
 """The same of wrist cameras, which are nearer to what they see."""
 FEWEST_EPISODES = 3
-LEAST_TRAVEL_M, LEAST_CHANGE = 2.5, 0.02
+LEAST_TRAVEL_M, LEAST_CHANGE = 1.5, 0.02
 """Travel of the busiest tool over all episodes together; after less, a mirrored camera can look right."""
 MOVED_SHARE, MOVED_DEVIATIONS = 2.5, 5.0
 """Displacement of the robot in the picture from one episode on: shares of the width, standard deviations."""
