@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import subprocess
 import sys
@@ -27,17 +28,16 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-LEAVE = '''
-import os
-
-def leave(disk, free):
+def leave(disk: Path, free: int) -> None:
     """Fill a disk up to so many bytes."""
     fill = disk / "fill"
     fill.unlink(missing_ok=True)
     fill.touch()
     state = os.statvfs(disk)
     fill.write_bytes(b"x" * max(0, state.f_bavail * state.f_frsize - free))
-'''
+
+
+LEAVE = f"import os\nfrom pathlib import Path\n{inspect.getsource(leave)}"
 
 
 ENCODE = """
@@ -135,7 +135,7 @@ def test_what_is_handed_on_is_whole_or_one_message(
     ids=["pipeline", "shards in processes"],
 )  # fmt: skip
 def test_a_full_disk_is_one_message_of_any_command(disk: Path, project_root: Path, command: tuple[str, ...]) -> None:
-    python(project_root, "-c", f"{LEAVE}\nimport pathlib\nleave(pathlib.Path({str(disk)!r}), 300_000)")
+    leave(disk, 300_000)
     store = disk / "store"
     ended = python(project_root, "-m", "flows.command_line", *command, "--preset", "smoke", "--artifacts", store)
     assert ended.returncode == 1, ended.stderr
