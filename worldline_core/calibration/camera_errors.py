@@ -335,7 +335,7 @@ class StillView:
         np.multiply(np.moveaxis(-step, -1, 0) / CELL_PX, weight, out=taken[:, PARAMETERS])
         np.multiply(np.diff(slope, axis=2), weight, out=taken[:, 1 + PARAMETERS : -1])
         np.multiply(np.moveaxis(-faster, -1, 0), weight, out=taken[:, -1])
-        taken = np.concatenate([taken.reshape(-1, *length.shape), weight[None]])
+        taken = np.concatenate([taken.reshape(2 * (1 + 2 * PARAMETERS), *length.shape), weight[None]])
         thickness, way = (weight * reach).astype(np.float32), step / CELL_PX
         square = (way**2).sum(axis=-1, keepdims=True) + 1e-6
         lines = np.concatenate([way, -(start * way).sum(axis=-1, keepdims=True)], axis=-1) / square
