@@ -15,6 +15,7 @@ from flows.command_line import main
 from worldline_core.calibration.camera_errors import moved_camera
 from worldline_core.calibration.estimate import estimate
 from worldline_core.calibration.estimate.estimate import camera_file, estimate_views
+from worldline_core.calibration.estimate.mount_search import mounts_around
 from worldline_core.calibration.estimate.recordings import recorded_views
 from worldline_core.calibration.estimate.refine import fit_still
 from worldline_core.calibration.estimate.still_camera import agreement, tools_apart
@@ -77,6 +78,19 @@ def test_what_cannot_be_estimated_is_named(bank: Loaded, kinematics: ArmKinemati
     for episodes, reason in ((bank[:2], "2 episodes"), (benchmark.SPOILED["still"](bank), "not enough motion")):
         (found,) = estimate_views(iter(episodes), kinematics, len(episodes))
         assert found.camera is None and reason in found.reasons[0]
+
+
+@pytest.mark.parametrize(
+    "hand", [np.array([[0.0, 0.02, -0.1], [0.01, -0.02, -0.06]]), np.empty((0, 3))], ids=["known", "unknown"]
+)
+def test_searched_mounts_see_the_tool_from_behind_the_hand(hand: np.ndarray) -> None:
+    mounts = np.stack(list(mounts_around(hand)))
+    assert len(np.unique(mounts.round(6), axis=0)) == 128
+    np.testing.assert_allclose(
+        mounts[:, :3, :3] @ mounts[:, :3, :3].swapaxes(1, 2), np.tile(np.eye(3), (128, 1, 1)), atol=1e-9
+    )
+    seen = -np.einsum("nji,nj->ni", mounts[:, :3, :3], mounts[:, :3, 3])  # the tool's origin before each camera
+    assert (np.hypot(seen[:, 0], seen[:, 1]) < 0.5 * seen[:, 2]).all() and (mounts[:, 2, 3] < 0).all()
 
 
 def without_mounts(kinematics: ArmKinematics) -> ArmKinematics:

@@ -15,8 +15,11 @@ LOOKS_AHEAD_M = 0.03
 
 
 def mounts_around(hand: np.ndarray) -> Iterator[np.ndarray]:
-    """T_tool_camera (4, 4), axes of OpenCV, of cameras beside a hand of points (p, 3) in the tool's frame, which see the tool."""
-    ahead = -hand.mean(axis=0)
+    """T_tool_camera (4, 4), axes of OpenCV, of cameras beside a hand of points (p, 3) in the tool's frame, which see the tool.
+
+    The hand points from its middle to the tool, or along the tool's z axis where no point of it is known.
+    """
+    ahead = -hand.mean(axis=0) if len(hand) else np.array([0.0, 0.0, 1.0])
     ahead /= np.linalg.norm(ahead)
     across = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
     across /= np.linalg.norm(across)

@@ -47,7 +47,7 @@ LEAST_WRIST_AGREEMENT = 0.3
 EPISODES_OF_STARTS, FOLLOWED = 5, 6
 """Episodes in which starts are compared, and how many starts of a search are followed."""
 MOST_COVERED, BLIND = 0.7, pose_from_rotation(np.array([0.0, 0.0, 9.0]), np.eye(3))
-"""Share of the picture that the hand may cover in a search; a camera far ahead of the hand, which it never sees."""
+"""Share of the picture above which a hand covers too much of it to judge a mount; a camera far ahead of the hand, which it never sees."""
 RIVAL_APART, RIVAL_TURNED = 0.05, 0.15
 """A rival shows the tool elsewhere [widths], or is turned against the best camera [rad]."""
 WRIST_FOCAL_PRIOR = 0.5
@@ -231,11 +231,10 @@ def _searched_starts(few: RecordedView, arm: int) -> list[tuple[CameraTrack, lis
             camera = mounted(few, T, focal)
             twice = replace(camera, T_base_camera=np.repeat(camera.T_base_camera, 2, axis=0))
             covered = covered_cells(twice, np.stack([hand, hand]), radii, (1, *cells))[0]
-            if covered.mean() < MOST_COVERED:
-                seen = [replace(each, scene=each.scene.without(covered)) for each in evidence]
-                scored.append((explained(seen, camera), camera))
-    best = sorted(scored, key=lambda each: -each[0])[:FOLLOWED]
-    return [(camera, wrist_evidence(few, arm, camera)) for _, camera in best]
+            seen = [replace(each, scene=each.scene.without(covered)) for each in evidence]
+            scored.append((covered.mean() > MOST_COVERED, -explained(seen, camera), camera))
+    best = sorted(scored, key=lambda each: each[:2])[:FOLLOWED]
+    return [(camera, wrist_evidence(few, arm, camera)) for *_, camera in best]
 
 
 def explained(evidence: Sequence[WristEvidence], camera: CameraTrack) -> float:
