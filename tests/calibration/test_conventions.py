@@ -61,7 +61,7 @@ def two_arms(seed: int = 0, **changes: Any) -> Episode:
 
 
 def unit_quaternions(state: np.ndarray) -> np.ndarray:
-    """Of unit length, as they come back from a matrix and the action's are not, and with w >= 0."""
+    """The state with quaternions of unit length and w >= 0, as a rotation matrix gives them back; the action's are not."""
     result = state.astype(np.float64)
     for start in (3, 11):
         quaternion = result[:, start : start + 4]

@@ -248,7 +248,7 @@ def test_the_robots_that_readers_name_themselves_exist() -> None:
 
 
 @pytest.mark.parametrize(("name", "hint"), [("unitree_g1", "did you mean 'unitree_g1_29dof'"), ("zz", "zz.yaml")])
-def test_a_robot_that_nobody_describes_is_a_mistake_in_the_configuration(name: str, hint: str) -> None:
+def test_a_robot_without_a_description_is_a_mistake_in_the_configuration(name: str, hint: str) -> None:
     def source(embodiment: str) -> dict[str, Any]:
         views = {"observation.images.top": "head"}
         return {"kind": "lerobot_v3", "path": "x", "embodiment": embodiment, "angle_unit": "rad", "views": views}

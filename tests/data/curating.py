@@ -1,4 +1,4 @@
-"""What many tests of data share: curation in one call, what it leaves, damaged HDF5 files, videos as other programs write them."""
+"""Helpers of the data tests: curation in one call, its results, damaged HDF5 files, and videos as other programs write them."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def test_a_truncated_video_costs_only_its_own_episodes(tmp_path: Path) -> None:
     assert row.numbers["decoded_frames"] < 40
 
 
-def test_missing_columns_missing_files_and_robots_that_nobody_describes(tmp_path: Path) -> None:
+def test_missing_columns_missing_files_and_robots_without_a_description(tmp_path: Path) -> None:
     """A robot is refused where a name is given, and for Stage I alone where the recording says `none`."""
     still = np.zeros((9, 16), np.float32)
     raw = record(tmp_path / "raw", [

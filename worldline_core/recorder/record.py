@@ -215,8 +215,8 @@ class RecordConfig(StrictModel):
         num_frames: frames per episode at 8 per second.
         workers: processes.
         video_crf: x264 quality of the stored videos.
-        defects: per embodiment, how many of the first training recordings are spoiled in which way (see
-            ``defects.py``); what was done to which episode is written to ``injected_defects.json``.
+        defects: per embodiment, how many of the first training recordings are spoiled in which way
+            (``DEFECTS``); what was done to which episode is written to ``injected_defects.json``.
         variety: carry some episodes out worse than planned.
         misses: share of the episodes that miss by any amount, from nothing to well beyond where the outcome turns; by how much
             is written to ``misses.json``.
