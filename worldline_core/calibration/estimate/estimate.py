@@ -42,7 +42,7 @@ from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures import evenly_spaced, jpeg_bytes
-from worldline_core.progress import Progress
+from worldline_core.progress import Progress, with_progress
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 logger = logging.getLogger(__name__)
@@ -59,7 +59,8 @@ def estimate_views(
 
     Raises: DataError as `recorded_views`.
     """
-    return [_estimate(view, kinematics) for view in recorded_views(loaded, kinematics, count).values()]
+    views = recorded_views(loaded, kinematics, count).values()
+    return [_estimate(view, kinematics) for view in with_progress(views, "calibrate estimate: fitting", "view")]
 
 
 def _estimate(recorded: RecordedView, kinematics: ArmKinematics) -> ViewEstimate:
