@@ -28,7 +28,7 @@ class IncompleteResponseError(Exception):
 
 
 def exchange(
-    url: str, body: bytes | None, *, headers: Mapping[str, str], timeout_s: float, max_bytes: int, proxies: bool = True
+    url: str, body: bytes | None, *, headers: Mapping[str, str], timeout_s: float, max_bytes: int
 ) -> tuple[int, bytes]:
     """Status and body of the answer to a POST (without ``body``: a GET); reading stops soon after ``max_bytes``.
 
@@ -36,7 +36,6 @@ def exchange(
 
     Args:
         timeout_s: of the whole exchange, name resolution included.
-        proxies: use the proxies named by environment variables.
 
     Raises:
         UnreachableError: nothing listens there.
@@ -45,7 +44,7 @@ def exchange(
 
     async def answered() -> tuple[int, bytes]:
         answer = bytearray()
-        client = httpx.AsyncClient(timeout=timeout_s, verify=_machine_certificates(), trust_env=proxies)
+        client = httpx.AsyncClient(timeout=timeout_s, verify=_machine_certificates())
         method = "GET" if body is None else "POST"
         async with (
             asyncio.timeout(timeout_s),

@@ -149,7 +149,6 @@ def test_different_robots_get_datasets_of_their_own(tmp_path: Path) -> None:
     stored = EpisodeSet.open(tmp_path / "set")
     assert [row.dataset for row in stored.rows] == ["datasets/ur5e_pair", "datasets/xarm7_pair", "datasets/ur5e_pair_2"]
     assert stored.rows[2].views == ("head", "right_wrist")
-    assert stored.select(embodiment="xarm7_pair") == [1]
     assert stored.select(split=["train", "test"]) == [0, 1, 2]
     assert stored.select(split="test") == []
     with pytest.raises(DataError, match=r"(?s)no such view.*head, right_wrist.*left_wrist"):

@@ -103,7 +103,7 @@ OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
     "side by side": lambda r, out: write_side_by_side(
         out / "a.mp4", {"true": r.videos["head"], "again": r.videos["head"]}, FPS, tile_height=96
     ),
-    "overlay": lambda r, out: write_overlay_video(out / "a.mp4", r.videos, r.tracks_of_episode, FPS, tile_height=96),
+    "overlay": lambda r, out: write_overlay_video(out / "a.mp4", r.videos, r.tracks_of_episode, FPS),
     "episode as mcap": read_mcap,
     "episode as rrd": lambda r, out: export(r.set, out, ["rrd"]),
     "episode as lerobot": lambda r, out: export(r.set, out, ["lerobot"]),

@@ -159,19 +159,19 @@ MOVING = tracks_of(np.full((4, 3, 1, 2), 16.0) + np.arange(4).reshape(4, 1, 1, 1
 
 def test_clips_and_sheets_show_all_views() -> None:
     frames = {"head": grey(4), "right_wrist": grey(3)}
-    clip = np.stack(list(overlay_clip(frames, MOVING, 8.0, tile_height=128, title="robot")))
-    # As long as the shortest; two tiles of 128 x 192, a gap, a heading and a legend; even sides.
-    height, width = 128 + LABEL_HEIGHT_PX + LEGEND_HEIGHT_PX, 2 * 192 + COLUMN_GAP_PX
+    clip = np.stack(list(overlay_clip(frames, MOVING, 8.0, title="robot")))
+    # As long as the shortest; two tiles of 256 x 384, a gap, a heading and a legend; even sides.
+    height, width = 256 + LABEL_HEIGHT_PX + LEGEND_HEIGHT_PX, 2 * 384 + COLUMN_GAP_PX
     assert clip.shape == (3, height, width, 3)
     body = clip[:, LABEL_HEIGHT_PX:-LEGEND_HEIGHT_PX]
-    assert np.array_equal(body[:, :, :192], body[:, :, -192:])
+    assert np.array_equal(body[:, :, :384], body[:, :, -384:])
     assert not np.array_equal(body[0], body[2])
     assert not np.array_equal(clip[0, -LEGEND_HEIGHT_PX:], clip[1, -LEGEND_HEIGHT_PX:])  # the frame number
     plain, outlined = (
-        overlay_sheet(dict.fromkeys(frames, grey(2)), MOVING, [0, 3], tile_height=64, style=OverlayStyle(outline=outline)) for outline in (False, True)
+        overlay_sheet(dict.fromkeys(frames, grey(2)), MOVING, [0, 3], style=OverlayStyle(outline=outline)) for outline in (False, True)
     )  # fmt: skip
     assert plain.shape == outlined.shape
-    assert plain.shape[0] > 2 * 64 + LEGEND_HEIGHT_PX
+    assert plain.shape[0] > 2 * 256 + LEGEND_HEIGHT_PX
     with pytest.raises(DataError, match=r"(?s)No view to draw.*top"):
         overlay_clip({"top": grey(3)}, MOVING, 8.0)
     with pytest.raises(DataError, match="no view with a track"):
@@ -180,10 +180,10 @@ def test_clips_and_sheets_show_all_views() -> None:
 
 def test_the_video_plays_and_repeats_to_the_byte(tmp_path: Path) -> None:
     for name in ("a.mp4", "b.mp4"):
-        write_overlay_video(tmp_path / name, dict.fromkeys(VIEWS, grey(4)), MOVING, 8.0, tile_height=64)
+        write_overlay_video(tmp_path / name, dict.fromkeys(VIEWS, grey(4)), MOVING, 8.0)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
     shown = decode_video(tmp_path / "a.mp4")
-    assert shown.shape == (4, 64 + LABEL_HEIGHT_PX + LEGEND_HEIGHT_PX, 3 * 96 + 2 * COLUMN_GAP_PX, 3)
+    assert shown.shape == (4, 256 + LABEL_HEIGHT_PX + LEGEND_HEIGHT_PX, 3 * 384 + 2 * COLUMN_GAP_PX, 3)
     assert near(shown[0], ARM_COLOURS["right"], 60).any()
 
 

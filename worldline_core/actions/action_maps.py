@@ -31,19 +31,19 @@ NUM_CHANNELS = 9
 CHANNELS = ("h", "d", "r1", "r2", "r3", "r4", "r5", "r6", "g")
 
 
-def latent_frame_indices(num_frames: int, temporal_factor: int = TEMPORAL_FACTOR) -> list[int]:
+def latent_frame_indices(num_frames: int) -> list[int]:
     """RGB frames whose controls the latent frames take: 0, 4, 8, ... (latent frame 0 is frame 0, j is frame 4j).
 
-    Raises: ConfigError when num_frames is not 1 + a multiple of the factor.
+    Raises: ConfigError when num_frames is not 1 + a multiple of four.
     """
-    if num_frames < 1 or (num_frames - 1) % temporal_factor:
+    if num_frames < 1 or (num_frames - 1) % TEMPORAL_FACTOR:
         raise ConfigError(
             "A clip does not fit the tokenizer",
-            expected=f"1 + a multiple of {temporal_factor} frames",
+            expected=f"1 + a multiple of {TEMPORAL_FACTOR} frames",
             got=num_frames,
-            next_step=f"use {1 + max(0, num_frames - 1) // temporal_factor * temporal_factor} frames",
+            next_step=f"use {1 + max(0, num_frames - 1) // TEMPORAL_FACTOR * TEMPORAL_FACTOR} frames",
         )
-    return list(range(0, num_frames, temporal_factor))
+    return list(range(0, num_frames, TEMPORAL_FACTOR))
 
 
 def control_frames(num_frames: int, per_latent_frame: int = 1) -> list[int]:
@@ -63,11 +63,9 @@ def stack_controls(
     return rearrange(maps, "b v c (t k) h w -> b v (k c) t h w", k=per_latent_frame)
 
 
-def grid_sigma(
-    grid_size: tuple[int, int], sigma_px_ref: float = SIGMA_PX_REFERENCE, ref: tuple[int, int] = REFERENCE_CANVAS
-) -> tuple[float, float]:
+def grid_sigma(grid_size: tuple[int, int], sigma_px_ref: float = SIGMA_PX_REFERENCE) -> tuple[float, float]:
     """(sigma_rows, sigma_columns) in grid cells."""
-    return sigma_px_ref * grid_size[0] / ref[0], sigma_px_ref * grid_size[1] / ref[1]
+    return sigma_px_ref * grid_size[0] / REFERENCE_CANVAS[0], sigma_px_ref * grid_size[1] / REFERENCE_CANVAS[1]
 
 
 def render_action_maps(
@@ -75,7 +73,6 @@ def render_action_maps(
     image_size: tuple[int, int],
     grid_size: tuple[int, int],
     sigma_px_ref: float = SIGMA_PX_REFERENCE,
-    ref: tuple[int, int] = REFERENCE_CANVAS,
     dtype: torch.dtype = torch.float32,
 ) -> Float[Tensor, "b v 9 t h w"]:
     """Render the maps of every frame of the batch; the arms are added, beyond 1 where they overlap.
@@ -94,13 +91,13 @@ def render_action_maps(
 
     Raises: ConfigError for an empty grid or sigma that is not positive.
     """
-    if min(*grid_size, *image_size, *ref) < 1 or sigma_px_ref <= 0:
+    if min(*grid_size, *image_size) < 1 or sigma_px_ref <= 0:
         raise ConfigError(
             "Cannot render action maps",
             expected="positive sizes and sigma",
-            got=f"image {image_size}, grid {grid_size}, reference {ref}, sigma {sigma_px_ref}",
+            got=f"image {image_size}, grid {grid_size}, sigma {sigma_px_ref}",
         )
-    sigma_rows, sigma_columns = grid_sigma(grid_size, sigma_px_ref, ref)
+    sigma_rows, sigma_columns = grid_sigma(grid_size, sigma_px_ref)
     uv = torch.where(tracks.valid[..., None], tracks.uv, torch.zeros_like(tracks.uv)).double()
     columns = _profile((uv[..., 0] + 0.5) * (grid_size[1] / image_size[1]) - 0.5, grid_size[1], sigma_columns)
     rows = _profile((uv[..., 1] + 0.5) * (grid_size[0] / image_size[0]) - 0.5, grid_size[0], sigma_rows)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from worldline_core.actions.action_maps import grid_sigma
-from worldline_core.actions.actions_config import REFERENCE_CANVAS, SIGMA_PX_REFERENCE
+from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.robot_masks import project_capsules
 from worldline_core.data.video.encoder import encode_video
@@ -35,6 +35,7 @@ from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import Resize
 from worldline_core.geometry.transforms import rotation_from_rot6d
+from worldline_core.pages.page import words
 from worldline_core.pictures import (
     INK,
     PAPER,
@@ -62,7 +63,7 @@ OUTLINE_COLOUR: Colour = (255, 255, 255)
 SHADE: Colour = (20, 22, 26)
 """Under every line, so that it is seen on light and dark ground."""
 TILE_HEIGHT = 256
-LEGEND_HEIGHT_PX = 26
+LEGEND_HEIGHT_PX, LEGEND_TEXT_PX = 26, 13
 _FRACTION_BITS = 4
 
 
@@ -96,7 +97,7 @@ def gaussian(
 
     What `render_action_maps` puts into channel 0 on a grid of this size, for one arm and without torch.
     """
-    sigma_v, sigma_u = grid_sigma((height, width), sigma_px_ref, REFERENCE_CANVAS)
+    sigma_v, sigma_u = grid_sigma((height, width), sigma_px_ref)
     rows = np.exp(-0.5 * ((np.arange(height) - float(uv[1])) / sigma_v) ** 2)
     columns = np.exp(-0.5 * ((np.arange(width) - float(uv[0])) / sigma_u) ** 2)
     return (rows[:, None] * columns[None, :]).astype(np.float32)
@@ -153,16 +154,14 @@ def picture_pixel(uv: NDArray[np.floating], image_size: tuple[int, int], size: t
     return np.asarray(uv, dtype=np.float64) * np.diagonal(affine)[:2] + affine[:2, 2]
 
 
-def axis_tips(
-    tracks: EpisodeTracks, n: int, v: int, arm: int, length_m: float = AXIS_LENGTH_M
-) -> list[NDArray[np.float64] | None]:
+def axis_tips(tracks: EpisodeTracks, n: int, v: int, arm: int) -> list[NDArray[np.float64] | None]:
     """Pixels (of the tracks' image size) of the ends of the tool's axes; None for one that is behind the camera."""
     K = tracks.K[v].astype(np.float64)
     ray = np.linalg.solve(K, np.append(tracks.uv[n, v, arm].astype(np.float64), 1.0))
     origin = ray * float(tracks.depth[n, v, arm])
     tips: list[NDArray[np.float64] | None] = []
     for axis in rotation_from_rot6d(tracks.rot6d[n, v, arm]).T:
-        tip = origin + length_m * axis
+        tip = origin + AXIS_LENGTH_M * axis
         tips.append((K @ (tip / tip[2]))[:2] if tip[2] > 1e-3 else None)
     return tips
 
@@ -248,11 +247,6 @@ def heat_layer(
     return np.clip(shown, 0, 255).astype(np.uint8)
 
 
-def view_name(view: str) -> str:
-    """A view in words: "left wrist"."""
-    return view.replace("_", " ")
-
-
 def legend_strip(
     arms: Sequence[str],
     width: int,
@@ -261,7 +255,6 @@ def legend_strip(
     outline: bool = False,
     ink: Colour = INK,
     paper: Colour = PAPER,
-    size_px: int = 13,
 ) -> Picture:
     """A strip that says what is drawn: arms, axes, ring, outline; and a note (a frame number) at its right end.
 
@@ -270,19 +263,19 @@ def legend_strip(
     strip = Image.new("RGB", (width, LEGEND_HEIGHT_PX), paper)
     draw = ImageDraw.Draw(strip)
     middle, x = LEGEND_HEIGHT_PX / 2, 8.0
-    end = width - 8 - (text_width_px(note, size_px) if note else 0)
+    end = width - 8 - (text_width_px(note, LEGEND_TEXT_PX) if note else 0)
     if note:
-        draw.text((end, middle), note, font=font(size_px), fill=ink, anchor="lm")
+        draw.text((end, middle), note, font=font(LEGEND_TEXT_PX), fill=ink, anchor="lm")
     marks: list[tuple[str, int, Colour]] = []
     items = [(f"{arm} tool", arm_colour(arms, index), "dot") for index, arm in enumerate(arms)]
     items += [(name, colour, "line") for name, colour in zip(AXIS_NAMES, AXIS_COLOURS, strict=True)]
     items += [("wide ring: gripper open", ink, "ring")]
     items += [("where the arms should lie", OUTLINE_COLOUR, "outline")] if outline else []
     for text, colour, mark in items:
-        needed = 20 + text_width_px(text, size_px) + 14
+        needed = 20 + text_width_px(text, LEGEND_TEXT_PX) + 14
         if x + needed > end:
             break
-        draw.text((x + 20, middle), text, font=font(size_px), fill=ink, anchor="lm")
+        draw.text((x + 20, middle), text, font=font(LEGEND_TEXT_PX), fill=ink, anchor="lm")
         marks.append((mark, round(x), colour))
         x += needed
     picture = np.array(strip, dtype=np.uint8)
@@ -302,7 +295,6 @@ def overlay_clip(
     tracks: EpisodeTracks,
     fps: float,
     *,
-    tile_height: int = TILE_HEIGHT,
     style: OverlayStyle = DEFAULT_STYLE,
     title: str = "",
 ) -> Iterator[Picture]:
@@ -320,13 +312,13 @@ def overlay_clip(
     columns: dict[str, Frames] = {}
     for view in [view for view in tracks.views if view in frames]:
         images = frames[view]
-        shape = min(len(images), tracks.num_frames), *scaled_size(images.shape[1], images.shape[2], tile_height), 3
+        shape = min(len(images), tracks.num_frames), *scaled_size(images.shape[1], images.shape[2], TILE_HEIGHT), 3
 
         def draw(images: Frames = images, view: str = view, count: int = shape[0]) -> Iterator[Picture]:
             for n, frame in enumerate(islice(images, count)):
-                yield draw_overlay(frame, tracks, n, view, tile_height=tile_height, style=style)
+                yield draw_overlay(frame, tracks, n, view, style=style)
 
-        label = view_name(view) + (f"  ·  {title}" if title and not columns else "")
+        label = words(view) + (f"  ·  {title}" if title and not columns else "")
         columns[label] = MadeFrames(draw, shape, np.uint8)
     if not columns:
         raise DataError(
@@ -335,7 +327,7 @@ def overlay_clip(
             expected=", ".join(tracks.views),
             got=", ".join(frames) or "no frames",
         )
-    return _with_legend(side_by_side(columns, tile_height=tile_height), tracks, fps, style)
+    return _with_legend(side_by_side(columns), tracks, fps, style)
 
 
 def _with_legend(rows: Iterator[Picture], tracks: EpisodeTracks, fps: float, style: OverlayStyle) -> Iterator[Picture]:
@@ -354,12 +346,11 @@ def write_overlay_video(
     tracks: EpisodeTracks,
     fps: float,
     *,
-    tile_height: int = TILE_HEIGHT,
     style: OverlayStyle = DEFAULT_STYLE,
     title: str = "",
 ) -> None:
     """Writes `overlay_clip` as an mp4 that browsers play, atomically; the bytes depend on the arguments alone."""
-    clip = overlay_clip(frames, tracks, fps, tile_height=tile_height, style=style, title=title)
+    clip = overlay_clip(frames, tracks, fps, style=style, title=title)
     with atomic_path(path) as temporary:
         encode_video(temporary, clip, fps, crf=20, preset="veryfast")
 
@@ -369,7 +360,6 @@ def overlay_sheet(
     tracks: EpisodeTracks,
     moments: Sequence[int],
     *,
-    tile_height: int = TILE_HEIGHT,
     style: OverlayStyle = DEFAULT_STYLE,
     title: str | None = None,
 ) -> Picture:
@@ -386,14 +376,12 @@ def overlay_sheet(
     for position, view in enumerate(tracks.views):
         if view not in frames:
             continue
-        drawn = [
-            draw_overlay(frame, tracks, n, view, tile_height=tile_height, style=style)
-            for frame, n in zip(frames[view], moments, strict=True)
-        ]
+        shown = zip(frames[view], moments, strict=True)
+        drawn = [draw_overlay(frame, tracks, n, view, style=style) for frame, n in shown]
         seen = int(tracks.valid[:, position].any(axis=-1).sum())
-        text = f"{view_name(view)}  ·  a tool is in view in {seen} of {tracks.num_frames} frames"
+        text = f"{words(view)}  ·  a tool is in view in {seen} of {tracks.num_frames} frames"
         rows.append(SheetRow(text, np.stack(drawn)))
     if not rows:
         raise DataError("The episode has no view with a track", where=f"episode {tracks.episode_id}")
-    sheet = contact_sheet(rows, tile_height=tile_height, title=title, column_titles=[f"frame {n}" for n in moments])
+    sheet = contact_sheet(rows, tile_height=TILE_HEIGHT, title=title, column_titles=[f"frame {n}" for n in moments])
     return np.concatenate([sheet, legend_strip(tracks.arms, sheet.shape[1], outline=style.outline)], axis=0)

@@ -22,7 +22,7 @@ from pydantic import ConfigDict, TypeAdapter
 
 from worldline_core.actions.action_tracks import project_tools, tracks_of_projection
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
-from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip, view_name
+from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
 from worldline_core.calibration.camera_errors import corrected_camera
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, SourceDiagnosis
@@ -324,9 +324,9 @@ def diagnosis_picture(
             continue
         arms = before.arms
         shown = {n: image for n, image in enumerate(islice(frames[view], max(chosen) + 1)) if n in chosen}
-        left.append(SheetRow(view_name(view), _drawn(shown, before, view, 0, tile_height)))
+        left.append(SheetRow(words(view), _drawn(shown, before, view, 0, tile_height)))
         if repaired is not None:
-            right.append(SheetRow(view_name(view), _drawn(shown, after, view, lag, tile_height)))
+            right.append(SheetRow(words(view), _drawn(shown, after, view, lag, tile_height)))
     if not left:
         expected = "a calibrated view with images"
         raise DataError("Nothing to draw", where=f"episode {recorded.episode_id}", expected=expected)

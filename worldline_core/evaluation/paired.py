@@ -200,7 +200,7 @@ def differences(present: Series, reference: Series) -> Series:
     return {name: values for name, values in sorted(found.items()) if values}
 
 
-def paired_tests(found: Series, *, seed: int = 0, least: int = LEAST_RECORDINGS) -> dict[str, PairedTest]:
+def paired_tests(found: Series, *, least: int = LEAST_RECORDINGS) -> dict[str, PairedTest]:
     """Tests all series of differences together; those of fewer than ``least`` recordings are left out.
 
     Returns:
@@ -220,7 +220,7 @@ def paired_tests(found: Series, *, seed: int = 0, least: int = LEAST_RECORDINGS)
     spread = np.sqrt((there * (values - mean) ** 2).sum(axis=0) / np.maximum(counts - 1, 1) / counts)
     varies = spread > 1e-12
     chance = np.full(len(recordings), 1 / len(recordings))
-    draws = np.random.default_rng(seed).multinomial(len(recordings), chance, _RESAMPLES).astype(np.float64)
+    draws = np.random.default_rng(0).multinomial(len(recordings), chance, _RESAMPLES).astype(np.float64)
     number = np.maximum(draws @ there, 1.0)
     means = (draws @ values) / number
     square = (draws @ values**2) / number - means**2

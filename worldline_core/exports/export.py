@@ -217,8 +217,6 @@ def export_rollout(
     episode_id: str,
     output: Path,
     formats: Sequence[str],
-    *,
-    name: str | None = None,
 ) -> list[Path]:
     """Write an episode's predictions below `output` and return the files.
 
@@ -227,7 +225,6 @@ def export_rollout(
         tracks: action tracks for tool poses and heat maps; left out when None.
         formats: `mp4` (one side-by-side video per view), `rrd` (one recording with everything), `mcap` and `mcap-ros2`
             (one per method).
-        name: beginning of the file names (default: the episode's id).
 
     Raises: DataError when no set predicted this episode, or the set does not hold it.
     """
@@ -237,7 +234,7 @@ def export_rollout(
     sigma_px_ref = SIGMA_PX_REFERENCE if tracks is None else tracks.sigma_px_ref
     drawn = None if tracks is None else tracks.tracks(episode_id)
     content = recording_content(predicted, episodes, drawn, episode_id, sigma_px_ref=sigma_px_ref)
-    stem, written = name or safe_stem(episode_id), list[Path]()
+    stem, written = safe_stem(episode_id), list[Path]()
     output.mkdir(parents=True, exist_ok=True)
     if "mp4" in formats:
         for view, frames in content.true_frames.items():

@@ -123,11 +123,9 @@ class ArmKinematics:
         pairs = [(links[arm.end_effector_link], arm.T_link_tool.matrix()) for arm in self.embodiment.arms]
         return torch.stack([link @ torch.from_numpy(offset).to(link) for link, offset in pairs], dim=1)
 
-    def wrist_camera_poses(
-        self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray | float] | None = None
-    ) -> dict[str, Float[Tensor, "n 4 4"]]:
+    def wrist_camera_poses(self, state: np.ndarray | Tensor) -> dict[str, Float[Tensor, "n 4 4"]]:
         """T_base_camera by view, for the arms whose camera mount is known: from controls, never from a recording."""
-        return self.wrist_cameras_of(self.link_poses(state, posture))
+        return self.wrist_cameras_of(self.link_poses(state))
 
     def wrist_cameras_of(self, links: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n 4 4"]]:
         """T_base_camera by view from what `link_poses` gave."""

@@ -92,9 +92,9 @@ def number(value: object, digits: int = 2, *, signed: bool = False) -> str:
     return sign + f"{value:.{digits}f}".replace("-", MINUS)
 
 
-def percent(share: float, digits: int = 0) -> str:
+def percent(share: float) -> str:
     """A share as `64 %`."""
-    return f"{number(100 * float(share), digits)}{NARROW_SPACE}%"
+    return f"{number(100 * float(share), 0)}{NARROW_SPACE}%"
 
 
 def duration(seconds: float) -> str:

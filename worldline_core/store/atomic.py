@@ -43,14 +43,14 @@ def write_json_atomic(path: Path, value: Any) -> None:
     write_bytes_atomic(path, (json.dumps(value, sort_keys=True, indent=1, allow_nan=False) + "\n").encode())
 
 
-def write_arrays_atomic(path: Path, arrays: Mapping[str, np.ndarray], metadata: dict[str, str] | None = None) -> None:
-    """Write arrays as safetensors, with text beside them."""
+def write_arrays_atomic(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays as safetensors."""
     import numpy as np
     from safetensors.numpy import save
 
     # `save` copies raw memory: a transposed view would be read back in another order.
     ordered = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
-    write_bytes_atomic(path, save(ordered, metadata))
+    write_bytes_atomic(path, save(ordered))
 
 
 def write_table_atomic(path: Path, table: pa.Table, *, rows_per_group: Sequence[int] | None = None) -> None:

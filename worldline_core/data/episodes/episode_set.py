@@ -78,18 +78,10 @@ class EpisodeSet:
         """Inputs that did not get into this set."""
         return read_quarantine(self.root)
 
-    def select(
-        self, *, split: str | Sequence[str] | None = None, embodiment: str | None = None, stage2_ok: bool | None = None
-    ) -> list[int]:
-        """Positions of the rows that match every given value."""
+    def select(self, *, split: str | Sequence[str] | None = None) -> list[int]:
+        """Positions of the rows of these splits; None means all."""
         splits = None if split is None else {split} if isinstance(split, str) else set(split)
-        return [
-            position
-            for position, row in enumerate(self.rows)
-            if (splits is None or row.split in splits)
-            and (embodiment is None or row.embodiment == embodiment)
-            and (stage2_ok is None or row.stage2_ok == stage2_ok)
-        ]
+        return [position for position, row in enumerate(self.rows) if splits is None or row.split in splits]
 
     def dataset_path(self, i: int) -> Path:
         """Folder of the LeRobot dataset that holds row i.

@@ -68,9 +68,9 @@ VERIFICATION_HEIGHT_PX = 480
 MOTION_COUNT = 12
 
 
-def first_pass_indices(num_frames: int, count: int = FIRST_PASS_COUNT) -> tuple[int, ...]:
-    """Frames at sqrt(i / (count - 1)): more of them late, where success and failure differ."""
-    return frames_at(np.sqrt(np.arange(count) / (count - 1)), num_frames)
+def first_pass_indices(num_frames: int) -> tuple[int, ...]:
+    """Twelve frames at sqrt(i / 11): more of them late, where success and failure differ."""
+    return frames_at(np.sqrt(np.linspace(0.0, 1.0, FIRST_PASS_COUNT)), num_frames)
 
 
 def verification_indices(num_frames: int) -> tuple[int, ...]:
@@ -78,9 +78,9 @@ def verification_indices(num_frames: int) -> tuple[int, ...]:
     return frames_at(VERIFICATION_POSITIONS, num_frames)
 
 
-def motion_indices(num_frames: int, count: int = MOTION_COUNT) -> tuple[int, ...]:
+def motion_indices(num_frames: int) -> tuple[int, ...]:
     """Frames spread evenly over the whole video."""
-    return frames_at(np.linspace(0.0, 1.0, count), num_frames)
+    return frames_at(np.linspace(0.0, 1.0, MOTION_COUNT), num_frames)
 
 
 def frames_at(positions: np.ndarray | tuple[float, ...], num_frames: int) -> tuple[int, ...]:

@@ -192,9 +192,6 @@ class ColourSegmenter:
     follows = True
     description = "colour models and GrabCut, started from the projected tool centres of the first frame"
 
-    def __init__(self, iterations: int = 3) -> None:
-        self.iterations = iterations
-
     def segment(self, video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
         """Empty masks where no point of the first frame is valid."""
         return self.stream()(video, points)
@@ -208,7 +205,7 @@ class ColourSegmenter:
             if len(video) == 0:
                 return np.zeros(video.shape[:3], dtype=bool)
             if following is None:
-                following = _Following(self.iterations, video[0], points)
+                following = _Following(video[0], points)
             return np.stack([following.mask(frame) for frame in video])
 
         return masks_of
@@ -217,8 +214,7 @@ class ColourSegmenter:
 class _Following:
     """One video: colour models of its first frame, and the mask of the frame before."""
 
-    def __init__(self, iterations: int, first: np.ndarray, points: np.ndarray | None) -> None:
-        self._iterations = iterations
+    def __init__(self, first: np.ndarray, points: np.ndarray | None) -> None:
         self._previous: np.ndarray | None = None
         self._foreground, self._background = np.zeros((1, 65)), np.zeros((1, 65))
         start = np.zeros((0, 2)) if points is None else points[0][np.isfinite(points[0]).all(axis=-1)]
@@ -240,7 +236,7 @@ class _Following:
             labels = self._carried_labels(self._previous, robot_likely(lab, self._colours))
         if np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).any() and np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():
             mode = cv2.GC_INIT_WITH_MASK if begins else cv2.GC_EVAL_FREEZE_MODEL
-            rounds = self._iterations if begins else 1
+            rounds = 3 if begins else 1
             picture = np.ascontiguousarray(frame[..., ::-1])
             cv2.grabCut(picture, labels, (0, 0, 0, 0), self._background, self._foreground, rounds, mode)
             mask = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
