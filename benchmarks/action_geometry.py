@@ -1,6 +1,6 @@
-"""Speed of forward kinematics against MuJoCo, of tool projection, and of action maps against drawing them with OpenCV.
+"""Speed of forward kinematics against MuJoCo, and of action maps against drawing them with OpenCV.
 
-    python benchmarks/action_geometry.py [--threads 1] [--device cpu] [--embodiment franka_panda] [--pair ur5e_pair]
+    python benchmarks/action_geometry.py [--threads 1] [--device cpu] [--embodiment franka_panda]
 
 Both sides get the same input; the largest difference of their results is printed. The ratios carry over to other machines, the
 figures do not. Maps: 3 views, 2 arms, 33 latent frames on 30 x 40 cells; OpenCV draws the Gaussian as circles of falling
@@ -18,17 +18,12 @@ import torch
 
 from benchmarks.harness import best_seconds, command_line, print_table
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
-from worldline_core.actions.action_tracks import compute_tracks, project_tools
 from worldline_core.actions.episode_tracks import TrackBatch
-from worldline_core.actions.robot_masks import kinematic_robot_masks, robot_capsules
-from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.embodiment import Embodiment, load_embodiment
 from worldline_core.geometry.embodiment_report import random_states
 from worldline_core.geometry.kinematics import ArmKinematics
 
 IMAGE, GRID, VIEWS, ARMS = (480, 640), (30, 40), 3, 2
-K = np.array([[430.0, 0, 319.5], [0, 430.0, 239.5], [0, 0, 1]])
-HEAD = np.array([[0.0, 0, -1, 2], [1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])
 SIGMA_OF_WIDTH = 10 / 512
 
 
@@ -69,52 +64,6 @@ def measure_kinematics(name: str) -> None:
     }
     rows = ((what, len(embodiment.arms) / each, each / seconds["batched"]) for what, each in seconds.items())
     print_table(("method", "tool poses/s", "batched is faster by"), rows)
-
-
-def episode_of(kinematics: ArmKinematics, action: np.ndarray) -> Episode:
-    cameras = {"head": CameraTrack("head", K, HEAD[None], IMAGE[1], IMAGE[0])}
-    for view, poses in kinematics.wrist_camera_poses(action).items():
-        cameras[view] = CameraTrack(view, K, poses.numpy(), IMAGE[1], IMAGE[0])
-    text = {"source": "benchmark", "scene": "s", "task_family": "lift", "instruction": "", "outcome": "unknown"}
-    return Episode(
-        episode_id="benchmark",
-        embodiment=kinematics.embodiment.name,
-        split="train",
-        fps=30.0,
-        state=action.astype(np.float32),
-        action=action.astype(np.float32),
-        timestamps=np.arange(len(action)) / 30,
-        cameras=cameras,
-        **text,
-    )
-
-
-def measure_projection(name: str) -> None:
-    kinematics = ArmKinematics(load_embodiment(name))
-    rng = np.random.default_rng(0)
-    # A random walk near the middle of the joints' ranges.
-    action = 0.3 * np.sin(np.cumsum(rng.normal(0, 0.05, (1024, kinematics.embodiment.state_size)), axis=0))
-    links = kinematics.link_poses(action)
-    wrists = kinematics.wrist_cameras_of(links)
-    cameras = torch.stack([torch.from_numpy(HEAD).expand(len(action), 4, 4), *wrists.values()], dim=1)
-    tools, opening = kinematics.tools_of(links), kinematics.gripper(action)
-    intrinsics = torch.from_numpy(K).expand(cameras.shape[1], 3, 3)
-    views = cameras.shape[1]
-
-    ours = best_seconds(lambda: project_tools(tools, opening, intrinsics, cameras, IMAGE)) / len(action)
-    episode = episode_of(kinematics, action)
-    capsules, radii = robot_capsules(kinematics, {link: pose[:33] for link, pose in links.items()})
-    batch = (capsules[None].float(), radii[None].float(), intrinsics[None].float(), cameras[None, :33].float())
-    seconds = {
-        f"projection after kinematics, {views} views, {tools.shape[1]} arms": ours,
-        "compute_tracks: all of it": best_seconds(lambda: compute_tracks(episode, kinematics)) / len(action),
-        "of which kinematics of every link": best_seconds(lambda: kinematics.link_poses(action)) / len(action),
-        f"of which {len(radii)} capsules": best_seconds(lambda: robot_capsules(kinematics, links)) / len(action),
-        "robot masks from tracks, 30 x 40, a view": best_seconds(lambda: kinematic_robot_masks(*batch, IMAGE, GRID))
-        / (33 * views),
-    }
-    print(f"\n{name}")
-    print_table(("", "us a frame", "frames/s"), ((what, 1e6 * each, 1 / each) for what, each in seconds.items()))
 
 
 def random_tracks(num_frames: int) -> TrackBatch:
@@ -167,12 +116,10 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu", help="of the action maps")
     parser.add_argument("--embodiment", default="franka_panda", help="of the kinematics")
-    parser.add_argument("--pair", default="ur5e_pair", help="of the projection")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)
     measure_kinematics(arguments.embodiment)
-    measure_projection(arguments.pair)
     measure_maps(arguments.device)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from worldline_core.errors import DataError
 from worldline_core.evaluation.planning.evaluate_planning import rule_choosers, tree_scores_by_shortcut
 from worldline_core.evaluation.planning.shortcuts import BankFacts, Reach, named_places
+from worldline_core.evaluation.scores import bootstrap_mean
 from worldline_core.recorder.attempts import BankSpec, RecordBanksConfig
 from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.looks import scenes
@@ -55,9 +56,8 @@ def facts_of(recorder: EpisodeRecorder, layout: Layout, motions: list[ExecutedMo
 
 def interval(successes: list[bool]) -> list[float]:
     """Mean, and its 95 % bootstrap interval over banks."""
-    values = np.array(successes, dtype=float)
-    means = values[np.random.default_rng(0).integers(len(values), size=(2000, len(values)))].mean(axis=1)
-    return [round(float(v), 3) for v in (values.mean(), *np.quantile(means, (0.025, 0.975)))]
+    found = bootstrap_mean(successes)
+    return [round(value, 3) for value in (found.mean, found.low, found.high)]
 
 
 def measure(

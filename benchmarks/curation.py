@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.harness import RECORDINGS, command_line, print_table, timed
-from tools.thumbnails import view_thumbnails
+from tools.labelled_clips import view_thumbnails
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.rules import find_near_duplicates

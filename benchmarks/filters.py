@@ -24,8 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import RECORDINGS, command_line, cpu_seconds, print_table
-from tools.labelled_clips import FAULTS, HARMLESS, Clip
-from tools.thumbnails import view_thumbnails
+from tools.labelled_clips import FAULTS, HARMLESS, Clip, view_thumbnails
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import decode_video
 from worldline_core.data.video.encoder import encode_video
@@ -34,7 +33,7 @@ from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure
 from worldline_core.filters.verdict import Finding
 
-LARGEST, CRF = 120, 23
+LARGEST, CRF, MOST_MISTAKES = 120, 23, 20
 TUNING_SCENES = {f"scene_{number:02d}" for number in range(12)}
 REASONS = (
     "static", "reset", "corrupted", "base_motion", "time_alignment", "too_dark", "overexposed", "blur", "joint_jump",
@@ -144,7 +143,7 @@ def scores(judged: list[Judged]) -> Iterator[tuple[str | int | float, ...]]:
         yield reason, positives, precision, recall, 2 * precision * recall / max(precision + recall, 1e-9), *of_frames
 
 
-def print_tables(judged: list[Judged], misses: int) -> None:
+def print_tables(judged: list[Judged]) -> None:
     print_table(("reason", "clips", "precision", "recall", "F1", "frames: recall", "precision"), scores(judged))
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for item in judged:
@@ -157,7 +156,7 @@ def print_tables(judged: list[Judged], misses: int) -> None:
         given = set(REASONS) & j.found
         return given != {j.truth} if j.truth else bool(given)
 
-    for item in [j for j in judged if mistaken(j)][:misses]:
+    for item in [j for j in judged if mistaken(j)][:MOST_MISTAKES]:
         print(f"  {item.name}: got {', '.join(sorted(item.found)) or 'nothing'}; {item.where}")
 
 
@@ -168,7 +167,6 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=100, help="of every fault; half as many of harmless changes")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=1)
-    parser.add_argument("--misses", type=int, default=20, help="how many mistakes to list")
     arguments = parser.parse_args()
     with ProcessPoolExecutor(arguments.processes, mp_context=get_context("spawn")) as pool:
         jobs = [
@@ -177,7 +175,7 @@ def main() -> None:
         ]
         judged = [item for job in jobs for item in job.result()]
     print(f"part {arguments.part}, {len(judged)} clips, {cpu_seconds():.0f} s of processor time")
-    print_tables(judged, arguments.misses)
+    print_tables(judged)
 
 
 if __name__ == "__main__":

@@ -35,8 +35,8 @@ def timed[T](work: Callable[[], T]) -> tuple[T, float, float]:
     return result, time.perf_counter() - wall, cpu_seconds() - processor
 
 
-def best_seconds(call: Callable[[], object], at_least: float = 1.0) -> float:
-    """Best time of one call over at least `at_least` seconds of calls.
+def best_seconds(call: Callable[[], object]) -> float:
+    """Best time of one call over at least a second of calls.
 
     Processor time with one thread on a CPU, which a busy machine disturbs little, otherwise wall time.
     """
@@ -45,7 +45,7 @@ def best_seconds(call: Callable[[], object], at_least: float = 1.0) -> float:
     clock = time.process_time if torch.get_num_threads() == 1 and not torch.cuda.is_available() else time.perf_counter
     call()
     best, spent = float("inf"), 0.0
-    while spent < at_least:
+    while spent < 1.0:
         start = clock()
         call()
         if torch.cuda.is_available():

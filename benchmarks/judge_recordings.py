@@ -1,7 +1,7 @@
 """Accuracy of the measured judge: on true videos, on these through a tokenizer, and on predictions.
 
     python benchmarks/judge_recordings.py RECORDINGS [--tokenizer FOLDER | --rollouts FOLDER | --model FOLDER --level 0.75]
-        [--segmenter FOLDER] [--split train validation] [--every 3] [--limit 500]
+        [--segmenter FOLDER] [--split train validation] [--every 3]
 
 RECORDINGS is an EpisodeSet of `worldline record` (episodes, or banks with their sealed outcomes). By default the robot masks
 that the judge needs are the exact ones of the recording, so that nothing but the judge (and the tokenizer, or the
@@ -45,6 +45,8 @@ from worldline_core.rollout.samplers import Noise, integrate, shifted_sigmas
 from worldline_core.rollout.worldline import WorldLine
 
 IMAGE = (64, 96)
+SHIFT = 5.0
+"""Of the model's noise levels towards noise."""
 
 
 def area(scores: np.ndarray, success: np.ndarray) -> float:
@@ -79,9 +81,9 @@ def shrunk(images: np.ndarray) -> np.ndarray:
 class Denoiser:
     """A Stage II model that restores true latents from noise of a level, knowing the first frame and the controls."""
 
-    def __init__(self, checkpoint: Path, level: float, steps: int, shift: float) -> None:
+    def __init__(self, checkpoint: Path, level: float, steps: int) -> None:
         self.world = WorldLine.from_pretrained(checkpoint, expect_kind="stage2")
-        self.sigmas = [level * sigma for sigma in shifted_sigmas(steps, shift)]
+        self.sigmas = [level * sigma for sigma in shifted_sigmas(steps, SHIFT)]
 
     @torch.no_grad()
     def __call__(self, episode: Episode, frames: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -127,11 +129,9 @@ def main() -> None:
     parser.add_argument("--model", type=Path, help="a Stage II checkpoint")
     parser.add_argument("--level", type=float, default=1.0, help="noise that the model starts from, 0..1")
     parser.add_argument("--steps", type=int, default=1, help="Euler steps of the model")
-    parser.add_argument("--shift", type=float, default=5.0, help="of the model's noise levels towards noise")
     parser.add_argument("--segmenter", type=Path)
     parser.add_argument("--split", nargs="+", help="splits; all by default")
     parser.add_argument("--every", type=int, default=1, help="only each so many-th recording")
-    parser.add_argument("--limit", type=int)
     arguments = parser.parse_args()
     episodes = EpisodeSet.open(arguments.recordings)
     sealed = arguments.recordings / SEALED_FILE
@@ -143,9 +143,9 @@ def main() -> None:
     tokenizer = None if arguments.tokenizer is None else load_tokenizer(arguments.tokenizer)
     denoiser = None
     if arguments.model is not None:
-        denoiser = Denoiser(arguments.model, arguments.level, arguments.steps, arguments.shift)
+        denoiser = Denoiser(arguments.model, arguments.level, arguments.steps)
     judged: dict[str, list[tuple[float, bool, bool, str | None]]] = defaultdict(list)
-    for position in tqdm(episodes.select(split=arguments.split)[:: arguments.every][: arguments.limit], disable=None):
+    for position in tqdm(episodes.select(split=arguments.split)[:: arguments.every], disable=None):
         row = episodes.rows[position]
         outcome = outcomes.get(row.episode_id, row.outcome)
         if outcome == "unknown" or (rollouts is not None and row.episode_id not in rollouts.episode_ids):

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import jaxtyping
 import pytest
 
-from tools.runtime_shapes import check_shapes_of
+from tests.runtime_shapes import check_shapes_of
 
 if TYPE_CHECKING:
     from worldline_core.model.world_model import WorldModel

@@ -25,12 +25,6 @@ RADII = {
     "xarm7": (0.080, 0.020, 0.008),
     "panda": (0.075, 0.021, 0.013),
 }
-SOURCES = {
-    "viperx": "gym-aloha (Apache-2.0)",
-    "ur5e": "robosuite (MIT)",
-    "xarm7": "robosuite (MIT)",
-    "panda": "robosuite (MIT)",
-}
 
 
 def kinematics_xml(scene: SceneModel) -> str:
@@ -92,8 +86,9 @@ def embodiment_yaml(scene: SceneModel) -> str:
         "base_link": "world",
         "arms": arms,
     }
+    source = "gym-aloha (Apache-2.0)" if robot.model == "viperx" else "robosuite (MIT)"
     head = (
-        f"# Kinematics from {SOURCES[robot.model]}; written by tools.kinematics_export.\n"
+        f"# Kinematics from {source}; written by tools.kinematics_export.\n"
         "# Base frame: on the table at the middle between the arm bases, x forward, y left, z up.\n"
     )
     return head + yaml.safe_dump(description, sort_keys=False, default_flow_style=None, width=110)

@@ -7,20 +7,14 @@ pictures that are compressed again afterwards. No filter reads this module.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from tools.picture_faults import (
-    blurred,
-    brightened,
-    darkened,
-    garbled,
-    moving_background,
-    noisy,
-)
 from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails
 
 Frames = Mapping[str, np.ndarray]
 
@@ -43,6 +37,21 @@ class Clip:
     severity: str = ""
 
 
+def view_thumbnails(frames_rgb: Iterable[np.ndarray], fps: float = 30.0) -> ViewThumbnails:
+    """Thumbnails of pictures that do not come from a video.
+
+    Args:
+        frames_rgb: uint8 (H, W, 3) each, RGB.
+        fps: their rate, from which follows how often sharpness is measured.
+
+    Raises: RejectedInputError when there are none, or they differ in shape.
+    """
+    maker = ThumbnailMaker(fps)
+    for frame in frames_rgb:
+        maker.add(cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2GRAY), full_range=True)
+    return maker.thumbnails()
+
+
 def at_frames(clip: Clip, index: np.ndarray) -> Clip:
     """The clip at frame numbers (which may repeat); time stays even."""
     episode = clip.episode
@@ -61,6 +70,12 @@ def at_frames(clip: Clip, index: np.ndarray) -> Clip:
     )
     frames = {view: images[index] for view, images in clip.frames.items()}
     return replace(clip, episode=moved, frames=frames, masks={view: m[index] for view, m in clip.masks.items()})
+
+
+def _marked(count: int, start: int, stop: int) -> np.ndarray:
+    """bool (count,), true from start to stop."""
+    frames = np.arange(count)
+    return (start <= frames) & (frames < stop)
 
 
 def _joint_columns(episode: Episode) -> list[int]:
@@ -82,8 +97,7 @@ def static(clip: Clip, random: np.random.Generator) -> Clip:
     length = int(random.integers(round(1.75 * clip.episode.fps), round(4 * clip.episode.fps) + 1))
     start = int(random.choice([0, int(random.integers(4, count - 4)), count - 1]))
     index = np.concatenate([np.arange(start), np.full(length, start), np.arange(start, count)])
-    bad = np.zeros(len(index), bool)
-    bad[start : start + length] = True
+    bad = _marked(len(index), start, start + length)
     standing = replace(at_frames(clip, index), fault="static", bad=bad, severity=f"{length} frames from {start}")
     return with_sensor_noise(standing, random)
 
@@ -153,9 +167,7 @@ def _spoil(
     view = clip.episode.primary_view
     images = clip.frames[view].copy()
     images[slice(*span)] = change(images[slice(*span)])
-    bad = np.zeros(len(images), bool)
-    bad[slice(*span)] = True
-    severity = f"{severity}, frames {span[0]}..{span[1] - 1}"
+    severity, bad = f"{severity}, frames {span[0]}..{span[1] - 1}", _marked(len(images), *span)
     return replace(clip, frames={**clip.frames, view: images}, fault=fault, bad=bad, severity=severity)
 
 
@@ -235,8 +247,7 @@ def textured_room(clip: Clip, random: np.random.Generator) -> Clip:
 def _driven(clip: Clip, random: np.random.Generator, span: tuple[int, int]) -> Clip:
     view = clip.episode.primary_view
     images, speed = moving_background(clip.frames[view], clip.masks[view], span, random)
-    bad = np.zeros(len(images), bool)
-    bad[span[0] + 1 : span[1]] = True
+    bad = _marked(len(images), span[0] + 1, span[1])
     severity = f"{speed} of the width a second, frames {span[0]}..{span[1]}"
     return replace(clip, frames={**clip.frames, view: images}, fault="base_motion", bad=bad, severity=severity)
 
@@ -276,8 +287,7 @@ def joint_jump(clip: Clip, random: np.random.Generator) -> Clip:
     start = int(random.integers(4, count - 4))
     stop = count if random.integers(2) else start + int(random.integers(1, 4))
     state[start:stop, joint] += size
-    bad = np.zeros(count, bool)
-    bad[start : start + 1 if stop == count else stop] = True
+    bad = _marked(count, start, start + 1 if stop == count else stop)
     episode = replace(clip.episode, state=state)
     severity = f"{size:+.2f} rad in joint {joint}, frames {start}..{stop - 1}"
     return replace(clip, episode=episode, fault="joint_jump", bad=bad, severity=severity)
@@ -292,32 +302,134 @@ def joint_speed(clip: Clip, random: np.random.Generator) -> Clip:
     start = int(random.integers(4, count - length - 1))
     ramp = np.clip(np.arange(count) - start, 0, length) * speed / clip.episode.fps
     state[:, joint] += ramp.astype(np.float32)
-    bad = np.zeros(count, bool)
-    bad[start + 1 : start + length + 1] = True
+    bad = _marked(count, start + 1, start + length + 1)
     severity = f"{speed:.1f} rad/s in joint {joint}"
     return replace(clip, episode=replace(clip.episode, state=state), fault="joint_speed", bad=bad, severity=severity)
 
 
-FAULTS: dict[str, Callable[[Clip, np.random.Generator], Clip]] = {
-    "static": static,
-    "reset": reset,
-    "frozen": frozen,
-    "broken_pictures": broken_pictures,
-    "base_motion": base_motion,
-    "late_states": late_states,
-    "late_pictures": late_pictures,
-    "too_dark": too_dark,
-    "overexposed": overexposed,
-    "blur": blur,
-    "joint_jump": joint_jump,
-    "joint_speed": joint_speed,
-}
+# Faults of pictures, uint8 (n, H, W, 3)
+
+
+def noisy(images: np.ndarray, levels: float, random: np.random.Generator) -> np.ndarray:
+    """With independent sensor noise of a standard deviation in grey levels."""
+    noise = random.normal(0, levels, images.shape).astype(np.float32)
+    return np.clip(images + noise, 0, 255).round().astype(np.uint8)
+
+
+def garbled(images: np.ndarray, kind: str, random: np.random.Generator) -> np.ndarray:
+    """As a damaged stream decodes: "noise" all over, "blank" one level, a grey "band", or misplaced "blocks"."""
+    out, (count, height, width) = images.copy(), images.shape[:3]
+    if kind == "noise":
+        return random.integers(0, 256, images.shape, dtype=np.uint8)
+    if kind == "blank":
+        return np.full_like(images, random.integers(60, 200))
+    if kind == "band":  # a truncated JPEG: the rest of the picture is grey
+        out[:, round(height * random.uniform(0.3, 0.65)) :] = 128
+        return out
+    block = max(8, height // 8)
+    for image in out:
+        for top in range(0, height, block):
+            for left in range(0, width, block):
+                if random.uniform() < 0.5:
+                    row, column = random.integers(0, height - block + 1), random.integers(0, width - block + 1)
+                    patch = images[random.integers(count), row : row + block, column : column + block]
+                    place = image[top : top + block, left : left + block]
+                    place[:] = 255 - patch[: place.shape[0], : place.shape[1]]
+    return out
+
+
+def darkened(images: np.ndarray, gain: float, random: np.random.Generator) -> np.ndarray:
+    """With a share `gain` of the light, and the noise of a sensor that sees little."""
+    return noisy((images.astype(np.float32) * gain).round().astype(np.uint8), 1.5, random)
+
+
+def brightened(images: np.ndarray, share: float, random: np.random.Generator) -> np.ndarray:
+    """So bright that about `share` of the pixels are white."""
+    luma = images.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
+    gain = 255 / max(float(np.quantile(luma, 1 - share)), 1.0)
+    return noisy(np.clip(images.astype(np.float32) * max(gain, 1.0) * 1.15, 0, 255).astype(np.uint8), 1.0, random)
+
+
+def blurred(images: np.ndarray, radius_px: float, shaken: bool, random: np.random.Generator) -> np.ndarray:
+    """Defocused (a Gaussian of standard deviation `radius_px`), or smeared along a line three times as long."""
+    if not shaken:
+        return np.stack([cv2.GaussianBlur(image, (0, 0), radius_px) for image in images])
+    size = 2 * max(1, round(1.5 * radius_px)) + 1
+    out = []
+    for image in images:
+        angle = random.uniform(0, np.pi)
+        kernel = np.zeros((size, size), np.float32)
+        reach = (size - 1) / 2
+        for step in np.linspace(-reach, reach, 4 * size):
+            kernel[round(reach + step * np.sin(angle)), round(reach + step * np.cos(angle))] = 1
+        out.append(cv2.filter2D(image, -1, kernel / kernel.sum()))
+    return np.stack(out)
+
+
+def furnished_room(height: int, width: int, random: np.random.Generator) -> np.ndarray:
+    """uint8 (height, width, 3): a wall, a floor, and things before them, as a camera on a robot sees a room."""
+    wall, floor = random.uniform(70, 200, 3), random.uniform(50, 160, 3)
+    horizon = round(height * random.uniform(0.3, 0.6))
+    room = np.empty((height, width, 3), np.float32)
+    room[:horizon], room[horizon:] = wall, floor
+    for _ in range(int(random.integers(40, 90))):
+        thing_h, thing_w = random.uniform(0.05, 0.3, 2) * height
+        top, left = random.uniform(-0.1, 1, 2) * (height, width)
+        colour = tuple(random.uniform(20, 235, 3).tolist())
+        box = (int(left), int(top)), (int(left + thing_w), int(top + thing_h))
+        if random.integers(2):
+            cv2.rectangle(room, *box, colour, -1)
+        else:
+            cv2.ellipse(room, (*box[0],), (int(thing_w / 2) + 1, int(thing_h / 2) + 1), 0, 0, 360, colour, -1)
+    grain = cv2.resize(random.normal(0, 8, (height // 3, width // 3, 1)).astype(np.float32), (width, height))
+    return np.clip(cv2.GaussianBlur(room, (0, 0), 0.7) + grain[..., None], 0, 255).astype(np.uint8)
+
+
+def moving_background(
+    images: np.ndarray, masks: np.ndarray, span: tuple[int, int], random: np.random.Generator
+) -> tuple[np.ndarray, str]:
+    """The robot of a recording (its masks, (n, h, w)) before a room through which its base drives during `span`.
+
+    Driving forward enlarges the room about its middle, driving sideways and turning shift it; the speed rises and falls
+    smoothly as a chassis' does.
+
+    Returns: pictures, and the speed in words.
+    """
+    count, height, width = images.shape[:3]
+    room = furnished_room(3 * height, 3 * width, random)
+    per_second = float(random.uniform(0.05, 0.3))
+    direction = random.uniform(0, 2 * np.pi)
+    forward = float(random.uniform(-1, 1)) if random.integers(2) else 0.0
+    active = np.zeros(count)
+    start, stop = span
+    if stop > start:
+        ramp = np.minimum(np.arange(stop - start) + 1, np.arange(stop - start)[::-1] + 1)
+        active[start:stop] = np.minimum(ramp / 3, 1.0)
+        active[start] = 0
+    way = np.cumsum(active) * per_second / 8 * width
+    out = []
+    for i in range(count):
+        shift = way[i] * np.array([np.cos(direction), 0.4 * np.sin(direction)])
+        zoom = np.exp(forward * way[i] / width)
+        corner = np.array([width, height]) * (1.5 - 0.5 / zoom) + np.clip(shift, -0.9 * width, 0.9 * width)
+        place = np.array([[1 / zoom, 0, corner[0]], [0, 1 / zoom, corner[1]]], np.float64)
+        seen = cv2.warpAffine(
+            room, place, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REFLECT
+        )
+        robot = cv2.resize(masks[i].astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)[..., None]
+        out.append((robot * images[i] + (1 - robot) * seen).round().astype(np.uint8))
+    return np.stack(out), f"{per_second:.2f}" + (f", forward {forward:+.2f}" if forward else "")
+
+
+Change = Callable[[Clip, np.random.Generator], Clip]
+FAULTS: dict[str, Change] = {
+    change.__name__: change
+    for change in (
+        static, reset, frozen, broken_pictures, base_motion, late_states, late_pictures, too_dark, overexposed, blur,
+        joint_jump, joint_speed,
+    )
+}  # fmt: skip
 """Faults by name; `Clip.fault` is the quarantine reason that each must get."""
 
-HARMLESS: dict[str, Callable[[Clip, np.random.Generator], Clip]] = {
-    "short_pause": short_pause,
-    "there_and_back": there_and_back,
-    "slight_haze": slight_haze,
-    "textured_room": textured_room,
-}
+HARMLESS: dict[str, Change] = {c.__name__: c for c in (short_pause, there_and_back, slight_haze, textured_room)}
 """Changes that look like a fault and are none: no filter may drop anything for them."""

@@ -14,7 +14,7 @@ import pytest
 
 from tests.data.conftest import make_sample
 from tests.data.curating import record
-from tools.thumbnails import view_thumbnails
+from tools.labelled_clips import view_thumbnails
 from worldline_core.config import validate
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits, LeakageConfig

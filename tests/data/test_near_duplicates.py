@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tools.thumbnails import view_thumbnails
+from tools.labelled_clips import view_thumbnails
 from worldline_core.data.curation.rules import MIN_MOTION_OVERLAP, find_near_duplicates
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.fingerprint import (

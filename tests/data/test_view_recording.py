@@ -15,7 +15,7 @@ import pytest
 
 from tests.data.conftest import make_sample
 from tests.data.curating import files_of, packets, run, write_video
-from tools.thumbnails import view_thumbnails
+from tools.labelled_clips import view_thumbnails
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, recorded_size, store_view

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tools.labelled_clips import FAULTS, HARMLESS, Clip
-from tools.thumbnails import view_thumbnails
+from tools.labelled_clips import FAULTS, HARMLESS, Clip, view_thumbnails
 from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure

@@ -72,11 +72,3 @@ def confusion(labels: Sequence[Label], found: Mapping[str, Outcome]) -> dict[tup
             shown = "kept"
         table.setdefault((label.layout, label.kind), Counter())[shown] += 1
     return table
-
-
-def shares_right(labels: Sequence[Label], found: Mapping[str, Outcome]) -> dict[tuple[str, str], float]:
-    """(layout, kind) -> share of its recordings whose outcome is right."""
-    right: dict[tuple[str, str], list[bool]] = {}
-    for label in labels:
-        right.setdefault((label.layout, label.kind), []).append(is_right(label, found.get(label.episode_id)))
-    return {key: sum(values) / len(values) for key, values in right.items()}

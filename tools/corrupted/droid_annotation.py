@@ -1,4 +1,4 @@
-"""DROID annotation JSON with defects, above all in the paths that the annotation names."""
+"""DROID annotation JSON with defects: paths that lead elsewhere, keys that are not there, damaged JSON."""
 
 from __future__ import annotations
 
@@ -39,45 +39,12 @@ def _without(key: str) -> RecordDefect:
     return spoil
 
 
-def _cut_states(record: Record, random: np.random.Generator) -> None:
-    record["states"] = record["states"][:-1]
-    record["joints"] = record["joints"][:-1]
-
-
-def _cut_joints(record: Record, random: np.random.Generator) -> None:
-    record["joints"] = record["joints"][: -int(random.integers(1, 5))]
-
-
-def _ragged(record: Record, random: np.random.Generator) -> None:
-    row = int(random.integers(len(record["states"])))
-    record["states"][row] = record["states"][row][:-1]
-
-
-def _not_a_number(record: Record, random: np.random.Generator) -> None:
-    record["joints"][int(random.integers(len(record["joints"])))][2] = float("nan")
-
-
-def _words(record: Record, random: np.random.Generator) -> None:
-    record["states"][3][1] = "0.4 m"
-
-
-def _ticks(record: Record, random: np.random.Generator) -> None:
-    for row in record["joints"]:
-        row[3] = row[3] * 4096
-
-
 KINDS = (
     Kind("path_upwards", _video_at("../../../elsewhere/0.mp4"), ("path_traversal",)),
     Kind("path_absolute", _video_at("/etc/hostname"), ("path_traversal",)),
     Kind("path_to_nothing", _video_at("videos/none.mp4"), ("missing_file",)),
     Kind("no_videos", _without("videos"), ("missing_view",)),
     Kind("no_states", _without("states"), ("missing_column",)),
-    Kind("states_cut", _cut_states, ("length_mismatch",)),
-    Kind("joints_cut", _cut_joints, ("length_mismatch",)),
-    Kind("states_ragged", _ragged, ("length_mismatch", "unreadable")),
-    Kind("states_in_words", _words, ("length_mismatch", "unreadable", "missing_column")),
-    Kind("joints_not_finite", _not_a_number, ("nan_state",)),
-    Kind("joints_in_ticks", _ticks, ("joint_out_of_range",)),
 )
 _TEXTS: tuple[tuple[str, Callable[[str, np.random.Generator], bytes]], ...] = (
     ("json_cut", lambda text, random: text[: int(len(text) * random.uniform(0.2, 0.8))].encode()),
@@ -85,9 +52,6 @@ _TEXTS: tuple[tuple[str, Callable[[str, np.random.Generator], bytes]], ...] = (
     ("json_deep", lambda text, random: b"[" * 200_000),
     ("json_not_utf8", lambda text, random: text.encode().replace(b"pick", b"p\xff\xfek")),
 )
-
-
-"""Number of recordings that `write` adds for each of `each`."""
 
 
 def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:

@@ -156,9 +156,6 @@ _PICTURES: tuple[tuple[str, PictureDefect, tuple[str, ...]], ...] = (
 )
 
 
-"""Number of recordings that `write` adds for each of `each`."""
-
-
 @dataclass
 class _Dataset:
     """Episodes so far: their truth, and their rows in the list."""

@@ -15,15 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from tools.corrupted import defects
-from tools.corrupted.content import (
-    FPS,
-    HEIGHT,
-    NUM_FRAMES,
-    WIDTH,
-    gripper_motion,
-    joint_motion,
-    pictures,
-)
+from tools.corrupted.content import FPS, HEIGHT, NUM_FRAMES, WIDTH, gripper_motion, joint_motion, pictures
 from tools.corrupted.defects import Kind, Label
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.mcap.exported import write_episode_mcap
@@ -104,9 +96,6 @@ FILE_KINDS = (
     Kind("file_linked_out", defects.link_out, ("path_traversal",)),
     Kind("chunk_claims_bytes", _claim_chunk, ("too_large",)),
 )
-
-
-"""Number of recordings that `write` adds for each of `each`."""
 
 
 def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:

@@ -23,9 +23,9 @@ _K = np.array([[80.0, 0, (WIDTH - 1) / 2], [0, 80.0, (HEIGHT - 1) / 2], [0, 0, 1
 Source = dict[str, Any]
 
 
-def write_one_of_each(folder: Path, seed: int = 0) -> dict[str, Source]:
+def write_one_of_each(folder: Path) -> dict[str, Source]:
     """Layout -> its `curate.sources[]` entry; each in a folder of its own."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     sources: dict[str, Source] = {}
     for module in (lerobot_v21, droid_annotation, mcap):
         name = module.__name__.rsplit(".", 1)[1]
