@@ -190,8 +190,8 @@ def make_model() -> Callable[..., WorldModel]:
     """Very small world models (4 latent channels, 9 action channels) whose every weight is random: no path is silent."""
     import torch
 
-    from worldline_core.model.world_model import WorldModel
-    from worldline_core.model.world_model_config import WorldModelConfig
+    from worldline_core.model.networks import build_world_model
+    from worldline_core.model.world_model_config import MixtureConfig
 
     small = {
         "latent_channels": 4, "hidden_size": 24, "num_layers": 2, "num_heads": 2, "num_kv_heads": 1, "head_dim": 12,
@@ -200,7 +200,7 @@ def make_model() -> Callable[..., WorldModel]:
 
     def make(seed: int = 0, *, scale: float = 0.2, **changes: object) -> WorldModel:
         generator = torch.Generator().manual_seed(seed)
-        model = WorldModel(WorldModelConfig.model_validate(small | changes))
+        model = build_world_model(MixtureConfig.model_validate(small | changes))
         with torch.no_grad():
             for parameter in model.parameters():
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)

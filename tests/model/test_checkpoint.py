@@ -17,8 +17,8 @@ from worldline_core.model.checkpoint import (
     save_checkpoint,
     write_weights,
 )
-from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.networks import build_world_model
+from worldline_core.model.world_model_config import MixtureConfig
 
 
 def build(**changes):
@@ -26,7 +26,7 @@ def build(**changes):
         "latent_channels": 4, "hidden_size": 12, "num_layers": 2, "num_heads": 2, "num_kv_heads": 1, "head_dim": 12,
         "intermediate_size": 16, "rope_sections": (2, 2, 2), "vocab_size": 7,
     }  # fmt: skip
-    model = WorldModel(WorldModelConfig.model_validate(values | changes))
+    model = build_world_model(MixtureConfig.model_validate(values | changes))
     model.initialise(torch.Generator().manual_seed(0))
     return model
 
@@ -146,7 +146,7 @@ def test_damaged_files_are_refused(folder):
         (json.dumps(content | {"format": "other"}), "Not a checkpoint of this version"),
         (json.dumps(content | {"version": 2}), "Not a checkpoint of this version"),
         (json.dumps(content | {"kind": "other"}), "kind: Input should be"),
-        (json.dumps(content | {"config": content["config"] | {"hidden": 3}}), r"config\.hidden: Extra inputs"),
+        (json.dumps(content | {"config": content["config"] | {"hidden": 3}}), r"config\.mixture\.hidden: Extra inputs"),
         (json.dumps(without), "metadata: Field required"),
         ("{", "not JSON"),
     ):

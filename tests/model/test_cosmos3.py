@@ -14,7 +14,7 @@ from tests.model.test_checkpoint import most_bytes
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import fill, load_checkpoint
 from worldline_core.model.cosmos3 import config_from_diffusers, import_backbone, read_cosmos3
-from worldline_core.model.world_model import WorldModel
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import ImportBackboneConfig, cosmos3_config
 
 
@@ -228,5 +228,5 @@ def test_the_published_config_is_the_full_size(size, published, generation, both
     assert config == cosmos3_config(size)
     for towers, (least, most) in (("generation", generation), ("both", both)):
         with torch.device("meta"):
-            model = WorldModel(config.model_copy(update={"towers": towers}))
+            model = build_world_model(config.model_copy(update={"towers": towers}))
         assert least < sum(parameter.numel() for parameter in model.parameters()) < most

@@ -9,7 +9,7 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.layers import video_positions, view_starts
-from worldline_core.model.world_model import WorldModel
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import cosmos3_config
 
 SIZE = 5  # of a control vector
@@ -106,7 +106,7 @@ def test_text_conditions_and_padding_changes_nothing(build):
 @pytest.mark.parametrize("prediction", ["velocity", "first_frame_residual"])
 def test_a_fresh_model_stands_still_or_copies_the_first_frame(build, prediction):
     latents, maps, sigma = sample()
-    model = WorldModel(build(prediction=prediction).config)
+    model = build_world_model(build(prediction=prediction).config)
     model.initialise(torch.Generator().manual_seed(0))
     velocity = model(latents, sigma, action_maps=maps).velocity[:, :, :, 1:]
     if prediction == "velocity":

@@ -22,9 +22,9 @@ from worldline_core.distillation.teacher_trajectories import TrajectoryStore
 from worldline_core.errors import ArtifactError, CheckpointError
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet, save_segmenter
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import load_tokenizer
-from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.store.artifact_files import read_json_lines, read_manifest
 from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.video_teacher import load_teacher
@@ -32,8 +32,8 @@ from worldline_core.training.video_teacher import load_teacher
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    model = WorldModel(
-        WorldModelConfig(
+    model = build_world_model(
+        MixtureConfig(
             latent_channels=4, hidden_size=12, num_layers=2, num_heads=2, num_kv_heads=1, head_dim=12,
             intermediate_size=16, rope_sections=(2, 2, 2), vocab_size=7,
         )

@@ -13,9 +13,9 @@ from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.model.checkpoint import save_checkpoint
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import fit_patch_tokenizer
-from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec, NativeVectors, WorldModelConfig
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec, MixtureConfig, NativeVectors
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.encode_latents import encode_latents
 
@@ -79,7 +79,7 @@ def fit_tokenizer(folder):
     return tokenizer
 
 
-MODEL = WorldModelConfig(
+MODEL = MixtureConfig(
     latent_channels=8, hidden_size=24, num_layers=1, num_heads=2, num_kv_heads=1, head_dim=12, intermediate_size=32,
     rope_sections=(2, 2, 2), towers="generation",
 )  # fmt: skip
@@ -88,7 +88,7 @@ MODEL = WorldModelConfig(
 def small_model(**changes):
     """A model as training begins, with both towers where it has a vocabulary."""
     towers = {"towers": "both"} if "vocab_size" in changes else {}
-    model = WorldModel(MODEL.model_copy(update=towers | changes))
+    model = build_world_model(MODEL.model_copy(update=towers | changes))
     model.initialise(torch.Generator().manual_seed(0))
     return model
 
@@ -111,7 +111,7 @@ def inputs(tmp_path_factory, make_contract, make_spec):
     write_recordings(root, [(name, "test" if seed else "train", N, VIEWS, VIEWS) for seed, name in enumerate(NAMES)])
     digest = fit_tokenizer(root / "tokenizer").encoder_digest[:16]
     generator = torch.Generator().manual_seed(0)
-    model = WorldModel(MODEL)
+    model = build_world_model(MODEL)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
@@ -125,7 +125,7 @@ def inputs(tmp_path_factory, make_contract, make_spec):
     save("causal", "causal")
     save("small_blocks", "causal", causal=make_spec(recent_blocks=1, sigmas=(1.0, 0.5, 0.0)))
     torch.manual_seed(1)
-    both = WorldModel(MODEL.model_copy(update={"towers": "both", "vocab_size": 300}))
+    both = build_world_model(MODEL.model_copy(update={"towers": "both", "vocab_size": 300}))
     torch.nn.init.normal_(both.proj_out.weight, std=0.2)
     facts = {"tokenizer": digest, "text": {"kind": "bytes", "max_length": 48, "path": None}}
     for name, said in (("base", facts), ("silent", None), ("foreign", facts | {"tokenizer": "0123"})):
@@ -137,7 +137,7 @@ def inputs(tmp_path_factory, make_contract, make_spec):
         ("either", "either", "stage2"),
         ("either_causal", "either", "causal"),
     ):
-        film = WorldModel(MODEL.model_copy(update={"action_conditioning": takes, "native_size": 14}))
+        film = build_world_model(MODEL.model_copy(update={"action_conditioning": takes, "native_size": 14}))
         shared = {key: value for key, value in model.state_dict().items() if takes == "either" or "action_" not in key}
         film.load_state_dict(shared, strict=False)
         torch.nn.init.normal_(film.action_film.proj[0].weight, generator=torch.Generator().manual_seed(2))

@@ -18,7 +18,7 @@ from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, wr
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.model.tokenizers import PatchTokenizer, PatchTokenizerConfig
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training.clip_source import LatentRow, group_key, single_key
 from worldline_core.training.flow_matching import FlowMatchingObjective
@@ -149,7 +149,7 @@ def world(tmp_path_factory):
 @pytest.fixture
 def model_config():
     """Makes configurations of models that fit the world's latents."""
-    return lambda **changes: WorldModelConfig.model_validate(TINY_MODEL | changes)
+    return lambda **changes: MixtureConfig.model_validate(TINY_MODEL | changes)
 
 
 def trainer(steps, **changes):

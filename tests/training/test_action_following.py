@@ -12,8 +12,8 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError, TrainingError
 from worldline_core.model.checkpoint import read_checkpoint_info
-from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.networks import build_world_model
+from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training.action_following import ActionFollowing
 from worldline_core.training.clip_config import FrameInput
@@ -141,7 +141,7 @@ def test_a_run_without_its_tokenizer_is_refused_before_it_trains(inputs, tmp_pat
 
 
 def test_the_objective_predicts_from_the_observed_frame():
-    model = WorldModel(WorldModelConfig.model_validate(TINY_MODEL))
+    model = build_world_model(MixtureConfig.model_validate(TINY_MODEL))
     objective = FlowMatchingObjective(model, sigma=SigmaSampling(), weighting=LossWeighting(), sampler_steps=2)
     latents, noise = torch.randn(2, 2, 3, 4, 3, 4, 4)
     with torch.no_grad():

@@ -12,8 +12,8 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import TrainedClips, WorldModelConfig
+from worldline_core.model.networks import build_world_model
+from worldline_core.model.world_model_config import MixtureConfig, TrainedClips
 from worldline_core.training.clip_config import ClipSampling
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
@@ -227,6 +227,6 @@ def test_a_model_of_the_head_alone_trains_on_any_recording(inputs, tmp_path):
     clips = {"lengths": [9, 17], "view_weights": {"head": 1.0}}
     train_stage2(stage2(clips=clips, input={"kind": "frames", "image_size": SIZE}), inputs, tmp_path / "model")
     assert read_checkpoint_info(tmp_path / "model").trained == TrainedClips(view_sets=(HEAD,), strides=(1,))
-    model = WorldModel(WorldModelConfig(view_offsets=(0.0, 8.0), views=RIGHT))
+    model = build_world_model(MixtureConfig(view_offsets=(0.0, 8.0), views=RIGHT))
     with pytest.raises(ConfigError, match="Unknown or repeated view"):
         model(torch.zeros(1, 1, 32, 2, 4, 6), torch.ones(1), views=("left_wrist",))

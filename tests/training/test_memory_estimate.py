@@ -12,8 +12,8 @@ from tasks.train_stage1 import train_stage1
 from tests.model.test_checkpoint import most_bytes
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError
-from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.networks import build_world_model
+from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.pipeline import memory_estimate
 from worldline_core.pipeline.memory_estimate import (
     Estimate,
@@ -34,11 +34,11 @@ from worldline_core.training.training_state import TrainingStates
 
 SOURCE = Sources(None, None, (64, 96), (8, 12))
 SIZES = (
-    (WorldModelConfig(towers="generation", hidden_size=64, num_heads=1, num_layers=4, intermediate_size=192), 17),
-    (WorldModelConfig(towers="generation"), 33),
-    (WorldModelConfig(towers="generation", hidden_size=384, num_heads=6, num_layers=6, intermediate_size=1152), 33),
+    (MixtureConfig(towers="generation", hidden_size=64, num_heads=1, num_layers=4, intermediate_size=192), 17),
+    (MixtureConfig(towers="generation"), 33),
+    (MixtureConfig(towers="generation", hidden_size=384, num_heads=6, num_layers=6, intermediate_size=1152), 33),
 )
-TWO_LAYERS = WorldModelConfig(towers="generation", num_layers=2)
+TWO_LAYERS = MixtureConfig(towers="generation", num_layers=2)
 BLOCK = {"checkpointing": "block", "reduce_every_micro_step": True}
 objective = partial(FlowMatchingObjective, sigma=SigmaSampling(), weighting=LossWeighting())
 
@@ -67,7 +67,7 @@ def test_estimated_memory_is_what_the_allocator_hands_out(
     """The copy of a state that is being written is not counted: how long it is there depends on the disk."""
     config, frames = SIZES[size]
     values = {"precision": precision, "accumulation": accumulation, "sharding": {"checkpointing": checkpointing}}
-    training, model = training_of(config, frames, **values), WorldModel(config)
+    training, model = training_of(config, frames, **values), build_world_model(config)
     model.initialise(torch.Generator().manual_seed(0))
     model.checkpointing = checkpointing
     batch = SOURCE.batch(config, 1, config.views, frames)
@@ -87,7 +87,7 @@ def test_estimated_memory_is_what_the_allocator_hands_out(
 def test_a_deep_model_holds_what_two_shallow_ones_predict(monkeypatch):
     # The backward pass of deep models holds most where shallow ones do before it.
     assert memory_estimate.extrapolated(lambda layers: Held(10 + layers, 2 * layers), 36) == (46, 72)
-    config = WorldModelConfig(towers="generation", num_layers=6)
+    config = MixtureConfig(towers="generation", num_layers=6)
     line = training_of(config).activations(sharded=False)
     monkeypatch.setattr(memory_estimate, "extrapolated", lambda trace, layers: trace(layers))
     assert line == pytest.approx(training_of(config).activations(sharded=False), rel=1e-3)
@@ -108,7 +108,7 @@ def test_checkpointing_and_more_devices_are_proposed_in_this_order():
 def test_parts_are_shared_out_but_for_what_is_frozen_and_whole(monkeypatch):
     monkeypatch.setattr(Training, "activations", lambda *_args, **_named: 100)
     monkeypatch.setattr(memory_estimate, "parameter_counts", lambda *_: (1000, 10))
-    model = WorldModel(TWO_LAYERS)
+    model = build_world_model(TWO_LAYERS)
     work = Work(lambda _: None, (model,), (model,), {"tokenizer": torch.nn.Linear(1, 1)})
     monkeypatch.setattr(Training, "outline", lambda *_: work)
 
@@ -160,7 +160,7 @@ def test_a_training_that_cannot_fit_its_card_is_refused_before_it_begins(world, 
 
 
 def test_parameters_are_counted_on_the_real_model():
-    model = WorldModel(TWO_LAYERS)
+    model = build_world_model(TWO_LAYERS)
     assert parameter_counts(TWO_LAYERS)[0] == sum(value.numel() for value in model.parameters())
     trained = parameter_counts(TWO_LAYERS, lambda name: name.startswith("action_encoder."))[0]
     assert trained == sum(value.numel() for _, value in model.action_parameters())

@@ -16,7 +16,8 @@ from safetensors.torch import load_file
 from tests.training import conftest
 from tests.training.conftest import TINY_MODEL, losses
 from worldline_core.model.checkpoint import save_checkpoint
-from worldline_core.model.world_model import WorldModel, WorldModelConfig
+from worldline_core.model.networks import build_world_model
+from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.store.artifact_files import digest_folder, read_json_lines
 
 
@@ -66,7 +67,7 @@ def trainer(steps, batch_size, **changes):
 
 @pytest.fixture(scope="module")
 def inputs(world, teacher, tmp_path_factory):
-    model, folder = WorldModel(WorldModelConfig.model_validate(TINY_MODEL)), tmp_path_factory.mktemp("base")
+    model, folder = build_world_model(MixtureConfig.model_validate(TINY_MODEL)), tmp_path_factory.mktemp("base")
     model.initialise(torch.Generator().manual_seed(0))
     save_checkpoint(folder, model, kind="base", action_contract=None)
     return {**world.inputs, "stage1": folder, "teacher": teacher}

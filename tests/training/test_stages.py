@@ -18,7 +18,7 @@ from tests.training.conftest import FRAME_INPUT, VIEWS, losses, stage1, stage2, 
 from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.world_model import WorldModel
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import NativeVectors
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.store.artifact_files import digest_folder, read_json_lines
@@ -46,7 +46,7 @@ def inputs(world, tmp_path_factory):
 
 
 def fresh(model_config, **changes):
-    model = WorldModel(model_config(**changes))
+    model = build_world_model(model_config(**changes))
     model.initialise(torch.Generator().manual_seed(0))
     return model
 
@@ -90,7 +90,7 @@ def test_stage1_trains_both_towers_on_text_and_leaves_the_action_branch(inputs, 
 
 
 def test_what_stage2_trains(model_config):
-    model = WorldModel(model_config())
+    model = build_world_model(model_config())
     generation, action = stage2_groups(model, 66.0)
     everything, names = {name for name, _ in model.named_parameters()}, set(generation.parameters)
     assert action.multiplier == 66.0

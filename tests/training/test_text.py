@@ -9,7 +9,7 @@ import torch
 from tests.training.conftest import TINY_MODEL, stage1
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
 from worldline_core.model.text import VISION_START, ClipFacts, Cosmos3Text, load_text_encoder
-from worldline_core.model.world_model_config import TextConfig
+from worldline_core.model.world_model_config import MixtureConfig, TextConfig
 from worldline_core.rehearsal.outside_models import write_qwen2_tokenizer
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch
@@ -46,7 +46,9 @@ def test_a_stride_slows_the_frames_that_the_prompt_names(world):
 
 
 def test_bytes_are_what_the_shipped_checkpoints_were_trained_on():
-    ids, mask = load_text_encoder(TextConfig(max_length=6), 300)([" Lift ", "put it down"], [CLIP, CLIP])
+    ids, mask = load_text_encoder(TextConfig(max_length=6), MixtureConfig(vocab_size=300))(
+        [" Lift ", "put it down"], [CLIP, CLIP]
+    )
     # Bytes of "lift" and "put i" are shifted by two, 1 ends a text, 0 pads.
     assert ids.tolist() == [[110, 107, 104, 118, 1, 0], [114, 119, 118, 34, 107, 1]]
     assert mask.tolist() == [[True] * 5 + [False], [True] * 6]
@@ -61,7 +63,7 @@ def test_text_that_does_not_fit_the_model_is_refused(tmp_path):
         (TextConfig(kind="cosmos3", path=str(tmp_path / "none")), 151_936, UnavailableError, "is not here"),
     ):
         with pytest.raises(error, match=message):
-            load_text_encoder(config, size)
+            load_text_encoder(config, MixtureConfig(vocab_size=size))
 
 
 UNUSED = [

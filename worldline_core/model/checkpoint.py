@@ -20,12 +20,14 @@ from torch import Tensor
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
-from worldline_core.model.layers import is_action_parameter, is_text_parameter, new_action_tensors
+from worldline_core.model.layers import is_action_parameter, new_action_tensors
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import (
     ActionContract,
     CausalSpec,
     NativeVectors,
+    NetworkConfig,
     TrainedClips,
     WorldModelConfig,
 )
@@ -183,7 +185,7 @@ class CheckpointInfo(StrictModel):
     """
 
     kind: CheckpointKind
-    config: WorldModelConfig
+    config: NetworkConfig
     action_contract: ActionContract | None
     causal: CausalSpec | None = None
     trained: TrainedClips | None = None
@@ -349,12 +351,12 @@ def load_checkpoint(
             next_step=f"set action_frames to {info.config.action_frames}, or start from another checkpoint",
         )
     with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
-        model = WorldModel(config)
+        model = build_world_model(config)
     if weights:
         path = folder / WEIGHTS
         tensors = _with_branches(config, info.config, read_weights(path, info.weights_sha256))
         if config.towers == "generation":
-            tensors = {name: tensor for name, tensor in tensors.items() if not is_text_parameter(name)}
+            tensors = {name: tensor for name, tensor in tensors.items() if not model.is_text_parameter(name)}
         fill(model, tensors, where=path, dtype=dtype)
     return model, info
 

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import check_fit, read_weights, save_checkpoint
-from worldline_core.model.layers import is_text_parameter, new_action_tensors
+from worldline_core.model.layers import new_action_tensors
+from worldline_core.model.mixture import MixtureModel, is_text_parameter
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import (
     Cosmos3Size,
     ImportBackboneConfig,
-    WorldModelConfig,
+    MixtureConfig,
     cosmos3_config,
 )
 from worldline_core.store.artifact_files import read_json
@@ -42,7 +43,7 @@ UNUSED_PARAMETERS = (
 
 def config_from_diffusers(
     config: Mapping[str, Any], *, where: object, fps: float | None = None, expected: Cosmos3Size | None = None
-) -> WorldModelConfig:
+) -> MixtureConfig:
     """Translate a diffusers ``config.json``.
 
     Args:
@@ -135,7 +136,7 @@ def read_cosmos3(
         )  # fmt: skip
     raw = read_json(root / "config.json")
     config = config_from_diffusers(raw, where=root / "config.json", fps=fps, expected=size)
-    config = WorldModelConfig.model_validate(config.model_dump() | dict(changes or {}))
+    config = MixtureConfig.model_validate(config.model_dump() | dict(changes or {}))
     tensors = read_weights(root / SINGLE, None)
     without_text = config.towers == "generation"
     ignored = {
@@ -143,7 +144,7 @@ def read_cosmos3(
     }
     kept = {name: tensor for name, tensor in tensors.items() if name not in ignored}
     with torch.device("meta"):
-        model = WorldModel(config)
+        model = MixtureModel(config)
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(0)
         new = new_action_tensors(config)

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
-from worldline_core.model.world_model_config import TextConfig
+from worldline_core.model.world_model_config import MixtureConfig, TextConfig, WorldModelConfig
 from worldline_core.store.artifact_files import read_json
 
 SYSTEM_PROMPT = "You are a helpful assistant who will generate videos from a give prompt."
@@ -165,8 +165,8 @@ class ByteText:
         return padded([[*(byte + BYTE_OFFSET for byte in text), END_OF_TEXT] for text in cut], 0)
 
 
-def load_text_encoder(config: TextConfig, vocabulary_size: int) -> TextEncoder:
-    """The text encoder of a config.
+def load_text_encoder(config: TextConfig, model: WorldModelConfig) -> TextEncoder:
+    """The text encoder of a config, for a model of this configuration.
 
     Raises:
         ConfigError: it does not fit the model's vocabulary, or ``path`` is missing.
@@ -179,11 +179,11 @@ def load_text_encoder(config: TextConfig, vocabulary_size: int) -> TextEncoder:
         raise ConfigError("The backbone's text tokenizer needs a folder.", where="text.path", expected="a path")
     else:
         encoder = Cosmos3Text(Path(config.path), max_length=config.max_length, system_prompt=config.system_prompt)
-    if vocabulary_size < encoder.vocabulary_size:
+    if isinstance(model, MixtureConfig) and model.vocab_size < encoder.vocabulary_size:
         raise ConfigError(
             "The model's vocabulary is too small for this text.",
             where="model.vocab_size",
             expected=f">= {encoder.vocabulary_size}",
-            got=vocabulary_size,
+            got=model.vocab_size,
         )
     return encoder

@@ -1,6 +1,6 @@
-"""The action-driven world model: a mixture of transformers over text and multi-view video latents.
+"""The action-driven world model: one transformer over multi-view video latents, driven four ways.
 
-One network, four passes: :meth:`WorldModel.forward` (a whole clip), :meth:`~WorldModel.forward_teacher_forcing` (all
+What is common to all networks (`mixture.py`, `wan.py`) is here, their four passes: :meth:`WorldModel.forward` (a whole clip), :meth:`~WorldModel.forward_teacher_forcing` (all
 blocks of a recorded clip at once), :meth:`~WorldModel.forward_block` (the next block after a cache) and
 :meth:`~WorldModel.write_block` (a finished block into the cache).
 
@@ -10,6 +10,7 @@ d model width. Convention: ``z_sigma = (1 - sigma) z + sigma eps``, velocity ``e
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, cast
@@ -30,18 +31,15 @@ from worldline_core.model.block_causal_attention import (
     block_bounds,
 )
 from worldline_core.model.layers import (
+    ActionEncoder,
+    CompiledInHalves,
     GenerationAttention,
-    MixtureLayer,
-    RMSNorm,
+    NativeActionFilm,
     Rotation,
     TextContext,
     TimeEmbedder,
-    action_branches,
     check_shapes,
     is_action_parameter,
-    is_text_parameter,
-    rotation,
-    text_positions,
     velocity_of,
     video_positions,
 )
@@ -56,30 +54,72 @@ class WorldModelOutput:
     features: Tensor | None
 
 
-class WorldModel(nn.Module):
-    """Predicts the velocity of multi-view latents from the first frame, action maps, and optionally text."""
+class WorldModel(nn.Module, ABC):
+    """Predicts the velocity of multi-view latents from the first frame, action maps, and optionally text.
+
+    A network has the parts that are declared here by the same names, says how it turns positions (`rotation`), runs over the
+    tokens (`_run`) and reads a text (`encode_text`). Its layers take (tokens, attention, number, condition).
+    """
+
+    layers: nn.ModuleList
+    proj_in: nn.Linear
+    proj_out: nn.Linear
+    time_embedder: TimeEmbedder
+    action_encoder: ActionEncoder | None
+    action_film: NativeActionFilm | None
+
+    small: tuple[str, ...] = ("action_encoder.conv",)
+    """Beginnings of the names of matrices that start small, whatever their fan-in."""
+    residual: tuple[str, ...]
+    """Ends of the names of matrices that write to the residual stream."""
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
         self.config = config
-        if config.towers == "both":
-            self.embed_tokens = nn.Embedding(config.vocab_size, config.hidden_size)
-            self.norm = RMSNorm(config.hidden_size, config.rms_norm_eps)
-        self.layers = nn.ModuleList([MixtureLayer(config) for _ in range(config.num_layers)])
-        self.norm_moe_gen = RMSNorm(config.hidden_size, config.rms_norm_eps)
-        self.proj_in = nn.Linear(config.patch_dim, config.hidden_size)
-        self.proj_out = nn.Linear(config.hidden_size, config.patch_dim)
-        self.time_embedder = TimeEmbedder(config.hidden_size)
-        self.action_encoder, self.action_film = action_branches(config)
         self.view_embedding = (
             nn.Parameter(torch.zeros(len(config.views), config.hidden_size)) if config.view_embedding else None
         )
         self.checkpointing: Literal["none", "block"] = "none"
         """``block``: the backward pass computes every block again from its input."""
 
+    @abstractmethod
+    def rotation(self, positions: Float[Tensor, "3 *batch n"]) -> Rotation:
+        """Rotary angles at (time, height, width) of tokens."""
+
+    @abstractmethod
+    def encode_text(self, text_ids: Tensor, text_mask: Tensor | None = None) -> TextContext:
+        """What the layers read of right-padded texts, as the model's `TextEncoder` gives them."""
+
+    @abstractmethod
+    def _run(
+        self,
+        latents: Tensor,
+        sigma: Tensor,
+        clean: Tensor,
+        attend: GenerationAttention,
+        action_maps: Tensor | None,
+        views: Sequence[str],
+        text: TextContext | None = None,
+        features_at: int | None = None,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Output of the head ``(b n p)``, and the tokens after one layer.
+
+        Args:
+            sigma: noise level by clip or latent frame, ``(b)`` or ``(b t)``.
+            clean: latent frames without noise, ``(b t)``; their sigma is not read.
+        """
+
+    def text_offset(self, text: TextContext | None) -> float:
+        """Time of the first latent frame on the rotary axis, where text precedes it."""
+        return 0.0
+
+    def is_text_parameter(self, name: str) -> bool:
+        """Returns whether a parameter serves text alone, and is left out of a model that takes none."""
+        return False
+
     def compile_blocks(self) -> None:
         """Compile what every block computes around its attention; weights and their names stay as they are."""
-        for layer in self._mixture():
+        for layer in cast("Sequence[CompiledInHalves]", self.layers):
             layer.compile_halves()
 
     def initialise(self, generator: torch.Generator | None = None) -> None:
@@ -88,52 +128,30 @@ class WorldModel(nn.Module):
         Matrices get normals of one over the square root of their fan-in, those that write to the residual stream less
         by the square root of twice the depth. The head, the action branch's output and the view vectors start at zero.
         """
-        residual = (2 * self.config.num_layers) ** -0.5
         for name, parameter in self.named_parameters():
             if name.startswith(("proj_out.", "action_encoder.proj.", "action_film.proj.", "view_embedding")):
                 nn.init.zeros_(parameter)
             elif parameter.ndim < 2:
-                nn.init.constant_(parameter, 1.0 if "norm" in name else 0.0)
+                nn.init.constant_(parameter, 1.0 if "norm" in name and name.endswith("weight") else 0.0)
             else:
-                small = name.startswith(("action_encoder.conv", "embed_tokens"))
-                std = 0.02 if small else parameter[0].numel() ** -0.5
-                if name.endswith(("to_add_out.weight", "to_out.weight", "down_proj.weight")):
-                    std *= residual
+                std = 0.02 if name.startswith(self.small) else parameter[0].numel() ** -0.5
+                if name.endswith(self.residual):
+                    std *= (2 * self.config.num_layers) ** -0.5
                 nn.init.normal_(parameter, 0.0, std, generator=generator)
 
     def generation_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
         """Parameters that Stage II trains besides the action branch (docs/method.md section 4)."""
         for name, parameter in self.named_parameters():
-            if not is_text_parameter(name) and not is_action_parameter(name):
+            if not self.is_text_parameter(name) and not is_action_parameter(name):
                 yield name, parameter
+
+    def text_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """Parameters of a text tower, which Stage I trains besides; a network without one has none."""
+        return ((name, parameter) for name, parameter in self.named_parameters() if self.is_text_parameter(name))
 
     def action_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
         """The branches of the controls, trained at their own rate."""
         return ((name, parameter) for name, parameter in self.named_parameters() if is_action_parameter(name))
-
-    def encode_text(self, text_ids: Tensor, text_mask: Tensor | None = None) -> TextContext:
-        """Run the understanding tower over right-padded token ids ``(b m)``.
-
-        Raises:
-            ConfigError: the model was built or loaded without its understanding tower.
-        """
-        if self.config.towers != "both":
-            raise ConfigError(
-                "This model has no understanding tower, so it takes no text",
-                expected='towers="both"',
-                got=self.config.towers,
-                next_step="load the Stage I checkpoint with both towers, or leave the text out",
-            )
-        size = text_ids.shape[1]
-        mask = torch.ones_like(text_ids, dtype=torch.bool) if text_mask is None else text_mask.bool()
-        cosine, sine = rotation(self.config, text_positions(mask.sum(dim=1), size))
-        by = (rearrange(cosine, "b n d -> b 1 n d"), rearrange(sine, "b n d -> b 1 n d"))
-        tokens = self.embed_tokens(text_ids)
-        contexts: list[tuple[Tensor, Tensor]] = []
-        for layer in self._mixture():
-            tokens, context = layer.understand(tokens, by)
-            contexts.append(context)
-        return TextContext(tuple(contexts), None if bool(mask.all()) else mask, size)
 
     def forward(
         self,
@@ -163,14 +181,13 @@ class WorldModel(nn.Module):
         """
         check_shapes(self.config, latents, views, action_maps)
         frames, (rows, columns) = latents.shape[3], self._patch_grid(latents)
-        offset = 0.0 if text is None or text.ignored else text.size + self.config.temporal_margin
-        by = self._rotation(torch.arange(frames, device=latents.device), latents, views, fps, offset)
+        frame_numbers = torch.arange(frames, device=latents.device)
+        by = self._rotation(frame_numbers, latents, views, fps, self.text_offset(text))
         clean = torch.zeros(len(latents), frames, dtype=torch.bool, device=latents.device)
         clean[:, 0] = True
-        tokens = self._embed(latents, sigma, clean, action_maps, views)
         attend = FullAttention(by) if text is None else FullAttention(by, text.mask, text.ignored)
-        tokens, features = self._run(tokens, attend, action_maps, text, features_at)
-        velocity = self._velocity(tokens, latents, sigma, clean, latents[:, :, :, :1])
+        emitted, features = self._run(latents, sigma, clean, attend, action_maps, views, text, features_at)
+        velocity = self._velocity(emitted, latents, sigma, clean, latents[:, :, :, :1])
         if features is not None:
             features = rearrange(features, "b (t v h w) d -> b v t h w d", t=frames, v=len(views), h=rows, w=columns)
         return WorldModelOutput(velocity, features)
@@ -196,8 +213,8 @@ class WorldModel(nn.Module):
         sigma = sigma if isinstance(sigma, Tensor) else torch.full((), sigma, device=noisy.device)
         sigma = sigma.expand(len(noisy))
         clean = torch.zeros(len(noisy), noisy.shape[3], dtype=torch.bool, device=noisy.device)
-        tokens = self._run_block(noisy, sigma, clean, cache, action_maps, views)
-        return self._velocity(tokens, noisy, sigma, clean, cache.reference)
+        emitted = self._run_block(noisy, sigma, clean, cache, action_maps, views)
+        return self._velocity(emitted, noisy, sigma, clean, cache.reference)
 
     def write_block(
         self,
@@ -264,14 +281,10 @@ class WorldModel(nn.Module):
         rows, columns = self._patch_grid(noisy)
         per_frame = len(views) * rows * columns
         sizes = tuple((stop - start) * per_frame for start, stop in bounds)
-        tokens = self._embed(latents, frame_sigma, is_clean, maps, views)
         attend = TeacherForcingAttention(by, sizes, spec.sink_blocks, spec.recent_blocks)
-        tokens, _ = self._run(tokens, attend, maps)
-        velocity = self._velocity(tokens, latents, frame_sigma, is_clean, clean[:, :, :, :1])
+        emitted, _ = self._run(latents, frame_sigma, is_clean, attend, maps, views)
+        velocity = self._velocity(emitted, latents, frame_sigma, is_clean, clean[:, :, :, :1])
         return torch.cat((torch.zeros_like(velocity[..., :1, :, :]), velocity[..., history:, :, :]), dim=3)
-
-    def _mixture(self) -> Sequence[MixtureLayer]:
-        return cast("Sequence[MixtureLayer]", self.layers)
 
     def _patch_grid(self, latents: Tensor) -> tuple[int, int]:
         """Patch rows and columns of one view."""
@@ -282,7 +295,7 @@ class WorldModel(nn.Module):
     ) -> Rotation:
         """Rotary angles of the tokens of these latent frames, for all heads: ``(n d)``, or ``(b 1 n d)`` by clip."""
         positions = video_positions(self.config, frames, self._patch_grid(latents), views, offset, fps)
-        cosine, sine = rotation(self.config, positions)
+        cosine, sine = self.rotation(positions)
         return (cosine, sine) if positions.ndim == 2 else (cosine[:, None], sine[:, None])
 
     def _run_block(
@@ -295,25 +308,21 @@ class WorldModel(nn.Module):
         views: Sequence[str],
         written: dict[int, tuple[Tensor, Tensor]] | None = None,
     ) -> Tensor:
-        """Tokens of one block that attends to itself and to the cache's window, which it follows in time."""
+        """Output of the head for one block that attends to itself and to the cache's window, which it follows in time."""
         check_shapes(self.config, latents, views, action_maps)
         own, window = (torch.arange(count, device=latents.device) for count in (latents.shape[3], cache.frames))
         by = self._rotation(own + cache.frames, latents, views, cache.fps)
         attend = CachedAttention(by, cache.window, self._rotation(window, latents, views, cache.fps), written)
-        return self._run(self._embed(latents, sigma, clean, action_maps, views), attend, action_maps)[0]
+        return self._run(latents, sigma, clean, attend, action_maps, views)[0]
 
-    def _embed(
-        self, latents: Tensor, sigma: Tensor, clean: Tensor, action_maps: Tensor | None, views: Sequence[str]
-    ) -> Tensor:
-        """Patches to tokens; time embedding on noisy frames only; action residual; view embedding."""
+    def _patches(self, latents: Tensor) -> Tensor:
+        """Patches of the latents, projected to tokens, ``(b t n d)`` with the n tokens of a latent frame in order ``(v h w)``."""
         size = self.config.patch_size
         patches = rearrange(latents, "b v c t (h p) (w q) -> b t (v h w) (p q c)", p=size, q=size)
-        tokens = self.proj_in(patches.to(self.proj_in.weight.dtype))
-        if sigma.ndim == 1:
-            sigma = sigma[:, None]
-        time = self.time_embedder(sigma.float() * (1000.0 * self.config.timestep_scale))
-        time = torch.where(clean[..., None], torch.zeros((), dtype=time.dtype, device=time.device), time)
-        tokens = tokens + rearrange(time, "b t d -> b t 1 d").to(tokens.dtype)
+        return self.proj_in(patches.to(self.proj_in.weight.dtype))
+
+    def _with_controls(self, tokens: Tensor, action_maps: Tensor | None, views: Sequence[str]) -> Tensor:
+        """Tokens ``(b t n d)`` with their view's vector and the residual of the maps, in one sequence."""
         if isinstance(self.view_embedding, nn.Parameter):
             chosen = torch.stack([self.view_embedding[self.config.views.index(view)] for view in views])
             chosen = repeat(chosen, "v d -> (v n) d", n=tokens.shape[2] // len(views))
@@ -323,35 +332,35 @@ class WorldModel(nn.Module):
             tokens = tokens + self.action_encoder(action_maps.to(self.proj_in.weight.dtype)).to(tokens.dtype)
         return tokens
 
-    def _run(
+    def _through_layers(
         self,
         tokens: Tensor,
         attend: GenerationAttention,
+        conditions: Sequence[object],
         action_maps: Tensor | None,
-        text: TextContext | None = None,
-        features_at: int | None = None,
+        features_at: int | None,
     ) -> tuple[Tensor, Tensor | None]:
+        """Tokens after all layers, each of which gets its condition, and after one of them."""
         if features_at is not None and not 1 <= features_at <= len(self.layers):
             raise ConfigError("features_at counts layers from 1", expected=f"1..{len(self.layers)}", got=features_at)
         features: Tensor | None = None
-        for index, layer in enumerate(self._mixture()):
-            context = None if text is None else text.layers[index]
+        for index, (layer, condition) in enumerate(zip(self.layers, conditions, strict=True)):
             if action_maps is not None and self.action_film is not None:
                 tokens = self.action_film(tokens, action_maps, index)
             if self.checkpointing == "block" and torch.is_grad_enabled():
-                tokens = cast("Tensor", checkpoint(layer, tokens, attend, index, context, use_reentrant=False))
+                tokens = cast("Tensor", checkpoint(layer, tokens, attend, index, condition, use_reentrant=False))
             else:
-                tokens = layer(tokens, attend, index, context)
+                tokens = layer(tokens, attend, index, condition)
             if features_at == index + 1:
                 features = tokens
-        return self.norm_moe_gen(tokens), features
+        return tokens, features
 
     def _velocity(
-        self, tokens: Tensor, latents: Tensor, sigma: Tensor, clean: Tensor, reference: Tensor | None
+        self, emitted: Tensor, latents: Tensor, sigma: Tensor, clean: Tensor, reference: Tensor | None
     ) -> Tensor:
         size = self.config.patch_size
         axes = {"v": latents.shape[1], "t": latents.shape[3], "h": latents.shape[-2] // size, "p": size, "q": size}
-        emitted = rearrange(self.proj_out(tokens), "b (t v h w) (p q c) -> b v c t (h p) (w q)", **axes)
+        emitted = rearrange(emitted, "b (t v h w) (p q c) -> b v c t (h p) (w q)", **axes)
         per_frame = sigma[:, None] if sigma.ndim == 1 else sigma
         level = rearrange(per_frame.float(), "b t -> b 1 1 t 1 1")
         velocity = velocity_of(self.config, emitted, latents, level, reference)

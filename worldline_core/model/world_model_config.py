@@ -6,11 +6,11 @@ A contract is saved in ``checkpoint.json`` and read from there alone; none of it
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, cast
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, DataError
@@ -24,36 +24,19 @@ ActionConditioning = Literal["maps", "vectors", "either"]
 
 
 class WorldModelConfig(StrictModel):
-    """Hyper-parameters of :class:`~worldline_core.model.world_model.WorldModel`.
-
-    The defaults are the small model that trains on two CPU cores; :func:`cosmos3_config` has the published ones.
-    """
+    """Hyper-parameters that every network has: shape, view slots, controls, and what its head predicts."""
 
     latent_channels: int = Field(default=32, ge=1)
     patch_size: int = Field(default=2, ge=1)
     hidden_size: int = Field(default=192, ge=2)
     num_layers: int = Field(default=8, ge=1, le=1024)
     num_heads: int = Field(default=3, ge=1)
-    num_kv_heads: int = Field(default=1, ge=1)
     head_dim: int = Field(default=64, ge=2)
     intermediate_size: int = Field(default=576, ge=1)
-    rms_norm_eps: float = Field(default=1e-6, gt=0)
-    feed_forward: Literal["swiglu", "squared_relu"] = "swiglu"
-    """``squared_relu``: without a gate (Cosmos3-Edge)."""
-    text_keys: Literal["normalised", "normalised_for_video"] = "normalised"
-    """Queries and keys of the text are normalised; or the text reads its keys as they are, and the video reads them normalised
-    (Cosmos3-Edge)."""
-
-    rope_sections: tuple[int, int, int] = (12, 10, 10)
-    """Rotary frequencies given to (time, height, width); they add up to ``head_dim / 2``."""
-    rope_theta: float = Field(default=100.0, gt=1)
-    """Small grids need high frequencies: with 5e6 most of them would not turn over 4 x 6 patches."""
     fps: float | None = Field(default=None, gt=0)
     """When given, temporal positions advance by ``base_fps / fps`` per latent frame (Cosmos3's fps modulation), with the
     rate of each clip itself where it is known. None counts latent frames, whatever the rate."""
     base_fps: float = Field(default=24.0, gt=0)
-    temporal_margin: float = Field(default=16.0, ge=0)
-    """Gap on the temporal axis between the last text token and the first video token."""
 
     views: tuple[str, ...] = VIEWS
     view_offsets: tuple[float, ...] = (0.0, 8.0, 20.0)
@@ -63,13 +46,11 @@ class WorldModelConfig(StrictModel):
     spatial_compression: int = Field(default=8, ge=1)
     """Pixels a latent cell covers; only used to read offsets given in pixels."""
     view_embedding: bool = True
-    """A learned, zero-initialised vector per view. Not in Cosmos3 (a pretrained model keeps it off): RoPE tells a token
+    """A learned, zero-initialised vector per view. Pretrained models have none and keep it off: RoPE tells a token
     where the others are, never where it is itself, which a small model trained from scratch learns slowly."""
 
     towers: Literal["both", "generation"] = "both"
-    vocab_size: int = Field(default=512, ge=1)
-    timestep_scale: float = Field(default=0.1, gt=0)
-    """The time embedding sees ``1000 * sigma * timestep_scale`` (Cosmos3: 0.001)."""
+    """``generation``: the model takes no text, and has no tower for it."""
     action_channels: int = Field(default=9, ge=1)
     """Channels of the map of one control frame."""
     native_size: int | None = Field(default=None, ge=1)
@@ -94,12 +75,6 @@ class WorldModelConfig(StrictModel):
     def _consistent(self) -> Self:
         if self.head_dim % 2:
             raise ValueError(f"head_dim must be even, got {self.head_dim}")
-        if sum(self.rope_sections) != self.head_dim // 2:
-            raise ValueError(f"rope_sections {self.rope_sections} must add up to head_dim / 2 = {self.head_dim // 2}")
-        if 3 * max(self.rope_sections[1:]) > self.head_dim // 2:
-            raise ValueError(f"rope_sections {self.rope_sections}: height and width interleave by three and do not fit")
-        if self.num_heads % self.num_kv_heads:
-            raise ValueError(f"num_heads {self.num_heads} must be a multiple of num_kv_heads {self.num_kv_heads}")
         if (self.action_conditioning == "maps") != (self.native_size is None):
             raise ValueError(f"native_size: {self.native_size}, of a model that takes {self.action_conditioning}")
         if len(self.views) != len(self.view_offsets) or len(set(self.views)) != len(self.views):
@@ -121,6 +96,55 @@ class WorldModelConfig(StrictModel):
     def patch_dim(self) -> int:
         """Values of one video patch (``patch_size**2 * latent_channels``)."""
         return self.patch_size**2 * self.latent_channels
+
+
+class MixtureConfig(WorldModelConfig):
+    """Hyper-parameters of :class:`~worldline_core.model.mixture.MixtureModel`.
+
+    The defaults are the small model that trains on two CPU cores; :func:`cosmos3_config` has the published ones.
+    """
+
+    network: Literal["mixture"] = "mixture"
+    num_kv_heads: int = Field(default=1, ge=1)
+    rms_norm_eps: float = Field(default=1e-6, gt=0)
+    feed_forward: Literal["swiglu", "squared_relu"] = "swiglu"
+    """``squared_relu``: without a gate (Cosmos3-Edge)."""
+    text_keys: Literal["normalised", "normalised_for_video"] = "normalised"
+    """Queries and keys of the text are normalised; or the text reads its keys as they are, and the video reads them normalised
+    (Cosmos3-Edge)."""
+
+    rope_sections: tuple[int, int, int] = (12, 10, 10)
+    """Rotary frequencies given to (time, height, width); they add up to ``head_dim / 2``."""
+    rope_theta: float = Field(default=100.0, gt=1)
+    """Small grids need high frequencies: with 5e6 most of them would not turn over 4 x 6 patches."""
+    temporal_margin: float = Field(default=16.0, ge=0)
+    """Gap on the temporal axis between the last text token and the first video token."""
+    vocab_size: int = Field(default=512, ge=1)
+    timestep_scale: float = Field(default=0.1, gt=0)
+    """The time embedding sees ``1000 * sigma * timestep_scale`` (Cosmos3: 0.001)."""
+
+    @model_validator(mode="after")
+    def _heads_fit(self) -> Self:
+        if sum(self.rope_sections) != self.head_dim // 2:
+            raise ValueError(f"rope_sections {self.rope_sections} must add up to head_dim / 2 = {self.head_dim // 2}")
+        if 3 * max(self.rope_sections[1:]) > self.head_dim // 2:
+            raise ValueError(f"rope_sections {self.rope_sections}: height and width interleave by three and do not fit")
+        if self.num_heads % self.num_kv_heads:
+            raise ValueError(f"num_heads {self.num_heads} must be a multiple of num_kv_heads {self.num_kv_heads}")
+        return self
+
+
+def _network(values: Any) -> str:
+    """The network that values describe; a mixture where they do not say so."""
+    named = (
+        cast("Mapping[str, Any]", values).get("network")
+        if isinstance(values, Mapping)
+        else getattr(values, "network", None)
+    )
+    return "mixture" if named is None else str(named)
+
+
+NetworkConfig = Annotated[Annotated[MixtureConfig, Tag("mixture")], Discriminator(_network)]
 
 
 Cosmos3Size = Literal["nano", "edge"]
@@ -158,9 +182,9 @@ _COSMOS3_SIZES: dict[Cosmos3Size, dict[str, object]] = {
 }
 
 
-def cosmos3_config(size: Cosmos3Size, **changes: object) -> WorldModelConfig:
+def cosmos3_config(size: Cosmos3Size, **changes: object) -> MixtureConfig:
     """Both towers of Cosmos3-Nano (paper, implementation) or Cosmos3-Edge, three views at 480x640."""
-    return WorldModelConfig.model_validate(_COSMOS3 | _COSMOS3_SIZES[size] | changes)
+    return MixtureConfig.model_validate(_COSMOS3 | _COSMOS3_SIZES[size] | changes)
 
 
 class TextConfig(StrictModel):

@@ -35,9 +35,10 @@ from worldline_core.distillation.trajectory_regression import TrajectoryObjectiv
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import DESCRIPTION, SINGLE_PRECISION, read_checkpoint_info
 from worldline_core.model.lpips import LPIPS
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig, cosmos3_config
+from worldline_core.model.world_model_config import MixtureConfig, WorldModelConfig, cosmos3_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.progress import Progress
 from worldline_core.shipped import project_path
@@ -140,7 +141,7 @@ def to_bfloat16(model: nn.Module) -> None:
 def parameter_counts(model: WorldModelConfig, trained: Callable[[str], bool] = lambda _: True) -> tuple[int, int]:
     """Parameters that are trained, and all those of one transformer block."""
     with torch.device("meta"):
-        network = WorldModel(model)
+        network = build_world_model(model)
     counted = sum(value.numel() for name, value in network.named_parameters() if trained(name))
     return counted, sum(value.numel() for value in network.layers[0].parameters())
 
@@ -279,7 +280,7 @@ class Training:
 
     def outline(self, layers: int) -> Work:
         """The step of a model of so many layers; call it within a FakeTensorMode."""
-        network = WorldModel(self.model.model_copy(update={"num_layers": layers}))
+        network = build_world_model(self.model.model_copy(update={"num_layers": layers}))
         for name, parameter in network.named_parameters():
             parameter.requires_grad_(self.trained(name))
         return self.work(network)
@@ -414,7 +415,7 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
         whole["encoder"] = tokenizer  # it stays there, though the later steps use the latents of the trajectories
     models, scores, distance = [network], list[WorldModel](), None
     if part == "teacher_forcing":
-        scores = [WorldModel(model)] if first.teacher_share else []
+        scores = [build_world_model(model)] if first.teacher_share else []
         objective: Any = TeacherForcingObjective(network, config, *scores)
     else:
         shown, views, channels, frames, *grid = batch.latents.shape
@@ -433,7 +434,7 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
         if part == "trajectory_regression":
             objective = TrajectoryObjective(network, config, distance)
         else:
-            fake, real = WorldModel(model), WorldModel(model)
+            fake, real = build_world_model(model), build_world_model(model)
             models, scores = [network, fake], [real]
             objective = DistributionMatchingObjective(network, real, fake, config, distance)
 
@@ -454,7 +455,7 @@ def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sou
 
     def trace(layers: int) -> Held:
         with fake, torch.no_grad(), autocast(trainer):
-            teacher = WorldModel(model.model_copy(update={"num_layers": layers})).requires_grad_(False)
+            teacher = build_world_model(model.model_copy(update={"num_layers": layers})).requires_grad_(False)
 
             def run() -> None:
                 teacher_trajectories(
@@ -505,7 +506,7 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
     start = inputs.get({Stage1Config: "base", Stage2Config: "stage1", DistillConfig: "stage2"}[type(config)])
     if memory is None or source is None or (start is None and not isinstance(config, Stage1Config)):
         return  # the training itself names the input that is missing
-    model = config.model if isinstance(config, Stage1Config) else WorldModelConfig()
+    model = config.model if isinstance(config, Stage1Config) else MixtureConfig()
     if start is not None:
         model = read_checkpoint_info(Path(start)).config
     if isinstance(config, Stage2Config):

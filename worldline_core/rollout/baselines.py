@@ -104,7 +104,7 @@ class TextToVideo:
                 next_step="set text in the rollout's sampler",
             )
         text = sampler.text or validate(TextConfig, stated or {}, where=f"{checkpoint}, metadata.text")
-        self.text = load_text_encoder(text, self.info.config.vocab_size)
+        self.text = load_text_encoder(text, self.info.config)
         self.views = tuple(self.info.config.views)
         self.steps = sampler.steps
         self.frames_per_unit = self.tokenizer.temporal_compression

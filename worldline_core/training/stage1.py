@@ -9,7 +9,8 @@ from typing import Any
 import torch
 
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
-from worldline_core.model.layers import is_action_parameter, is_text_parameter
+from worldline_core.model.layers import is_action_parameter
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
@@ -28,7 +29,7 @@ def stage1_groups(model: WorldModel) -> list[ParameterGroup]:
     """All parameters of both towers; the action branch is untouched, so it is still zero when Stage II begins."""
     return [
         ParameterGroup("generation", dict(model.generation_parameters())),
-        ParameterGroup("text", {name: value for name, value in model.named_parameters() if is_text_parameter(name)}),
+        ParameterGroup("text", dict(model.text_parameters())),
     ]
 
 
@@ -45,14 +46,14 @@ def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path)
         if "base" in inputs:
             first = processes()[0] == 0
             return load_checkpoint(Path(inputs["base"]), expect_kind=("base", "stage1"), towers="both", weights=first)
-        model = WorldModel(config.model)
+        model = build_world_model(config.model)
         model.initialise(torch.Generator().manual_seed(config.trainer.seed))
         return model, None
 
     title = "stage I" if config.kind == "stage1" else "base"
     stage = Stage.open(config, inputs, output, number=1, title=title, load_model=load_model)
     model = stage.model
-    loader = stage.loader(text=load_text_encoder(config.text, model.config.vocab_size))
+    loader = stage.loader(text=load_text_encoder(config.text, model.config))
     objective = FlowMatchingObjective(
         model, sigma=config.sigma, weighting=config.weighting, text_dropout=config.text_dropout
     )

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from worldline_core.config import ImageSize, StrictModel
-from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
+from worldline_core.model.world_model_config import MixtureConfig, NetworkConfig, TextConfig
 from worldline_core.training.clip_config import ClipInput, ClipSampling, LatentInput
 
 
@@ -193,7 +193,7 @@ class Stage1Config(StageConfig):
     """``model`` describes a model that starts from scratch; with the input ``base``, that checkpoint's own is used."""
 
     kind: Literal["base", "stage1"] = "stage1"
-    model: WorldModelConfig = Field(default_factory=lambda: WorldModelConfig.model_validate({}))
+    model: NetworkConfig = Field(default_factory=lambda: MixtureConfig.model_validate({}))
     clips: ClipSampling = ClipSampling(view_weights={"primary": 1.0})
     text: TextConfig = TextConfig()
     text_dropout: float = Field(default=0.1, ge=0, le=1)
