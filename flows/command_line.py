@@ -419,8 +419,7 @@ def _doctor(arguments: argparse.Namespace) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console command, which works in a child process; with `argv` it works in this one."""
-    from tasks.execution.command_line import exit_with_clear_errors
-    from tasks.execution.supervisor import run_supervised
+    from tasks.execution.command_line import exit_with_clear_errors, run_supervised
     from worldline_core.scale.process import keep_freed_memory
 
     # Early: threads that have allocated keep the arena that they have.

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tasks.execution.run_page import FinishedStep, write_finished_page, write_progress_page
 from worldline_core.report.context import ReportConfig, ReportContext, VideoScores, in_order, method, share_interval
-from worldline_core.report.progress import FinishedStep, write_finished_page, write_progress_page
 from worldline_core.report.report import Figure, first_page, head_view, headline, planning_figure, video_figures
 from worldline_core.report.videos import best_median_worst, choose_episodes
 

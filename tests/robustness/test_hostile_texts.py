@@ -21,6 +21,7 @@ import pytest
 from safetensors import SafetensorError
 
 from tasks.execution.command_line import exit_with_clear_errors, log_to_stderr
+from tasks.execution.run_page import write_progress_page
 from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImports]
 from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck
 from worldline_core.calibration.check_report import page as check_page
@@ -36,7 +37,6 @@ from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.pages.page import Table, environment, markdown
 from worldline_core.pictures import fit_text, text_width_px
 from worldline_core.report.data import markdown_table, plain
-from worldline_core.report.progress import write_progress_page
 from worldline_core.store.remote import parse_location
 from worldline_core.untrusted_text import LONGEST, shown, visible, without_credentials
 

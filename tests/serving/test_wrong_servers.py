@@ -18,7 +18,7 @@ msgpack = pytest.importorskip("msgpack")
 from websockets.sync.server import ServerConnection, serve
 
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.policies.array_messages import pack
+from worldline_core.policies.messages import pack
 from worldline_core.serving.client import SimulatorClient
 
 UPGRADE = b"HTTP/1.1 101 S\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"

@@ -20,7 +20,7 @@ from worldline_core.store.store import ArtifactStore
 # The work starts a process of its own that ignores polite signals, as a busy pool does, and writes its id.
 WORK = """
 import signal, subprocess, sys, time
-from tasks.execution.supervisor import run_supervised
+from tasks.execution.command_line import run_supervised
 
 def work():
     code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); time.sleep(60)"

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
-from worldline_core.policies.message_socket import MessageSocket
+from worldline_core.policies.messages import MAX_MESSAGE_BYTES, MessageSocket
 
 MAX_HORIZON = 1024
 """Longest chunk of actions: policies of this field plan some ten to hundred steps ahead."""
