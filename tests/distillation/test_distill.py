@@ -238,6 +238,30 @@ def test_masks_follow_the_robot_and_skip_views_without_calibration(finished):
     assert end > begin
 
 
+def test_adapters_train_every_step_and_the_scores_share_their_weights(inputs, tmp_path, monkeypatch):
+    scores = []
+
+    def kept(*models):
+        scores.extend(models)
+        return DistributionMatchingObjective(*models)
+
+    monkeypatch.setattr("worldline_core.distillation.distill.DistributionMatchingObjective", kept)
+    forms = {name: {**step, "trainer": step["trainer"] | {"precision": "bf16"}} for name, step in QUICK.items()}
+    forcing = {"trainer": trainer(1, precision="bf16")}
+    distill(config(lora={"rank": 2}, teacher_forcing=forcing, **forms), inputs, tmp_path / "out")
+    _, real, fake, *_ = scores
+    trained = {name for name, value in fake.named_parameters() if value.requires_grad}
+    assert all("lora" in name or name.startswith("action_encoder") or name == "view_embedding" for name in trained)
+    own = {name.replace(".base_layer.", "."): value for name, value in fake.named_parameters()}
+    places = {name: (own[name].data_ptr(), value.data_ptr()) for name, value in real.named_parameters()}
+    assert {name for name, (ours, theirs) in places.items() if ours != theirs} == {
+        n for n in trained if "lora" not in n
+    }
+    last = read_checkpoint_info(tmp_path / "out" / "trajectory_regression").weights_sha256
+    assert json.loads((tmp_path / "out" / "adapter" / "adapter.json").read_text())["start"] == last
+    assert load_checkpoint(tmp_path / "out", expect_kind="causal")[0].action_encoder.proj.weight.any()
+
+
 @pytest.mark.slow
 def test_controls_of_whole_intervals_reach_every_step(inputs, tmp_path, make_model, make_contract):
     contract = make_contract(sigma_px_ref=SIGMA, tokenizer="synthetic")

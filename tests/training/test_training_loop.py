@@ -115,6 +115,41 @@ def test_a_full_disk_ends_the_run_and_keeps_the_state_before(tmp_path):
     assert goes_on(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "form",
+    [
+        {"optimizer": {"moments": "8bit"}},
+        {"weights": "bf16", "precision": "bf16"},
+        {"weights": "bf16", "precision": "bf16", "average": "host", "optimizer": {"moments": "8bit"}},
+    ],
+    ids=["moments", "weights", "all"],
+)
+def test_forms_that_save_memory_take_small_steps_and_go_on_with_the_same_bytes(tmp_path, form):
+    """Each step is a twentieth of what bfloat16 resolves at 1: rounded to the nearest, no weight would ever move."""
+
+    def trained(name, at=lambda _: 1.0):
+        dtype = torch.bfloat16 if "weights" in form else torch.float32
+        weight, optimizer = nn.Parameter(torch.ones(48, 128, dtype=dtype)), {"warmup_steps": 0, "learning_rate": 2e-4}
+        config = TrainerConfig.model_validate(
+            {"steps": 12, "save_every_seconds": 1000, **form, "optimizer": optimizer | form.get("optimizer", {})}
+        )
+        batch = Numbers(("still",), torch.zeros(2, 48, 128))
+        averaged = train(
+            config, groups=[ParameterGroup("matrix", {"weight": weight})], objective=Mean(weight, at), load=lambda _: batch,
+            validate=lambda: {"loss": float((weight.detach().float() - 1).abs().mean())}, output=tmp_path / name,
+            identity={}, title="matrix",
+        ).average["weight"]  # fmt: skip
+        assert (averaged.dtype, weight.dtype) == (torch.float32, dtype)
+        return weight.detach().float(), averaged
+
+    with pytest.raises(StoppedError):
+        trained("stopped", stop_at(5))
+    found, wanted = trained("stopped"), trained("whole")
+    assert all(torch.equal(one, other) for one, other in zip(found, wanted, strict=True))
+    assert (1 - wanted[0].mean()).item() == pytest.approx(12 * 2e-4, rel=0.15)
+    assert 0 < (1 - wanted[1].mean()).item() < 12 * 2e-4
+
+
 @pytest.mark.parametrize("error", [RuntimeError("[gloo/transport/tcp/pair.cc:544] Connection closed by peer"), None])
 def test_a_state_that_another_process_left_unfinished_is_not_blamed_on_the_disk(tmp_path, error):
     weight = {"weight": nn.Parameter(torch.zeros(3))}

@@ -35,33 +35,33 @@ from worldline_core.distillation.teacher_trajectories import (
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import (
-    CHECKPOINT_DTYPE,
     CheckpointInfo,
     CheckpointKind,
     load_checkpoint,
     read_checkpoint_info,
-    save_checkpoint,
 )
 from worldline_core.model.lpips import load_lpips
 from worldline_core.model.tokenizers import WanTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import match_views
 from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.training.adapters import add_adapters, save_trained, say_price, share_frozen
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 from worldline_core.training.clip_source import open_source, training_rows
+from worldline_core.training.optimizers import require_one_process
 from worldline_core.training.processes import (
     ALONE,
     BatchPlan,
-    gathered,
+    hold_weights,
     join_processes,
     place_model,
     processes,
     wait_for_all,
 )
 from worldline_core.training.stage import HeldOutClips, input_facts, weights_of
-from worldline_core.training.trainer import ParameterGroup, batch_plan, train
+from worldline_core.training.trainer import ParameterGroup, batch_plan, train, trained_groups
 from worldline_core.training.training_config import TrainerConfig
 
 logger = logging.getLogger(__name__)
@@ -107,6 +107,8 @@ class DistillationRun:
     def __init__(self, config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> None:
         device = config.teacher_forcing.trainer.device
         join_processes(device)
+        for step in STEPS:
+            require_one_process(getattr(config, step).trainer, {"distill.lora": config.lora is not None})
         self.config, self.output, self.stage2 = config, output, Path(inputs["stage2"])
         self.info = info = read_checkpoint_info(self.stage2)
         self.start = Path(inputs.get("causal", self.stage2))
@@ -172,44 +174,71 @@ class DistillationRun:
         """Step 1, from the Stage II model, or from a causal one that goes on."""
         settings, work = self.config.teacher_forcing, self._work(STEPS[0])
         kind = "stage2" if self.start == self.stage2 else "causal"
-        model, info = self._model(self.start, settings.trainer, expect_kind=kind)
+        model, info = self._trained(self.start, settings.trainer, expect_kind=kind)
         plan = batch_plan(settings.trainer, work)
         sampler = self._sampler(settings.trainer, self.config.first_clips, plan)
-        teacher = self._model(self.stage2, settings.trainer)[0] if settings.teacher_share else None
+        teacher = self._frozen(settings.trainer) if settings.teacher_share else None
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
         stop = settings.trainer.steps and settings.trainer.steps * plan.accumulation
         loader = copy(self.loader)
         loader.object_weights = weights_of(settings.weighting, self.episodes, self.source)
         load = loader.batches(sampler, self.config.input, work, stop)
-        return self._train(STEPS[0], settings.trainer, objective, load, info)
+        return self._train(STEPS[0], settings.trainer, objective, load, info, self.start)
 
     def trajectory_regression(self) -> dict[str, float]:
         """Step 2, from step 1's model, on trajectories that this model makes."""
         settings = self.config.trajectory_regression
         self._make_trajectories()
-        student, info = self._model(self.folder(STEPS[0]), settings.trainer, expect_kind="causal")
+        start = self.folder(STEPS[0])
+        student, info = self._trained(start, settings.trainer, expect_kind="causal")
         objective = TrajectoryObjective(student.train(), self.config, self.perceptual)
-        return self._train(STEPS[1], settings.trainer, objective, self._load_trajectories(STEPS[1]), info)
+        return self._train(STEPS[1], settings.trainer, objective, self._load_trajectories(STEPS[1]), info, start)
 
     def distribution_matching(self) -> dict[str, float]:
         """Step 3, from step 2's model; the real and the fake score start from the same weights."""
         settings = self.config.distribution_matching
-        student, info = self._model(self.folder(STEPS[1]), settings.trainer, expect_kind="causal")
-        real, fake = (self._model(self.stage2, settings.trainer)[0] for _ in range(2))
+        start = self.folder(STEPS[1])
+        student, info = self._trained(start, settings.trainer, expect_kind="causal")
+        real = self._frozen(settings.trainer)
+        fake = self._trained(self.stage2, settings.trainer, shared=real)[0]
         objective = DistributionMatchingObjective(student.train(), real, fake.train(), self.config, self.perceptual)
-        parameters = {f"fake.{name}": parameter for name, parameter in fake.named_parameters()}
+        parameters = {f"fake.{name}": value for name, value in fake.named_parameters() if value.requires_grad}
         other = ParameterGroup("fake", parameters, settings.fake_score_rate, averaged=False)
         return self._train(
-            STEPS[2], settings.trainer, objective, self._load_trajectories(STEPS[2]), info, (other, fake)
+            STEPS[2], settings.trainer, objective, self._load_trajectories(STEPS[2]), info, start, (other, fake)
         )
 
-    def _model(
-        self, folder: Path, trainer: TrainerConfig, *, expect_kind: CheckpointKind | None = None
+    def _trained(
+        self,
+        folder: Path,
+        trainer: TrainerConfig,
+        *,
+        expect_kind: CheckpointKind | None = None,
+        shared: WorldModel | None = None,
     ) -> tuple[WorldModel, CheckpointInfo]:
-        """A checkpoint's video tower, shared out among the processes; the first one alone reads its weights."""
+        """A checkpoint's video tower, to be trained, shared out among the processes; the first one alone reads its weights.
+
+        Args:
+            shared: a frozen model of the same weights, in place of those that are not trained.
+        """
         first = processes()[0] == 0
         model, info = load_checkpoint(folder, expect_kind=expect_kind, towers="generation", weights=first)
-        return place_model(model, trainer.sharding, precision=trainer.precision, device=trainer.device), info
+        if (lora := self.config.lora) is not None:
+            add_adapters(model, lora, trainer.seed)
+            if shared is None:
+                say_price(model, lora)
+            else:
+                share_frozen(model, shared)
+        place_model(
+            model, trainer.sharding, precision=trainer.precision, device=trainer.device, weights=trainer.weights
+        )  # fmt: skip
+        return model, info
+
+    def _frozen(self, trainer: TrainerConfig) -> WorldModel:
+        """The Stage II model's video tower, which is not trained, shared out among the processes."""
+        model, _ = load_checkpoint(self.stage2, towers="generation", weights=processes()[0] == 0)
+        model.requires_grad_(False)
+        return place_model(model, trainer.sharding, precision=trainer.precision, device=trainer.device)
 
     def _sampler(self, trainer: TrainerConfig, clips: ClipSampling, plan: BatchPlan) -> ClipSampler:
         """Clips of the training splits."""
@@ -228,7 +257,7 @@ class DistillationRun:
         settings, trainer = config.trajectory_regression.trajectories, config.trajectory_regression.trainer
         if not (folder / INDEX).is_file():
             teacher, info = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
-            teacher.to(trainer.device).eval().requires_grad_(False)
+            hold_weights(teacher.requires_grad_(False), trainer.precision).to(trainer.device).eval()
             per_shard = min(settings.clips, settings.clips_per_shard)
             drawn = trainer.model_copy(update={"batch_size": per_shard, "seed": settings.seed})
             # Processes take shards in turn, so none is read ahead.
@@ -261,6 +290,7 @@ class DistillationRun:
         objective: CausalObjective[BatchT],
         load: Callable[[int], BatchT],
         parent: CheckpointInfo,
+        start: Path,
         *others: tuple[ParameterGroup, WorldModel],
     ) -> dict[str, float]:
         """Train one step with the shared loop, then write its checkpoint and metrics; a finished step is only read."""
@@ -272,7 +302,9 @@ class DistillationRun:
         sampler = self._sampler(trainer, config.clips, ALONE)
         result = train(
             trainer,
-            groups=(ParameterGroup("student", dict(model.named_parameters())), *(group for group, _ in others)),
+            groups=trained_groups(
+                ParameterGroup("student", dict(model.named_parameters())), *(group for group, _ in others)
+            ),
             objective=objective,
             load=load,
             validate=held_out.validation(trainer, objective),
@@ -295,30 +327,26 @@ class DistillationRun:
             title=step.replace("_", " "),
             models=(model, *(other for _, other in others)),
         )
-        trained = {name: result.average[name] for name, _ in model.named_parameters()}
-        weights = gathered(model.state_dict() | trained, CHECKPOINT_DTYPE)
+        description: dict[str, Any] = {
+            "kind": "causal",
+            "action_contract": self.info.contract,
+            "causal": config.spec,
+            "trained": sampler.trained(model.config.views),
+            "vectors": self.info.vectors,
+            "metadata": {
+                "distillation": step,
+                "step": result.steps,
+                "seed": trainer.seed,
+                "start": {"kind": parent.kind, "weights_sha256": parent.weights_sha256},
+                "tokenizer": self.source.description["tokenizer"],
+                "lpips": self.lpips,
+                "metrics": result.metrics,
+                **input_facts(config.input, self.source, self._work(STEPS[0]), self._work(TRAJECTORIES)),
+            },
+        }
         if processes()[0] == 0:
             write_bytes_atomic(log, (work / "metrics.jsonl").read_bytes())
-            save_checkpoint(
-                folder,
-                model,
-                kind="causal",
-                action_contract=self.info.contract,
-                causal=config.spec,
-                trained=sampler.trained(model.config.views),
-                vectors=self.info.vectors,
-                metadata={
-                    "distillation": step,
-                    "step": result.steps,
-                    "seed": trainer.seed,
-                    "start": {"kind": parent.kind, "weights_sha256": parent.weights_sha256},
-                    "tokenizer": self.source.description["tokenizer"],
-                    "lpips": self.lpips,
-                    "metrics": result.metrics,
-                    **input_facts(config.input, self.source, self._work(STEPS[0]), self._work(TRAJECTORIES)),
-                },
-                state_dict=weights,
-            )
+        save_trained(folder, model, result.average, start=start, lora=config.lora, description=description)
         wait_for_all()
         return {f"{step}/{name}": value for name, value in result.metrics.items()}
 

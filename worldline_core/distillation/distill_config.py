@@ -14,6 +14,7 @@ from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipInput, ClipSampling, LatentInput
 from worldline_core.training.training_config import (
     ActionFollowingConfig,
+    LoRAConfig,
     LossWeighting,
     OptimizerConfig,
     SigmaSampling,
@@ -141,6 +142,8 @@ class DistillConfig(StrictModel):
     ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` the recordings' frames, which
     are encoded when the teacher sees them; the trajectories keep the latents of their clips.
     ``action_following``: measured in each of the three steps; null measures nothing.
+    ``lora``: each step trains adapters on the model before it, and distribution matching also on the score that follows the student,
+    which then shares its other weights with the real score; null: all weights.
     """
 
     input: ClipInput = LatentInput()
@@ -152,6 +155,7 @@ class DistillConfig(StrictModel):
     window: WindowConfig = WindowConfig()
     sigmas: tuple[float, ...] = CAUSAL_SIGMAS
     action_following: ActionFollowingConfig | None = None
+    lora: LoRAConfig | None = None
     teacher_forcing: TeacherForcingConfig = TeacherForcingConfig()
     trajectory_regression: TrajectoryRegressionConfig = TrajectoryRegressionConfig()
     distribution_matching: DistributionMatchingConfig = DistributionMatchingConfig()

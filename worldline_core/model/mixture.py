@@ -196,6 +196,7 @@ class MixtureModel(WorldModel):
 
     small = (*WorldModel.small, "embed_tokens")
     residual = ("to_add_out.weight", "to_out.weight", "down_proj.weight")
+    adapted = r"layers\.\d+\.(self_attn\.(add_[qkv]_proj|to_add_out)|mlp_moe_gen\.\w+_proj)"
 
     def __init__(self, config: MixtureConfig) -> None:
         super().__init__(config)

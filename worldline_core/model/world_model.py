@@ -72,6 +72,8 @@ class WorldModel(nn.Module, ABC):
     """Beginnings of the names of matrices that start small, whatever their fan-in."""
     residual: tuple[str, ...]
     """Ends of the names of matrices that write to the residual stream."""
+    adapted: str
+    """Names of the linear layers of attention and feed-forward that LoRA adapts, as a regular expression."""
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()

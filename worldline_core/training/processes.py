@@ -179,14 +179,40 @@ def device_mesh(config: ShardingConfig, device: str) -> DeviceMesh:
     return init_device_mesh(kind, (world_size // shards, shards), mesh_dim_names=("copy", "shard"))
 
 
+def weight_dtype(
+    name: str, parameter: Tensor, precision: Literal["fp32", "bf16"], weights: Literal["fp32", "bf16"] = "fp32"
+) -> torch.dtype:
+    """Dtype in which a process alone holds a weight, by its name; ``weights``: of trained matrices.
+
+    Matrices of blocks and of the text embedding are nearly all that there is. Their products in bfloat16 give the same from weights
+    that were rounded before, so what is not trained is.
+    """
+    half = precision == "bf16" and parameter.ndim > 1 and name.startswith(("layers.", "embed_tokens."))
+    return torch.bfloat16 if half and (weights == "bf16" or not parameter.requires_grad) else torch.float32
+
+
+def hold_weights(
+    model: WorldModel, precision: Literal["fp32", "bf16"], weights: Literal["fp32", "bf16"] = "fp32"
+) -> WorldModel:
+    """Give a model that a process has alone its weights as `weight_dtype` says, each where it is."""
+    for name, parameter in model.named_parameters():
+        parameter.data = parameter.data.to(weight_dtype(name, parameter, precision, weights))
+    return model
+
+
 def place_model(
-    model: WorldModel, config: ShardingConfig, *, precision: Literal["fp32", "bf16"], device: str
+    model: WorldModel,
+    config: ShardingConfig,
+    *,
+    precision: Literal["fp32", "bf16"],
+    device: str,
+    weights: Literal["fp32", "bf16"] = "fp32",
 ) -> WorldModel:
     """Put a model on its device, in parts where processes share the run, with what the configuration asks for.
 
     The first process's weights are handed out; on the others the model may be empty (`load_checkpoint`). Call it before
-    the parameters are given to an optimiser: sharding replaces them. Weights, gradients and moments stay
-    in float32; with "bf16" blocks are gathered and computed in bfloat16, and gradients are summed in float32. The time
+    the parameters are given to an optimiser: sharding replaces them. A process alone holds them as `weight_dtype` says. Weights,
+    gradients and moments of several stay in float32; with "bf16" blocks are gathered and computed in bfloat16, and gradients are summed in float32. The time
     embedding is computed in float32, as Cosmos3 does.
 
     Raises:
@@ -197,12 +223,14 @@ def place_model(
     if config.compile:
         model.compile_blocks()
     if processes()[1] == 1:
-        return model.to(device)
+        return hold_weights(model, precision, weights).to(
+            device
+        )  # cast first: the device never holds more than it keeps
     from torch.distributed.checkpoint.state_dict import StateDictOptions, set_model_state_dict
     from torch.distributed.fsdp import MixedPrecisionPolicy, fully_shard, register_fsdp_forward_method
 
     _register_outputs()
-    weights = model.state_dict() if processes()[0] == 0 else {}
+    read = model.state_dict() if processes()[0] == 0 else {}
     model.to("meta")
     mesh = device_mesh(config, device)
     plain = MixedPrecisionPolicy(cast_forward_inputs=False)
@@ -220,7 +248,7 @@ def place_model(
     with reporting_lost_processes("handing out the weights"):
         # Tensor by tensor: no device ever holds the whole model.
         options = StateDictOptions(full_state_dict=True, broadcast_from_rank0=True)
-        set_model_state_dict(model, weights, options=options)
+        set_model_state_dict(model, read, options=options)
     return model
 
 

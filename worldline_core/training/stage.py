@@ -14,17 +14,20 @@ import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.model.checkpoint import CHECKPOINT_DTYPE, CheckpointInfo, save_checkpoint
+from worldline_core.errors import ConfigError
+from worldline_core.model.checkpoint import CheckpointInfo
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, NativeVectors
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training.action_following import ActionFollowing, Predictor
+from worldline_core.training.adapters import add_adapters, save_trained, say_price
 from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader, ObjectWeights
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 from worldline_core.training.clip_source import ClipSource, open_source, training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.processes import BatchPlan, gathered, join_processes, place_model, processes
+from worldline_core.training.optimizers import require_one_process
+from worldline_core.training.processes import BatchPlan, join_processes, place_model
 from worldline_core.training.trainer import ParameterGroup, Probe, TrainingResult, batch_plan, held_out_losses, train
 from worldline_core.training.training_config import (
     ActionFollowingConfig,
@@ -43,7 +46,8 @@ class Stage:
     """One run of a stage: the model, and the clips it is trained on.
 
     Attributes:
-        start: digest of the weights that the run begins with, or "scratch"; parent_kind: that checkpoint's kind.
+        start: digest of the weights that the run begins with, or "scratch"; parent_kind: that checkpoint's kind; parent: its
+            folder.
         rows: the episodes that this stage may train on and be validated on.
     """
 
@@ -53,6 +57,7 @@ class Stage:
     model: WorldModel
     start: str
     parent_kind: str | None
+    parent: Path | None
     episodes: EpisodeSet
     source: ClipSource
     rows: list[ClipRow]
@@ -67,6 +72,7 @@ class Stage:
         number: Literal[1, 2],
         title: str,
         load_model: Callable[[], tuple[WorldModel, CheckpointInfo | None]],
+        parent: Path | None,
         tracks: ActionTracks | None = None,
     ) -> Stage:
         """Join the processes, load the model, open ``episodes`` and ``latents`` (or ``tokenizer``), choose the episodes.
@@ -77,19 +83,31 @@ class Stage:
             DataError: no episode is left.
             UnavailableError: the decoder that is asked for cannot be loaded.
         """
-        device = config.trainer.device
+        trainer = config.trainer
+        device = trainer.device
         join_processes(device)
-        torch.manual_seed(config.trainer.seed)
-        model, parent = load_model()
-        place_model(model, config.trainer.sharding, precision=config.trainer.precision, device=device).train()
+        require_one_process(trainer, {"lora": config.lora is not None})
+        if config.lora is not None and parent is None:
+            raise ConfigError(
+                "LoRA adapts a model that exists", where=f"{title}: lora", expected="a checkpoint to start from",
+                got="none", next_step="give --input base=FOLDER, or leave lora out",
+            )  # fmt: skip
+        torch.manual_seed(trainer.seed)
+        model, info = load_model()
+        if config.lora is not None:
+            add_adapters(model, config.lora, trainer.seed)
+            say_price(model, config.lora)
+        place_model(
+            model, trainer.sharding, precision=trainer.precision, device=device, weights=trainer.weights
+        ).train()
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
         source = open_source(config.input, inputs, episodes, device)
         rows = training_rows(
             source, episodes, stage=number, views=config.clips.shown_views(model.config.views), tracks=tracks,
             vectors=model.config.native_size is not None, outcomes=config.outcomes,
         )  # fmt: skip
-        start, kind = ("scratch", None) if parent is None else (parent.weights_sha256, parent.kind)
-        return cls(config, title, output, model, start, kind, episodes, source, rows)
+        start, kind = ("scratch", None) if info is None else (info.weights_sha256, info.kind)
+        return cls(config, title, output, model, start, kind, parent, episodes, source, rows)
 
     @property
     def vector_share(self) -> float:
@@ -191,27 +209,25 @@ class Stage:
     ) -> dict[str, Any]:
         """Gather and write the averaged weights (the first process alone writes) and return the counts of the run."""
         trainer = self.config.trainer
-        weights = gathered({**self.model.state_dict(), **result.average}, CHECKPOINT_DTYPE)
-        if processes()[0] == 0:
-            save_checkpoint(
-                self.output,
-                self.model,
-                kind=kind,
-                action_contract=action_contract,
-                trained=self.sampler.trained(self.model.config.views) if kind == "stage2" else None,
-                vectors=self._vectors() if kind == "stage2" else None,
-                metadata={
-                    "step": result.steps,
-                    "seed": trainer.seed,
-                    "tokenizer": self.source.description["tokenizer"],
-                    "episodes": len(self.training_rows),
-                    "sources": dict(sorted(Counter(row.source for row in self.training_rows).items())),
-                    "metrics": result.metrics,
-                    **input_facts(self.config.input, self.source, self.output / "run"),
-                    **facts,
-                },
-                state_dict=weights,
-            )
+        description: dict[str, Any] = {
+            "kind": kind,
+            "action_contract": action_contract,
+            "trained": self.sampler.trained(self.model.config.views) if kind == "stage2" else None,
+            "vectors": self._vectors() if kind == "stage2" else None,
+            "metadata": {
+                "step": result.steps,
+                "seed": trainer.seed,
+                "tokenizer": self.source.description["tokenizer"],
+                "episodes": len(self.training_rows),
+                "sources": dict(sorted(Counter(row.source for row in self.training_rows).items())),
+                "metrics": result.metrics,
+                **input_facts(self.config.input, self.source, self.output / "run"),
+                **facts,
+            },
+        }
+        save_trained(
+            self.output, self.model, result.average, start=self.parent, lora=self.config.lora, description=description
+        )  # fmt: skip
         clips = result.steps * trainer.batch_size * self.plan.per_step
         found, fit, kept = len(self.episodes), len(self.rows), len(self.training_rows)
         left_out = {"in other splits": fit - kept, "not fit for this stage, or without latents or tracks": found - fit}

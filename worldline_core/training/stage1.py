@@ -16,7 +16,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
 from worldline_core.training.stage import Stage
-from worldline_core.training.trainer import ParameterGroup
+from worldline_core.training.trainer import ParameterGroup, trained_groups
 from worldline_core.training.training_config import Stage1Config
 
 
@@ -26,11 +26,9 @@ def is_trained(name: str) -> bool:
 
 
 def stage1_groups(model: WorldModel) -> list[ParameterGroup]:
-    """All parameters of both towers; the action branch is untouched, so it is still zero when Stage II begins."""
-    return [
-        ParameterGroup("generation", dict(model.generation_parameters())),
-        ParameterGroup("text", dict(model.text_parameters())),
-    ]
+    """What is trained of both towers; the action branch is untouched, so it is still zero when Stage II begins."""
+    generation = ParameterGroup("generation", dict(model.generation_parameters()))
+    return trained_groups(generation, ParameterGroup("text", dict(model.text_parameters())))
 
 
 def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -42,16 +40,18 @@ def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path)
         DataError: if no clip is long enough, or one cannot be read.
     """
 
+    parent = Path(inputs["base"]) if "base" in inputs else None
+
     def load_model() -> tuple[WorldModel, CheckpointInfo | None]:
-        if "base" in inputs:
+        if parent is not None:
             first = processes()[0] == 0
-            return load_checkpoint(Path(inputs["base"]), expect_kind=("base", "stage1"), towers="both", weights=first)
+            return load_checkpoint(parent, expect_kind=("base", "stage1"), towers="both", weights=first)
         model = build_world_model(config.model)
         model.initialise(torch.Generator().manual_seed(config.trainer.seed))
         return model, None
 
     title = "stage I" if config.kind == "stage1" else "base"
-    stage = Stage.open(config, inputs, output, number=1, title=title, load_model=load_model)
+    stage = Stage.open(config, inputs, output, number=1, title=title, load_model=load_model, parent=parent)
     model = stage.model
     loader = stage.loader(text=load_text_encoder(config.text, model.config))
     objective = FlowMatchingObjective(

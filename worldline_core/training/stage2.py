@@ -23,7 +23,7 @@ from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
 from worldline_core.training.relational import RelationalTerm, TeacherSimilarities
 from worldline_core.training.stage import Stage
-from worldline_core.training.trainer import ParameterGroup
+from worldline_core.training.trainer import ParameterGroup, trained_groups
 from worldline_core.training.training_config import Stage2Config
 from worldline_core.training.video_teacher import load_teacher
 
@@ -31,11 +31,11 @@ logger = logging.getLogger(__name__)
 
 
 def stage2_groups(model: WorldModel, action_multiplier: float) -> list[ParameterGroup]:
-    """Generation modules, time embedding and latent projections at the base rate; the action branch faster."""
-    return [
+    """Generation modules, time embedding and latent projections (or their adapters) at the base rate; the action branch faster."""
+    return trained_groups(
         ParameterGroup("generation", dict(model.generation_parameters())),
         ParameterGroup("action", dict(model.action_parameters()), action_multiplier),
-    ]
+    )
 
 
 def stage2_model_config(config: Stage2Config, start: WorldModelConfig, *, drawn: bool = True) -> WorldModelConfig:
@@ -69,7 +69,9 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         kinds = ("base", "stage1", "stage2")
         return load_checkpoint(parent, expect_kind=kinds, towers="generation", adapt=adapt, weights=processes()[0] == 0)
 
-    stage = Stage.open(config, inputs, output, number=2, title="stage II", load_model=load_model, tracks=tracks)
+    stage = Stage.open(
+        config, inputs, output, number=2, title="stage II", load_model=load_model, parent=parent, tracks=tracks
+    )
     model = stage.model
     contract = ActionContract.model_validate(
         {

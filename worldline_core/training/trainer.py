@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from worldline_core.errors import ConfigError, StoppedError, TrainingError
 from worldline_core.progress import Progress
 from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.training.optimizers import clip_gradients, make_optimizer, set_learning_rate, update_weights
 from worldline_core.training.processes import (
     BatchPlan,
     average_values,
@@ -55,6 +56,15 @@ class ParameterGroup:
     parameters: Mapping[str, nn.Parameter]
     multiplier: float = 1.0
     averaged: bool = True
+
+
+def trained_groups(*groups: ParameterGroup) -> list[ParameterGroup]:
+    """The groups, without parameters that are not trained; groups that are then empty are left out."""
+    trained = [
+        replace(group, parameters={name: value for name, value in group.parameters.items() if value.requires_grad})
+        for group in groups
+    ]
+    return [group for group in trained if group.parameters]
 
 
 class NamedBatch(Protocol):
@@ -232,7 +242,7 @@ def train[BatchT: NamedBatch](
         while (fraction := config.fraction(done, seconds)) < 1:
             factor = schedule(done) if schedule else learning_rate_factor(settings, done, fraction)
             for slot, group in zip(run.optimizer.param_groups, groups, strict=True):
-                slot["lr"] = settings.learning_rate * group.multiplier * factor
+                set_learning_rate(slot, settings.learning_rate * group.multiplier * factor)
             step_began = time.monotonic()
             values, size = run.step(done)
             if config.minutes:  # clocks differ from process to process
@@ -317,17 +327,10 @@ class TrainingRun[BatchT: NamedBatch]:
         self.config, self.groups, self.objective, self.load = config, groups, objective, load
         self.models, self.output, self.title = models, output, title
         self.plan = batch_plan(config, output)
-        settings = config.optimizer
-        self.optimizer = torch.optim.AdamW(
-            [{"params": list(group.parameters.values())} for group in groups],
-            lr=settings.learning_rate,
-            betas=settings.betas,
-            weight_decay=settings.weight_decay,
-            fused=True,
-        )
+        self.optimizer = make_optimizer(config, [list(group.parameters.values()) for group in groups])
         named = {group.name: {f"{group.name}/{key}": p for key, p in group.parameters.items()} for group in groups}
         averaged = {key: p for group in groups if group.averaged for key, p in named[group.name].items()}
-        self.average = ExponentialAverage(averaged, config.ema_decay)
+        self.average = ExponentialAverage(averaged, config.ema_decay, on_host=config.average == "host")
         parameters = {key: p for group in named.values() for key, p in group.items()}
         self.states = TrainingStates(output, config.saving, parameters, self.average, self.optimizer)
 
@@ -336,7 +339,6 @@ class TrainingRun[BatchT: NamedBatch]:
         config, plan = self.config, self.plan
         trained = self.objective.trained_group(step)
         turn = [group for group in self.groups if trained in (None, group.name)]
-        self.optimizer.zero_grad(set_to_none=True)
         totals: dict[str, float] = {}
         size, kept = 0, ""
         for part in range(plan.accumulation):
@@ -362,7 +364,7 @@ class TrainingRun[BatchT: NamedBatch]:
                 got=totals["loss"],
                 next_step=f"lower the learning rate, or look at these clips; {self.states.last_good()}",
             )
-        norm = nn.utils.clip_grad_norm_(
+        norm = clip_gradients(
             [parameter for group in turn for parameter in group.parameters.values()], config.optimizer.clip_norm
         )
         totals["gradient_norm"] = float(whole(norm))
@@ -373,7 +375,7 @@ class TrainingRun[BatchT: NamedBatch]:
                 got=totals["gradient_norm"],
                 next_step=f"lower the learning rate or the clipping norm; {self.states.last_good()}",
             )
-        self.optimizer.step()  # leaves parameters without a gradient as they are
+        update_weights(self.optimizer, config, step)
         if any(group.averaged for group in turn):
             self.average.update()
         self.objective.end_step(totals)

@@ -85,7 +85,10 @@ class SavingConfig(StrictModel):
 
 
 class OptimizerConfig(StrictModel):
-    """AdamW with linear warm-up, a plateau, and a linear decay to 0 over the last share ``decay`` of the run."""
+    """AdamW with linear warm-up, a plateau, and a linear decay to 0 over the last share ``decay`` of the run.
+
+    ``moments``: "8bit" holds both moments in 8 bits, in blocks of 256 values with a scale each (torchao), for a quarter of the memory.
+    """
 
     learning_rate: float = Field(default=1e-3, gt=0)
     betas: tuple[float, float] = (0.9, 0.95)
@@ -93,6 +96,7 @@ class OptimizerConfig(StrictModel):
     warmup_steps: int = Field(default=100, ge=0)
     decay: float = Field(default=0.0, ge=0, le=1)
     clip_norm: float = Field(default=1.0, gt=0)
+    moments: Literal["fp32", "8bit"] = "fp32"
 
 
 class TrainerConfig(StrictModel):
@@ -102,6 +106,9 @@ class TrainerConfig(StrictModel):
     ``batch_size`` counts examples per device and micro-step, ``accumulation`` micro-steps per device and step.
     ``global_batch`` fixes the examples of a step over all devices instead: how many micro-steps each takes follows from
     it, and the run learns the same on 8 or 64 devices.
+    ``precision``: of what is computed; weights that are not trained are held in it, too. ``weights``: of the blocks' trained matrices,
+    and so of their gradients; "bf16" rounds each update up or down at random, so that small ones are not lost.
+    ``average``: where the moving average is, always in float32; "host" keeps it off the card.
     """
 
     steps: int | None = Field(default=None, ge=1)
@@ -112,6 +119,8 @@ class TrainerConfig(StrictModel):
     optimizer: OptimizerConfig = OptimizerConfig()
     ema_decay: float = Field(default=0.999, ge=0, lt=1)
     precision: Literal["fp32", "bf16"] = "bf16"
+    weights: Literal["fp32", "bf16"] = "fp32"
+    average: Literal["device", "host"] = "device"
     device: str = "cpu"
     log_every: int = Field(default=20, ge=1)
     validate_every: int = Field(default=0, ge=0, description="0: only after the last step")
@@ -130,6 +139,8 @@ class TrainerConfig(StrictModel):
             raise ValueError(f"global_batch ({self.global_batch}) must be a multiple of batch_size ({self.batch_size})")
         if self.global_batch is not None and self.accumulation != 1:
             raise ValueError("accumulation follows from global_batch and the number of processes: give one of the two")
+        if self.weights == "bf16" and self.precision == "fp32":
+            raise ValueError("weights in bf16 are computed with in bf16: set precision to bf16, or weights to fp32")
         return self
 
     def fraction(self, step: int, seconds: float) -> float:
@@ -171,12 +182,26 @@ class ActionFollowingConfig(StrictModel):
     stop_when_ignored: int | None = Field(default=None, ge=1)
 
 
+class LoRAConfig(StrictModel):
+    """Adapters in place of full fine-tuning: ``W + scale B A`` with ``rank`` columns of B and rows of A, on attention and feed-forward
+    of the video tower. Action branches and view embedding are trained in full, everything else stays as it is.
+    """
+
+    rank: int = Field(default=16, ge=1)
+    scale: float = Field(default=2.0, gt=0)
+
+
+class MergeAdapterConfig(StrictModel):
+    """Nothing to set: an adapter says what it becomes."""
+
+
 class StageConfig(StrictModel):
     """Settings that both stages share: clips, loss and run.
 
     ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` reads the recordings' frames
     and encodes them during training.
     ``outcomes``: only episodes that ended so (``[success]``); None takes all. No outcome reaches the model either way.
+    ``lora``: train adapters alone; null: all weights.
     """
 
     trainer: TrainerConfig
@@ -187,6 +212,7 @@ class StageConfig(StrictModel):
     outcomes: tuple[str, ...] | None = Field(default=None, min_length=1)
     sigma: SigmaSampling = Field(default_factory=SigmaSampling)
     weighting: LossWeighting = Field(default_factory=LossWeighting)
+    lora: LoRAConfig | None = None
 
 
 class Stage1Config(StageConfig):

@@ -29,6 +29,7 @@ from worldline_core.config import cache_relevant_config
 from worldline_core.errors import ArtifactError, TrainingError
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+from worldline_core.training.optimizers import empty_moments, stored_parts
 from worldline_core.training.processes import another_process_ended, own_part, processes, wait_for_all
 from worldline_core.training.training_config import SavingConfig
 
@@ -128,17 +129,23 @@ def _damaged(where: Path, got: object) -> ArtifactError:
 
 
 class ExponentialAverage:
-    """Exponential moving average of named parameters; shipped checkpoints hold it. Sharded where they are.
+    """Exponential moving average of named parameters, in float32; shipped checkpoints hold it. Sharded where they are.
 
     The decay rises with the number n of updates, ``min(decay, (1 + n) / (10 + n))``, so that the random start is
     forgotten also in short runs.
+
+    Args:
+        on_host: keep it in the machine's memory, not on the parameters' device.
     """
 
-    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
+    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float, *, on_host: bool = False) -> None:
         self.parameters = dict(parameters)
         self.decay = decay
         self.updates = 0
-        self.average = {name: parameter.detach().clone() for name, parameter in self.parameters.items()}
+        self.average = {
+            name: parameter.detach().to("cpu" if on_host else parameter.device, torch.float32, copy=True)
+            for name, parameter in self.parameters.items()
+        }
 
     @torch.no_grad()
     def update(self) -> None:
@@ -146,24 +153,27 @@ class ExponentialAverage:
         decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
         self.updates += 1
         for name, parameter in self.parameters.items():
-            own_part(self.average[name]).lerp_(own_part(parameter), 1 - decay)
+            average = own_part(self.average[name])
+            average.lerp_(own_part(parameter).to(average), 1 - decay)
 
     @contextmanager
     def swapped(self) -> Iterator[None]:
-        """Within the context the model holds the average."""
-        self._exchange()
+        """Within the context the model holds the average; its weights wait beside it."""
+        with torch.no_grad():
+            kept = {
+                name: own_part(parameter).detach().to(own_part(self.average[name]).device, copy=True)
+                for name, parameter in self.parameters.items()
+            }
+        self._fill(self.average)
         try:
             yield
         finally:
-            self._exchange()
+            self._fill(kept)
 
     @torch.no_grad()
-    def _exchange(self) -> None:
+    def _fill(self, values: Mapping[str, Tensor]) -> None:
         for name, parameter in self.parameters.items():
-            weights, average = own_part(parameter), own_part(self.average[name])
-            current = weights.detach().clone()
-            weights.copy_(average)
-            average.copy_(current)
+            own_part(parameter).copy_(own_part(values[name]))
 
 
 class TrainingStates:
@@ -243,11 +253,8 @@ class TrainingStates:
             reader = HuggingFaceStorageReader(str(folder))
             stored = reader.read_metadata().state_dict_metadata
             for name, parameter in self.parameters.items():
-                for key in ("exp_avg", "exp_avg_sq"):
-                    if f"{key}/{name}" in stored:  # moments have the memory layout of their parameter
-                        self.optimizer.state[parameter][key] = torch.zeros_like(parameter)
                 if f"step/{name}" in stored:
-                    self.optimizer.state[parameter]["step"] = torch.zeros((), device=parameter.device)
+                    self.optimizer.state[parameter] = empty_moments(self.optimizer, parameter)
             tensors = self._tensors()
             load(tensors, storage_reader=reader, process_group=self._group, no_dist=self._alone)
         except (CheckpointException, SafetensorError, KeyError, ValueError, RuntimeError) as error:
@@ -361,7 +368,8 @@ class TrainingStates:
             if name in self.average.average:
                 tensors[f"average/{name}"] = self.average.average[name]
             for key, value in self.optimizer.state.get(parameter, {}).items():
-                tensors[f"{key}/{name}"] = value
+                for part, tensor in stored_parts(value).items():
+                    tensors[f"{key}{part}/{name}"] = tensor
         return tensors
 
 
