@@ -7,7 +7,6 @@ import struct
 import tracemalloc
 from pathlib import Path
 
-import lz4.frame
 import numpy as np
 import pytest
 import zstandard
@@ -18,9 +17,8 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from tests.robustness.conftest import rejected  # pyright: ignore[reportMissingImports]
 from tools.corrupted import mcap
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import file as mcap_file
 from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
-from worldline_core.data.mcap.file import McapFile, check_chunks
+from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.mcap.messages import MessageDecoder
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -30,15 +28,9 @@ def record(opcode: int, body: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(body)) + body
 
 
-def chunk(packed: bytes, unpacked: int, compression: bytes = b"zstd") -> bytes:
-    head = struct.pack("<QQQI", 0, 0, unpacked, 0) + struct.pack("<I", len(compression)) + compression
+def chunk(packed: bytes, unpacked: int) -> bytes:
+    head = struct.pack("<QQQI", 0, 0, unpacked, 0) + struct.pack("<I", 4) + b"zstd"
     return record(0x06, head + struct.pack("<Q", len(packed)) + packed)
-
-
-def checked(path: Path, compression: bytes, packed: bytes, declared: int) -> None:
-    """Look at a file of one chunk, written by hand."""
-    path.write_bytes(MAGIC + chunk(packed, declared, compression) + record(0x0F, bytes(4)) + MAGIC)
-    check_chunks(path, "a")
 
 
 @pytest.fixture
@@ -58,23 +50,6 @@ def refused(path: Path, content: bytes) -> bool:
     except RejectedInputError:
         return True
     return False
-
-
-def test_chunks_are_unpacked_no_further_than_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.mcap"
-    with rejected("too_large", "chunk is too large"):
-        checked(path, b"zstd", zstandard.compress(b"x" * 100), 10**12)
-    # The frame's own size is what the decompressor allocates, whatever the chunk declares.
-    header = b"\x28\xb5\x2f\xfd" + bytes([0b1110_0000]) + struct.pack("<Q", 10**12)  # single segment, 8 bytes of size
-    assert zstandard.frame_content_size(header) == 10**12
-    with rejected("too_large", "chunk is too large"):
-        checked(path, b"zstd", header + zstandard.compress(b"x" * 300)[6:], 300)
-    monkeypatch.setattr(mcap_file, "MAX_CHUNK_BYTES", 1 << 20)
-    bomb = lz4.frame.compress(b"\0" * (8 << 20))
-    assert len(bomb) < 100_000
-    with rejected("too_large", "chunk is too large"):
-        checked(path, b"lz4", bomb, 1000)
-    checked(path, b"lz4", lz4.frame.compress(b"\0" * 1000), 1000)
 
 
 @pytest.mark.parametrize("content", [b"", b"x" * 100, MAGIC, MAGIC + struct.pack("<BQ", 0x06, 2**63) + b"x" * 50])
@@ -110,24 +85,12 @@ def indexed_file(path: Path, data: bytes, chunks: list[tuple[int, int]]) -> Path
     return path
 
 
-def test_an_index_that_leads_into_an_attachment_or_twice_to_a_chunk(tmp_path: Path) -> None:
-    """The size of a chunk in there was never looked at."""
+def test_an_index_that_leads_twice_to_a_chunk(tmp_path: Path) -> None:
     small = chunk(zstandard.compress(b"\0" * 1000), 1000)
-    attachment = record(0x09, struct.pack("<QQII", 0, 0, 0, 0) + struct.pack("<Q", len(small)) + small + bytes(4))
-    inside = len(MAGIC) + 9 + 8 + 9 + 24 + 8
-    path = indexed_file(tmp_path / "a.mcap", attachment, [(inside, len(small))])
-    assert path.read_bytes()[inside] == 0x06
-    with pytest.raises(RejectedInputError, match=r"damaged or was not finished[\s\S]*something else than the chunks"):
-        McapFile(path)
-    place = (len(MAGIC) + 17, len(small))
+    path, place = tmp_path / "a.mcap", (len(MAGIC) + 17, len(small))
     assert McapFile(indexed_file(path, small, [place])).topics == {"/a": ""}
-    with pytest.raises(RejectedInputError, match="or to one twice"):
+    with pytest.raises(RejectedInputError, match="to one chunk twice"):
         McapFile(indexed_file(path, small, [place] * 1000))
-    content = indexed_file(path, b"", []).read_bytes()
-    end = content.index(record(0x0F, bytes(4))) + 13
-    path.write_bytes(content[:end] + small + content[end:])
-    with pytest.raises(RejectedInputError, match="behind the end of the data"):
-        McapFile(path)
 
 
 def test_every_flipped_byte_of_our_own_file_is_noticed(sound: tuple[Path, bytes]) -> None:
@@ -158,12 +121,11 @@ def foxglove(name: str) -> Schema:
         (b"Empty[] name\nfloat64[] position\n===\nMSG: sensor_msgs/Empty\n", b"\0\1\0\0" + struct.pack("<I", 2**26)),
         (b"Empty[] name\n===\nMSG: sensor_msgs/Empty\nuint8[0] x\n", b"\0\1\0\0" + struct.pack("<I", 2**31)),
         (b"Empty[4000000000] name\n===\nMSG: sensor_msgs/Empty\nA[ 0 ] x\n===\nMSG: sensor_msgs/A\nint8 x", bytes(8)),
-        (b"string[] name\nfloat64[] position\n", b"\0\1\0\0" + struct.pack("<I", 2**26) + bytes(2**26)),
     ],
 )
 def test_ros_messages_of_a_few_bytes_do_not_become_millions_of_objects(definition: bytes, data: bytes) -> None:
     tracemalloc.start()
-    with pytest.raises(RejectedInputError, match=r"arrays of length 0|Message is too large|cannot be decoded"):
+    with pytest.raises(RejectedInputError, match=r"arrays of length 0|cannot be decoded"):
         decode("cdr", ros(definition), data)
     assert tracemalloc.get_traced_memory()[1] < 64 << 20
     tracemalloc.stop()
@@ -174,21 +136,14 @@ STATES = {"timestamp": {"sec": 1, "nsec": 0}, "joints": [{"name": "a", "position
 
 
 @pytest.mark.parametrize(
-    ("encoding", "schema", "data", "match"),
+    ("encoding", "schema", "data"),
     [
-        *(
-            ("json", foxglove(name), b"[" + content * 300_000 + b"1]", r"is too large|too many values")
-            for name in ("JointStates", "CompressedImage")
-            for content in (b"[],", b"{},", b"[[]],", b"1,")
-        ),
-        ("json", foxglove("JointStates"), json.dumps(STATES).encode(), "more columns than a robot"),
-        ("protobuf", Schema(1, DESCRIPTORS, "protobuf", "foxglove.JointStates"), b"\x12\x00" * 1_000_000, "is too large"),
+        ("json", foxglove("JointStates"), json.dumps(STATES).encode()),
+        ("protobuf", Schema(1, DESCRIPTORS, "protobuf", "foxglove.JointStates"), b"\x12\x00" * 1001),
     ],
-)  # fmt: skip
-def test_messages_of_millions_of_values_are_not_unpacked(
-    encoding: str, schema: Schema, data: bytes, match: str
-) -> None:
-    with rejected("too_large", match):
+)
+def test_messages_of_more_joints_than_a_robot_has(encoding: str, schema: Schema, data: bytes) -> None:
+    with rejected("too_large", "more columns than a robot"):
         decode(encoding, schema, data)
 
 

@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 from pydantic import TypeAdapter
 
-from tools.corrupted import defects
+from tools.corrupted import defects, mcap
 from tools.corrupted.mutations import read_everything
 from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
 from worldline_core.data.sources.hdf5 import require_h5py
@@ -128,6 +129,19 @@ def _repeated(value: pa.Array, rows: int) -> pa.Array:
     return pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), value)
 
 
+# --- MCAP
+
+
+def _packed_chunk(path: Path) -> None:
+    """A file of one chunk, a lz4 frame of two gigabytes of zeros that says that it is small."""
+    with lz4.frame.LZ4FrameCompressor() as frame:
+        packed = frame.begin() + b"".join(frame.compress(bytes(1 << 20)) for _ in range(2000)) + frame.flush()
+    chunk = struct.pack("<QQQII", 0, 0, 1000, 0, 3) + b"lz4" + struct.pack("<Q", len(packed)) + packed
+    parts = (0x01, bytes(8)), (0x06, chunk), (0x0F, bytes(4)), (0x02, bytes(20))
+    records = b"".join(struct.pack("<BQ", opcode, len(body)) + body for opcode, body in parts)
+    path.write_bytes(b"\x89MCAP0\r\n" + records + b"\x89MCAP0\r\n")
+
+
 # --- images
 
 
@@ -180,6 +194,8 @@ ATTACKS = (
     Attack(*_TABLE, "a megabyte of fixed length, 6,400 times",
            _rows(_repeated(pa.array([b"\0" * 1_000_000], pa.binary(1_000_000)), 64), 100), _ROWS),
     Attack(*_TABLE, "3 * 10^8 equal rows", _rows(pa.array(np.zeros(10**7)), 30), _ROWS),
+    Attack("mcap", "*.mcap", "a chunk of a terabyte", _random(mcap.claim_chunk), ("out_of_memory", "unreadable")),
+    Attack("mcap", "*.mcap", "a chunk of 2 GB in a frame of 8 MB", _packed_chunk, ("out_of_memory", "unreadable")),
     Attack(*_NPY, "10^12 rows", _bytes_at((b"'shape': (", 0, b"1000000000000, 16), }")), _LARGE),
     Attack(*_NPY, "an array of objects", lambda path: np.save(path, np.array([print]), allow_pickle=True), ("unreadable",)),
     Attack(*_PNG, "30,000 x 30,000 pixels", _content(lambda: png_with(size=(30_000, 30_000))), ("too_large",)),

@@ -79,7 +79,7 @@ MESSAGE_KINDS: tuple[tuple[str, _Change, tuple[str, ...]], ...] = (
 )
 
 
-def _claim_chunk(path: Path, random: np.random.Generator) -> None:
+def claim_chunk(path: Path, random: np.random.Generator) -> None:
     """The first chunk claims to unpack to a terabyte."""
     content = bytearray(path.read_bytes())
     position = 8
@@ -94,7 +94,6 @@ FILE_KINDS = (
     Kind("file_empty", defects.empty, ("unreadable",)),
     Kind("file_garbage", defects.garbage, ("unreadable",)),
     Kind("file_linked_out", defects.link_out, ("path_traversal",)),
-    Kind("chunk_claims_bytes", _claim_chunk, ("too_large",)),
 )
 
 
@@ -125,6 +124,7 @@ def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> t
             path = place(base, kind.name, kind.reasons)
             kind.spoil(path, random)
             known_by_its_name(path)
+        claim_chunk(place(base, "chunk_claims_bytes", ("unreadable", "out_of_memory")), random)
         path = place(base, "not_an_episode", ("unreadable", "missing_topic"))
         _rewrite(path, lambda found, index, message: message, with_metadata=False)
         known_by_its_name(path)

@@ -65,7 +65,7 @@ MAX_SIDE_PX = 16_384
 MAX_COLUMNS = 1_000
 """Columns of one track of a robot, which has some hundreds at most."""
 MAX_CHUNK_BYTES = 256 << 20
-"""One compressed chunk of an MCAP file once unpacked; recorders write 1 to 10 MB."""
+"""One record of an MCAP file; recorders write chunks of 1 to 10 MB."""
 
 
 class RejectedInputError(DataError):

@@ -1,9 +1,4 @@
-"""One MCAP file: checked before it is unpacked, its topics, the messages of chosen topics, and their images.
-
-The library trusts a chunk's header: it allocates what a zstd frame claims, and unpacks an lz4 frame to its end, up to 255
-bytes per byte. The size of every chunk is therefore checked first. Records (https://mcap.dev/spec): an opcode, a length
-of 8 bytes, then the record.
-"""
+"""One MCAP file: its topics, the messages of chosen topics, and their images (https://mcap.dev/spec)."""
 
 from __future__ import annotations
 
@@ -15,13 +10,11 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 import av
 import av.error
 import cv2
-import lz4.frame
 import numpy as np
 import zstandard
 from av.video.codeccontext import VideoCodecContext
@@ -34,7 +27,7 @@ from mcap.summary import Summary
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.guards.plain_files import UPRIGHT, decode_image, turned_view
-from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, check_image_size, too_large
+from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, check_image_size, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.data.mcap.messages import (
     IMAGE_KINDS,
@@ -48,13 +41,10 @@ from worldline_core.data.video.picture import Picture
 
 # What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
 _DAMAGE = (
-    McapError, zstandard.ZstdError, EOFError, OSError, ValueError, RuntimeError, LookupError, struct.error, OverflowError, MemoryError,
+    McapError, zstandard.ZstdError, EOFError, OSError, ValueError, RuntimeError, LookupError, struct.error, OverflowError,
 )  # fmt: skip
 _MAGIC = b"\x89MCAP0\r\n"
-_CHUNK = 0x06
-_DATA_END = 0x0F
 _FOOTER_BYTES = 9 + 20
-_LZ4_RATIO = 255
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
 _SMALLEST_BYTES = 2 * len(_MAGIC) + _FOOTER_BYTES
 _PNG = b"\x89PNG"
@@ -99,7 +89,7 @@ class Stream:
 class McapFile:
     """Read access to one file, which is open only while it is read.
 
-    Every method raises RejectedInputError: missing_file, special_file, too_large, unreadable (damaged, not finished).
+    Every method raises RejectedInputError: missing_file, special_file, unreadable (damaged, not finished), out_of_memory.
     """
 
     def __init__(self, path: AnyPath) -> None:
@@ -110,18 +100,19 @@ class McapFile:
     @cached_property
     def _summary(self) -> Summary | None:
         """None for a complete file without a summary, which is then read from its beginning."""
-        chunks = check_chunks(regular_file(self.path, "MCAP file"), self.path)
+        with _reading(self.path), regular_file(self.path, "MCAP file").open("rb") as stream:
+            _check_format(stream, self.path)
         with self._reader(indexed=True) as reader:
             summary = reader.get_summary()
             indexed = [] if summary is None else [index.chunk_start_offset for index in summary.chunk_indexes]
-            if len(set(indexed)) < len(indexed) or not set(indexed) <= set(chunks):
-                raise ValueError("an index that leads to something else than the chunks, or to one twice")
+            if len(set(indexed)) < len(indexed):
+                raise ValueError("an index that leads to one chunk twice")
             return summary
 
     def check_sums(self) -> None:
         """Compares the whole file with the checksums of its data and its summary (0: none)."""
         path = regular_file(self.path, "MCAP file")
-        with _damage_as_rejection(self.path), path.open("rb") as stream:
+        with _reading(self.path), path.open("rb") as stream:
             reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
             (footer,) = deque(reader.records, maxlen=1)
             if not isinstance(footer, Footer):
@@ -242,7 +233,7 @@ class McapFile:
         if indexed is None:
             indexed = self._summary is not None and bool(self._summary.chunk_indexes and self._summary.channels)
         path = regular_file(self.path, "MCAP file")
-        with _damage_as_rejection(self.path), path.open("rb") as stream:
+        with _reading(self.path), path.open("rb") as stream:
             if path.stat().st_size < _SMALLEST_BYTES:
                 raise EOFError(f"{path.stat().st_size} bytes")
             kind = SeekingReader if indexed else NonSeekingReader
@@ -278,15 +269,7 @@ class SplitMcap(McapFile):
             yield from part._records(topics, start_ns, stop_ns)
 
 
-@contextmanager
-def _damage_as_rejection(where: object) -> Iterator[None]:
-    try:
-        yield
-    except _DAMAGE as error:
-        what, next_step = "MCAP file is damaged or was not finished", "copy the file again, or try `mcap recover`"
-        raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200], next_step=next_step) from error
-
-
+_reading = partial(unreadable, "MCAP file is damaged or was not finished", faults=_DAMAGE)
 _OTHER_FORMATS = {
     b"\x28\xb5\x2f\xfd": ("packed as a whole by zstd", "unpack it: zstd -d FILE"),
     b"\x1f\x8b": ("packed as a whole by gzip", "unpack it: gunzip FILE"),
@@ -304,51 +287,6 @@ def _check_format(stream: BinaryIO, where: object) -> None:
             raise RejectedInputError("unreadable", what, where=where, expected="MCAP", got=got, next_step=next_step)
     if not begins.startswith(_MAGIC):
         raise ValueError("another beginning than that of an MCAP file")
-
-
-def check_chunks(path: Path, where: object) -> list[int]:
-    """Offsets of the chunks of the data section, none of which unpacks to more than MAX_CHUNK_BYTES.
-
-    Raises: RejectedInputError: too_large; unreadable for what is no MCAP file, breaks off, or has chunks after its data.
-    """
-    size, chunks, ended = path.stat().st_size, list[int](), False
-    with _damage_as_rejection(where), path.open("rb") as stream:
-        _check_format(stream, where)
-        position = len(_MAGIC)
-        while position < size - len(_MAGIC):
-            stream.seek(position)
-            opcode, length = struct.unpack("<BQ", stream.read(9))
-            if position + 9 + length > size:
-                raise EOFError(f"a record of {length} bytes where {size - position - 9} are left")
-            if opcode == _CHUNK:
-                if ended:
-                    raise ValueError("a chunk behind the end of the data")
-                unpacked = _unpacked_bytes(stream, length)
-                if unpacked > MAX_CHUNK_BYTES:
-                    what = "MCAP chunk is too large"
-                    raise too_large(what, where=where, limit=MAX_CHUNK_BYTES, got=unpacked, unit="bytes")
-                chunks.append(position)
-            ended = ended or opcode == _DATA_END
-            position += 9 + length
-    return chunks
-
-
-def _unpacked_bytes(stream: BinaryIO, length: int) -> int:
-    """Size that the chunk record at the stream's position unpacks to: the larger of its header's and its frame's claim."""
-    *_, declared, _, name_length = struct.unpack("<QQQII", stream.read(32))
-    if name_length > 32:
-        raise ValueError(f"a name of a compression of {name_length} bytes")
-    compression = stream.read(name_length)
-    packed_length = struct.unpack("<Q", stream.read(8))[0]
-    if packed_length > length:
-        raise ValueError(f"a chunk of {packed_length} bytes in a record of {length}")
-    if compression == b"zstd":
-        return max(declared, zstandard.frame_content_size(stream.read(min(packed_length, 32))))  # -1: unknown
-    if compression == b"lz4" and packed_length * _LZ4_RATIO > MAX_CHUNK_BYTES >= declared:
-        # An lz4 frame may unpack to more than it declares; only a frame of this length can unpack to too much.
-        frame = lz4.frame.LZ4FrameDecompressor().decompress(stream.read(packed_length), max_length=MAX_CHUNK_BYTES + 1)
-        return max(declared, len(frame))
-    return declared
 
 
 # Images: read in order of time, each decoded only when an instant needs it.

@@ -25,11 +25,8 @@ from mcap_ros2._vendor.rosidl_adapter.parser import InvalidSpecification, Invali
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
 
 from worldline_core.data.guards.plain_files import parse_json
-from worldline_core.data.guards.rejection import RejectedInputError, check_columns, too_large
+from worldline_core.data.guards.rejection import RejectedInputError, check_columns
 
-_MAX_MESSAGE_BYTES = 1 << 20
-"""One message that holds no image: it becomes objects, up to one per byte, and a megabyte is ten thousand transforms."""
-_MAX_JSON_ITEMS = 200_000
 _EMPTY_ARRAY = re.compile(rb"\[\s*0+\s*\]")
 """A field of a ROS definition that takes no bytes, so that an array of such messages may have any length."""
 
@@ -286,9 +283,6 @@ class MessageDecoder:
         if key not in self._channels:
             self._channels[key] = self._channel(channel, schema)
         kind, decode = self._channels[key]
-        if kind not in IMAGE_KINDS and len(data) > _MAX_MESSAGE_BYTES:
-            what, where = "Message is too large", f"{self._where}, topic {channel.topic}"
-            raise too_large(what, where=where, limit=_MAX_MESSAGE_BYTES, got=len(data), unit="bytes")
         try:
             raw = decode(data)
             stamp_ns, value = _header_time(raw), _READERS[kind](raw)
@@ -320,7 +314,7 @@ class MessageDecoder:
     def _decoder(self, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any] | None:
         where = f"{self._where}, topic {channel.topic}"
         if channel.message_encoding == "json":
-            return lambda data: _as_object(_parsed_json(data, where))
+            return lambda data: _as_object(parse_json(data, where))
         if schema is not None and channel.message_encoding in ("cdr", "protobuf") and not schema.data.strip():
             raise RejectedInputError(
                 "unknown_schema",
@@ -340,10 +334,3 @@ class MessageDecoder:
         except (*_FAULTS, *_SCHEMA_FAULTS) as error:
             what = "Schema definition cannot be read"
             raise RejectedInputError("unknown_schema", what, where=where, got=repr(error)[:200]) from error
-
-
-def _parsed_json(data: bytes, where: str) -> Any:
-    items = sum(data.count(mark) for mark in (b",", b"[", b"{"))
-    if items > _MAX_JSON_ITEMS:
-        raise too_large("Message has too many values", where=where, limit=_MAX_JSON_ITEMS, got=items, unit="values")
-    return parse_json(data, where)
