@@ -346,7 +346,9 @@ class DistillationRun:
         }
         if processes()[0] == 0:
             write_bytes_atomic(log, (work / "metrics.jsonl").read_bytes())
-        save_trained(folder, model, result.average, start=start, lora=config.lora, description=description)
+        save_trained(
+            folder, model, result.average, start=start, lora=config.lora, description=description, towers="generation"
+        )
         wait_for_all()
         return {f"{step}/{name}": value for name, value in result.metrics.items()}
 

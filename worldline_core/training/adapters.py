@@ -10,7 +10,7 @@ import hashlib
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from safetensors.torch import save
@@ -32,7 +32,6 @@ from worldline_core.model.checkpoint import (
 from worldline_core.model.layers import is_action_parameter
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.processes import gathered, processes
 from worldline_core.training.training_config import LoRAConfig, MergeAdapterConfig
@@ -112,7 +111,7 @@ def save_trained(
     start: Path | None,
     lora: LoRAConfig | None,
     description: Mapping[str, Any],
-    config: WorldModelConfig | None = None,
+    towers: Literal["both", "generation"],
 ) -> None:
     """Write the checkpoint of a training (the first process alone writes), and its adapter alone beside it where there is one.
 
@@ -122,9 +121,9 @@ def save_trained(
         average: the trained weights, by their names in ``model``.
         start: the checkpoint that the training began with.
         description: what `save_checkpoint` takes beside weights.
-        config: of the checkpoint, where the model has only a part of its towers.
+        towers: of the checkpoint; ``model`` may have fewer.
     """
-    config = config or model.config
+    config = model.config.model_copy(update={"towers": towers})
     if start is None or (config == model.config and all(one.requires_grad for one in model.parameters())):
         weights = gathered({**model.state_dict(), **average}, CHECKPOINT_DTYPE)
         if processes()[0] == 0:

@@ -9,7 +9,7 @@ The flow-matching objective of Stage I and Stage II, with the relational terms w
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -123,6 +123,7 @@ class FlowMatchingObjective(Objective[Batch]):
         self.action_dropout = action_dropout
         self.relational = relational
         self.sampler_steps = sampler_steps
+        self.encode_text: Callable[[Tensor, Tensor | None], TextContext] = model.encode_text
 
     def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """Loss of one micro-batch and its parts."""
@@ -157,7 +158,7 @@ class FlowMatchingObjective(Objective[Batch]):
         return total, {"flow_matching": flow.item(), **values}
 
     def _text(self, batch: Batch) -> TextContext | None:
-        return None if batch.text_ids is None else self.model.encode_text(batch.text_ids, batch.text_mask)
+        return None if batch.text_ids is None else self.encode_text(batch.text_ids, batch.text_mask)
 
     def end_step(self, values: Mapping[str, float]) -> None:
         """Update the scales of the relational terms with this step's losses."""

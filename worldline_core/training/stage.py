@@ -14,7 +14,6 @@ import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, NativeVectors
@@ -32,6 +31,7 @@ from worldline_core.training.trainer import ParameterGroup, Probe, TrainingResul
 from worldline_core.training.training_config import (
     ActionFollowingConfig,
     LossWeighting,
+    Stage1Config,
     Stage2Config,
     StageConfig,
     TrainerConfig,
@@ -86,12 +86,8 @@ class Stage:
         trainer = config.trainer
         device = trainer.device
         join_processes(device)
-        require_one_process(trainer, {"lora": config.lora is not None})
-        if config.lora is not None and parent is None:
-            raise ConfigError(
-                "LoRA adapts a model that exists", where=f"{title}: lora", expected="a checkpoint to start from",
-                got="none", next_step="give --input base=FOLDER, or leave lora out",
-            )  # fmt: skip
+        trains_text = not isinstance(config, Stage1Config) or config.text_tower == "trained"
+        require_one_process(trainer, {"lora": config.lora is not None, "text_tower": not trains_text})
         torch.manual_seed(trainer.seed)
         model, info = load_model()
         if config.lora is not None:
@@ -206,8 +202,13 @@ class Stage:
         kind: Literal["base", "stage1", "stage2"],
         action_contract: ActionContract | None,
         facts: Mapping[str, Any],
+        towers: Literal["both", "generation"] | None = None,
     ) -> dict[str, Any]:
-        """Gather and write the averaged weights (the first process alone writes) and return the counts of the run."""
+        """Gather and write the averaged weights (the first process alone writes) and return the counts of the run.
+
+        Args:
+            towers: of the checkpoint, where it has more than the model that was trained.
+        """
         trainer = self.config.trainer
         description: dict[str, Any] = {
             "kind": kind,
@@ -226,7 +227,8 @@ class Stage:
             },
         }
         save_trained(
-            self.output, self.model, result.average, start=self.parent, lora=self.config.lora, description=description
+            self.output, self.model, result.average, start=self.parent, lora=self.config.lora, description=description,
+            towers=towers or self.model.config.towers,
         )  # fmt: skip
         clips = result.steps * trainer.batch_size * self.plan.per_step
         found, fit, kept = len(self.episodes), len(self.rows), len(self.training_rows)

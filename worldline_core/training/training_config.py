@@ -216,13 +216,26 @@ class StageConfig(StrictModel):
 
 
 class Stage1Config(StageConfig):
-    """``model`` describes a model that starts from scratch; with the input ``base``, that checkpoint's own is used."""
+    """``model`` describes a model that starts from scratch; with the input ``base``, that checkpoint's own is used.
+
+    ``text_tower``: "frozen" leaves it as it is in ``base``; so does "stored", which keeps its keys and values of every prompt in the
+    machine's memory instead of it (for few prompts).
+    """
 
     kind: Literal["base", "stage1"] = "stage1"
     model: NetworkConfig = Field(default_factory=lambda: MixtureConfig.model_validate({}))
     clips: ClipSampling = ClipSampling(view_weights={"primary": 1.0})
     text: TextConfig = TextConfig()
     text_dropout: float = Field(default=0.1, ge=0, le=1)
+    text_tower: Literal["trained", "frozen", "stored"] = "trained"
+
+    @model_validator(mode="after")
+    def _adapters_leave_the_text(self) -> Self:
+        if self.lora is not None and self.text_tower == "trained":
+            raise ValueError(
+                "lora adapts the video tower: set text_tower to frozen, or to stored where prompts are few"
+            )
+        return self
 
     def weights_read(self) -> Mapping[str, Path | None]:
         return self.text.files_read()
