@@ -32,7 +32,7 @@ from worldline_core.data.curation.rules import find_near_duplicates
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.fingerprint import Fingerprint, fingerprint
-from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.episodes.view_recording import ViewImages
 from worldline_core.data.video.clip import VideoClip, decode_video
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.filters.filter import filter_episodes
@@ -116,7 +116,7 @@ def make_corpus(folder: Path, episodes: int, seconds: float, crf: int) -> None:
                 path = clips / f"{number}.{view}.mp4"
                 write_clip(path, recordings.frames(source, view), at, crf, 10 * number + k)
                 clip = VideoClip.whole_file(path, count, FPS)
-                views[view] = RecordedView(lambda: iter(()), count, clip)
+                views[view] = ViewImages(lambda: iter(()), count, clip)
             writer.add(episode, views)
             for view in views:
                 (clips / f"{number}.{view}.mp4").unlink()

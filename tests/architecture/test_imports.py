@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -49,3 +50,12 @@ def test_the_core_needs_neither_prefect_nor_what_is_above_it(imports: dict[str, 
     assert any("prefect" in libraries for libraries in imports.values())
     found = {module: {name for name in imported if name.split(".")[0] in above} for module, imported in imports.items()}
     assert {module: names for module, names in found.items() if names and module.startswith("worldline_core")} == {}
+
+
+def test_a_public_class_has_a_name_of_its_own(project_root: Path) -> None:
+    places: dict[str, list[str]] = defaultdict(list)
+    for package in PACKAGES:
+        for path in (project_root / package).rglob("*.py"):
+            for name in re.findall(r"^class ([A-Z]\w*)", path.read_text(), re.MULTILINE):
+                places[name].append(str(path))
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}

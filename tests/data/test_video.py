@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.data.curating import packets, plain_frames, write_video
-from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, copy_clip, store_view
+from worldline_core.data.episodes.view_recording import VideoSettings, ViewImages, copy_clip, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import (
     FrameDecoder,
@@ -223,7 +223,7 @@ def test_damaged_packets_are_not_copied_silently(recorded: Recorded, tmp_path: P
     with pytest.raises(RejectedInputError, match=r"damaged|truncated") as caught:
         copied(clip, tmp_path / "copy.mp4")
     assert caught.value.reason == "truncated_video"
-    encoded = RecordedView(lambda: iter(()), COUNT, clip, image_size=(32, 48))
+    encoded = ViewImages(lambda: iter(()), COUNT, clip, image_size=(32, 48))
     with pytest.raises(RejectedInputError, match=r"damaged|truncated") as caught:
         store_view(encoded, tmp_path / "encoded.mp4", FPS, VideoSettings(preset="ultrafast"))
     assert caught.value.reason == "truncated_video"

@@ -18,7 +18,7 @@ from tests.data.curating import files_of, packets, run, write_video
 from tools.labelled_clips import view_thumbnails
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.source import LoadedEpisode
-from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, recorded_size, store_view
+from worldline_core.data.episodes.view_recording import VideoSettings, ViewImages, recorded_size, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.thumbnails import ThumbnailMaker, shrunk
@@ -37,7 +37,7 @@ def recordings(folder: Path, count: int) -> dict[str, Any]:
             views = {}
             for view, images in frames.items():
                 path = write_video(folder / f"{number}.{view}.mp4", images, options={"crf": "20"})
-                views[view] = RecordedView(lambda: iter(()), FRAMES, VideoClip.whole_file(path, FRAMES, 8.0))
+                views[view] = ViewImages(lambda: iter(()), FRAMES, VideoClip.whole_file(path, FRAMES, 8.0))
             writer.add(episode, views)
     return {"kind": "episode_set", "path": str(folder / "raw")}
 
@@ -211,12 +211,12 @@ def test_too_few_or_too_many_images_are_refused(tmp_path: Path) -> None:
     _, frames, _ = make_sample(0)
     images = frames["head"]
     for count in (len(images) - 1, len(images) + 1):
-        recorded = RecordedView(lambda: iter(images), count)
+        recorded = ViewImages(lambda: iter(images), count)
         with pytest.raises(RejectedInputError, match=rf"(?s)differ in length.*expected: {count} frames") as caught:
             store_view(recorded, tmp_path / "v.mp4", 8.0, VideoSettings())
         assert caught.value.reason == "length_mismatch"
     with pytest.raises(RejectedInputError, match=r"no pictures|differ in length"):
-        store_view(RecordedView(lambda: iter(()), 3), tmp_path / "v.mp4", 8.0, VideoSettings())
+        store_view(ViewImages(lambda: iter(()), 3), tmp_path / "v.mp4", 8.0, VideoSettings())
 
 
 def test_a_source_without_clips_gives_its_images_one_by_one() -> None:

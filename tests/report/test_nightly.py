@@ -18,7 +18,7 @@ from worldline_core.evaluation.scores import Interval, Score, summarise, write_s
 from worldline_core.report import comparison
 from worldline_core.report.comparison import (
     REFERENCE_NIGHTS,
-    Change,
+    MetricChange,
     accept_night,
     compare_with_history,
     night_tests,
@@ -55,7 +55,7 @@ def scores(
     [("ssim", 0.9, "better"), ("ssim", 0.45, "same"), ("ssim", 0.2, "worse"), ("lpips", 0.9, "worse"), ("lpips", 0.2, "better")],
 )  # fmt: skip
 def test_verdicts(metric: str, mean: float, expected: str) -> None:
-    assert Change(metric, Interval(mean, mean, mean, 9), Interval(0.5, 0.4, 0.6, 9)).verdict == expected
+    assert MetricChange(metric, Interval(mean, mean, mean, 9), Interval(0.5, 0.4, 0.6, 9)).verdict == expected
 
 
 def test_a_regression_stays_one_until_it_is_repaired_or_accepted(tmp_path: Path) -> None:

@@ -17,9 +17,9 @@ import numpy as np
 from worldline_core.calibration.observation import (
     CELL_PX,
     LONGEST_STEP_PX,
-    Arm,
     Motion,
     Observation,
+    ObservedArm,
     Reading,
     cell_centres,
     predict_motion,
@@ -127,7 +127,7 @@ def _quadratic(*ratios: float) -> float:
     return max(WORST_TERM, -0.5 * float(sum(ratio**2 for ratio in ratios)))
 
 
-def _wrist(reading: Reading, camera: CameraTrack, i: int, arm: Arm) -> dict[str, float]:
+def _wrist(reading: Reading, camera: CameraTrack, i: int, arm: ObservedArm) -> dict[str, float]:
     view = camera.view
     poses = camera.poses(np.arange(len(reading.tools)))
     mount, metres, degrees = rms_hand_eye(reading.tools[:, i], poses)

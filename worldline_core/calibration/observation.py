@@ -42,7 +42,7 @@ _SUBCELL = 2**_SUBCELL_BITS
 
 
 @dataclass(frozen=True)
-class Arm:
+class ObservedArm:
     """One arm; `T_tool_mount` is its wrist camera's pose in the tool frame, None if unknown."""
 
     name: str
@@ -93,7 +93,7 @@ class Observation:
 
     episode: Episode
     gray: Mapping[str, np.ndarray]
-    arms: tuple[Arm, ...]
+    arms: tuple[ObservedArm, ...]
     kinematics: ArmKinematics | None
     _motion: dict[str, Motion] = field(default_factory=dict, repr=False)
     _stands: dict[str, bool] = field(default_factory=dict, repr=False)
@@ -208,12 +208,12 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.maximum(a, b) - np.minimum(a, b)
 
 
-def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ...]:
+def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[ObservedArm, ...]:
     """The arms of the embodiment; without kinematics, those of the recorded tool poses under the usual names."""
     if kinematics is None:
         count = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
         names = {1: ("right",), 2: ("left", "right")}.get(count, tuple(f"arm_{i}" for i in range(count)))
-        return tuple(Arm(name, f"{name}_wrist", None) for name in names)
+        return tuple(ObservedArm(name, f"{name}_wrist", None) for name in names)
     arms = arms_of_embodiment(kinematics)
     if episode.T_base_ee is not None and episode.T_base_ee.shape[1] != len(arms):
         raise DataError(
@@ -225,7 +225,7 @@ def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ..
     return arms
 
 
-def arms_of_embodiment(kinematics: ArmKinematics) -> tuple[Arm, ...]:
+def arms_of_embodiment(kinematics: ArmKinematics) -> tuple[ObservedArm, ...]:
     """The arms of a robot, and where its description mounts their cameras."""
     arms = []
     for arm in kinematics.embodiment.arms:
@@ -233,7 +233,7 @@ def arms_of_embodiment(kinematics: ArmKinematics) -> tuple[Arm, ...]:
         if camera is not None and camera.link == arm.end_effector_link:
             T_tool_link = np.linalg.inv(arm.T_link_tool.matrix())
             mount = T_tool_link @ np.asarray(camera.T_link_camera, dtype=np.float64)
-        arms.append(Arm(arm.name, arm.camera_view, mount))
+        arms.append(ObservedArm(arm.name, arm.camera_view, mount))
     return tuple(arms)
 
 

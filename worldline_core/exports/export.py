@@ -19,7 +19,7 @@ from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.episodes.recorded_poses import with_rigid_poses
-from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.episodes.view_recording import ViewImages
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.lerobot.dataset import LeRobotV3Dataset
 from worldline_core.data.mcap.exported import Encoding, write_episode_mcap, write_rollout_mcap
@@ -156,7 +156,7 @@ def _export_lerobot(episodes: EpisodeSet, output: Path, positions: Sequence[int]
             if writer.has(row.episode_id):
                 continue
             views = {
-                view: RecordedView(lambda clip=clip: iter(VideoFrames(clip)), row.video_frames, clip)
+                view: ViewImages(lambda clip=clip: iter(VideoFrames(clip)), row.video_frames, clip)
                 for view in row.views
                 for clip in (episodes.clip(position, view),)
             }

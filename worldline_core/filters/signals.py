@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from worldline_core.calibration.observation import Arm, arms_of
+from worldline_core.calibration.observation import ObservedArm, arms_of
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import UnavailableError
@@ -138,7 +138,7 @@ class Signals:
     joints: np.ndarray | None
     commands: np.ndarray | None
     T_base_tool: np.ndarray | None
-    arms: tuple[Arm, ...]
+    arms: tuple[ObservedArm, ...]
 
     @property
     def primary_view(self) -> str:
@@ -199,7 +199,7 @@ def measure(episode: Episode, thumbnails: Mapping[str, ViewThumbnails]) -> Signa
     )
 
 
-def tool_poses(episode: Episode) -> tuple[np.ndarray | None, tuple[Arm, ...]]:
+def tool_poses(episode: Episode) -> tuple[np.ndarray | None, tuple[ObservedArm, ...]]:
     """T_base_tool (N, A, 4, 4): as recorded, else from the embodiment's kinematics, else None; and the arms."""
     if episode.T_base_ee is not None:
         return episode.T_base_ee, arms_of(episode, None)

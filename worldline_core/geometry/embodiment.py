@@ -95,14 +95,14 @@ class Gripper(StrictModel):
 _MOUNT_TOLERANCE = 1.1e-4  # largest entry of |R R^T - I| of a wrist camera's mount
 
 
-class WristCamera(StrictModel):
+class WristMount(StrictModel):
     """Mount of an arm's camera; `T_link_camera` maps camera points (OpenCV axes) to the link."""
 
     link: str
     T_link_camera: tuple[tuple[float, ...], ...]
 
     @model_validator(mode="after")
-    def _rigid(self) -> WristCamera:
+    def _rigid(self) -> WristMount:
         if [len(row) for row in self.T_link_camera] != [4] * 4:
             raise ValueError("T_link_camera is not a 4x4 matrix")
         T = np.asarray(self.T_link_camera, dtype=np.float64)
@@ -120,7 +120,7 @@ class Arm(StrictModel):
     end_effector_link: str
     T_link_tool: RigidOffset = RigidOffset()
     gripper: Gripper = Gripper()
-    wrist_camera: WristCamera | None = None
+    wrist_camera: WristMount | None = None
     link_radius: float = Field(0.05, gt=0, lt=1)
     hand_radius: float | None = Field(None, gt=0, lt=1, description="default: gripper_radius")
     gripper_radius: float = Field(0.04, gt=0, lt=1)

@@ -236,7 +236,7 @@ class Night(StrictModel):
 
 
 @dataclass(frozen=True)
-class Change:
+class MetricChange:
     """One metric beside the last good night; None where one of the two did not measure it.
 
     ``test`` is None for metrics of too few recordings; their mean is compared with the interval of the good night.
@@ -295,11 +295,11 @@ class NightlyComparison:
 
     night: str
     previous: str | None
-    changes: Sequence[Change]
+    changes: Sequence[MetricChange]
     pictures: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def worse(self) -> list[Change]:
+    def worse(self) -> list[MetricChange]:
         """Metrics that became worse or are no longer measured."""
         return [change for change in self.changes if change.verdict in ("worse", "missing")]
 
@@ -355,7 +355,7 @@ def _compare(present: Night, earlier: Sequence[Night], history: Path) -> Nightly
     series = [read_series(scores_file(history, night.night)) for night in [*good[-REFERENCE_NIGHTS:], present]]
     tests = night_tests(series[-1], series[:-1])
     names = sorted({*present.metrics, *before})
-    changes = [Change(name, present.metrics.get(name), before.get(name), tests.get(name)) for name in names]
+    changes = [MetricChange(name, present.metrics.get(name), before.get(name), tests.get(name)) for name in names]
     return NightlyComparison(present.night, good[-1].night if good else None, changes)
 
 

@@ -29,7 +29,7 @@ from starlette.websockets import WebSocketDisconnect
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
-from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.episodes.view_recording import ViewImages
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.errors import DataError, UnavailableError, WorldLineError
@@ -437,6 +437,6 @@ def save_played(
         conventions={"pictures": "predicted", "started_at": recorded.episode_id, **notes},
     )  # fmt: skip
     with EpisodeSetWriter(folder / name, pixel_format="yuv444p", video_preset="veryfast") as writer:
-        views = {view: RecordedView(pictures.__iter__, len(pictures)) for view, pictures in frames.items()}
+        views = {view: ViewImages(pictures.__iter__, len(pictures)) for view, pictures in frames.items()}
         writer.add(episode, views)
     return folder / name

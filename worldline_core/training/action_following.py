@@ -50,7 +50,7 @@ STARTS = 4
 """Clips of an episode that are looked at; more where few episodes are held out."""
 
 
-class Predictor(Protocol):
+class ClipPredictor(Protocol):
     """Predicts a batch's latents from its first frames: the objective that trains the model."""
 
     def predict(
@@ -77,7 +77,7 @@ class ActionFollowing:
     def __init__(
         self,
         config: ActionFollowingConfig,
-        predictor: Predictor,
+        predictor: ClipPredictor,
         loader: ClipLoader,
         rows: Sequence[ClipRow],
         episodes: EpisodeSet,

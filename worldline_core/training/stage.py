@@ -18,7 +18,7 @@ from worldline_core.model.checkpoint import CheckpointInfo
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, NativeVectors
 from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.training.action_following import ActionFollowing, Predictor
+from worldline_core.training.action_following import ActionFollowing, ClipPredictor
 from worldline_core.training.adapters import add_adapters, save_trained, say_price
 from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader, ObjectWeights
@@ -256,7 +256,7 @@ def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str
     return facts
 
 
-class MeasuredObjective(Predictor, Protocol):
+class MeasuredObjective(ClipPredictor, Protocol):
     """An objective that can be measured on held-out clips."""
 
     def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]: ...

@@ -100,7 +100,7 @@ def curate(
     }
 
 
-def _quarantine_duplicates_and_leaks(work: CurateWork, listed: Sequence[Sequence[ListedEpisode]]) -> None:
+def _quarantine_duplicates_and_leaks(work: CurateWork, listed: Sequence[Sequence[SourceEpisode]]) -> None:
     """Quarantine what the rules over the whole set reject.
 
     Raises: DataError when a scene is both learnt from and tested on.
@@ -113,7 +113,7 @@ def _quarantine_duplicates_and_leaks(work: CurateWork, listed: Sequence[Sequence
 
 
 @dataclass(frozen=True)
-class ListedEpisode:
+class SourceEpisode:
     """One episode that a source lists.
 
     Attributes:
@@ -130,7 +130,7 @@ class ListedEpisode:
 
 
 @dataclass(frozen=True)
-class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
+class CurateWork(EpisodeWork[SourceEpisode, InputRow]):
     """Keeps or quarantines listed episodes.
 
     Attributes:
@@ -170,34 +170,34 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         """Name of a source in quarantine rows."""
         return self.config.sources[source].label
 
-    def listed_episodes(self) -> list[list[ListedEpisode]]:
+    def listed_episodes(self) -> list[list[SourceEpisode]]:
         """Episodes that each source lists, in its order, under ids that are unique in the set.
 
         Raises: DataError for a source that lists nothing.
         """
-        listed: list[list[ListedEpisode]] = []
+        listed: list[list[SourceEpisode]] = []
         seen: set[str] = set()
         for number in range(len(self.config.sources)):
-            episodes: list[ListedEpisode] = []
+            episodes: list[SourceEpisode] = []
             for listed_id in read_limited(self.config.reader, _episode_ids, self, number):
                 repeated = listed_id in seen
                 identity = unique_identity(listed_id, number, seen)
                 seen |= {identity, listed_id}
-                episodes.append(ListedEpisode(number, identity, listed_id, repeated))
+                episodes.append(SourceEpisode(number, identity, listed_id, repeated))
             listed.append(episodes)
         return listed
 
-    def remaining(self, number: int, episodes: Sequence[ListedEpisode]) -> list[ListedEpisode]:
+    def remaining(self, number: int, episodes: Sequence[SourceEpisode]) -> list[SourceEpisode]:
         del number
         return [episode for episode in episodes if not self.writer.has(episode.identity)]
 
-    def do(self, episode: ListedEpisode) -> InputRow:
+    def do(self, episode: SourceEpisode) -> InputRow:
         try:
             return read_limited(self.config.reader, _process, self, episode)
         except RejectedInputError as error:
             return self._quarantine(episode, error.reason, str(error), error.evidence)
 
-    def process(self, episode: ListedEpisode) -> InputRow:
+    def process(self, episode: SourceEpisode) -> InputRow:
         """Keep or quarantine an episode; called in a reader process.
 
         Raises: RejectedInputError (out_of_memory), MemoryError; UnreachableInputError; errors that end the run.
@@ -222,7 +222,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
                     return self.quarantine_crashed(episode, detail, crash_evidence(error))
         return self.row(episode.identity)
 
-    def _keep(self, episode: ListedEpisode) -> None:
+    def _keep(self, episode: SourceEpisode) -> None:
         """Raises: DataError (RejectedInputError, CalibrationError) for an episode that does not get through."""
         label = self.label(episode.source)
         if episode.repeated:
@@ -236,10 +236,10 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
             check_episode(own, loaded)
             self.writer.add(*prepare_episode(own, loaded))
 
-    def quarantine_crashed(self, episode: ListedEpisode, detail: str, evidence: Mapping[str, Any]) -> InputRow:
+    def quarantine_crashed(self, episode: SourceEpisode, detail: str, evidence: Mapping[str, Any]) -> InputRow:
         return self._quarantine(episode, "crashed", detail, evidence)
 
-    def _quarantine(self, episode: ListedEpisode, reason: str, detail: str, evidence: Mapping[str, Any]) -> InputRow:
+    def _quarantine(self, episode: SourceEpisode, reason: str, detail: str, evidence: Mapping[str, Any]) -> InputRow:
         self.writer.discard(episode.identity)  # written from files that changed meanwhile
         label, root = self.label(episode.source), parse_location(self.roots[episode.source])
         self.writer.quarantine(episode.identity, label, reason, visible(portable_text(detail, root, label)), evidence)
@@ -278,6 +278,6 @@ def _episode_ids(work: CurateWork, source: int) -> list[str]:
     return _kept_open(work).source(source).episode_ids()
 
 
-def _process(work: CurateWork, episode: ListedEpisode) -> InputRow:
+def _process(work: CurateWork, episode: SourceEpisode) -> InputRow:
     with helper_lock(work.output):
         return _kept_open(work).process(episode)

@@ -16,7 +16,7 @@ from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits
 from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode, Split
 from worldline_core.data.episodes.instructions import with_instruction
 from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, LoadedEpisode, Masks, says_droid
-from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.episodes.view_recording import ViewImages
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import frame_times
 from worldline_core.data.video.frames import Frames, MadeFrames
@@ -70,7 +70,7 @@ def prepare_episode(
     config: CurateConfig, loaded: LoadedEpisode
 ) -> tuple[
     Episode,
-    dict[str, RecordedView],
+    dict[str, ViewImages],
     dict[str, Frames],
     Callable[[Mapping[str, ViewThumbnails]], Episode],
     dict[str, Frames],
@@ -97,7 +97,7 @@ def prepare_episode(
             got=episode.num_frames,
         )
     frames = {
-        view: RecordedView(
+        view: ViewImages(
             partial(loaded.each_image, view),
             recorded.num_video_frames,
             loaded.clips.get(view),

@@ -44,9 +44,9 @@ from worldline_core.data.episodes.lerobot_writer import EpisodeVideo, write_data
 from worldline_core.data.episodes.sidecar import Packed, write_sidecar
 from worldline_core.data.episodes.view_recording import (
     RECORDED_SIZE,
-    RecordedView,
     VideoMode,
     VideoSettings,
+    ViewImages,
     recorded_size,
     store_view,
 )
@@ -179,7 +179,7 @@ class EpisodeSetWriter:
     def add(
         self,
         episode: Episode,
-        frames: Mapping[str, np.ndarray | RecordedView],
+        frames: Mapping[str, np.ndarray | ViewImages],
         robot_masks: Mapping[str, Frames] | None = None,
         described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None = None,
         thing_labels: Mapping[str, Frames] | None = None,
@@ -200,12 +200,12 @@ class EpisodeSetWriter:
         if not frames:
             raise DataError("Episode has no images", where=where, expected="at least one view", got="none")
         safe_name(episode.embodiment, "Embodiment")
-        views: dict[str, RecordedView] = {}
+        views: dict[str, ViewImages] = {}
         for view, images in frames.items():
             safe_name(view, "View")
             if isinstance(images, np.ndarray):
                 _check_images(images, episode, f"{where}, view {view}")
-            views[view] = RecordedView.of(images) if isinstance(images, np.ndarray) else images
+            views[view] = ViewImages.of(images) if isinstance(images, np.ndarray) else images
         robot_masks, thing_labels = robot_masks or {}, thing_labels or {}
         final = self._parts / part_name(episode.episode_id)
         # Not by the process id, which the containers that share a store have in common.

@@ -51,7 +51,7 @@ class VideoSettings(Encoding):
 
 
 @dataclass(frozen=True)
-class RecordedView:
+class ViewImages:
     """The pictures of one view as they were recorded, and how they are stored.
 
     Attributes:
@@ -72,7 +72,7 @@ class RecordedView:
     calibrated: bool = False
 
     @classmethod
-    def of(cls, frames: np.ndarray) -> RecordedView:
+    def of(cls, frames: np.ndarray) -> ViewImages:
         """A recording of pictures in memory, uint8 (N, H, W, 3), kept as they are."""
         return cls(lambda: iter(frames), len(frames))
 
@@ -97,7 +97,7 @@ def recorded_size(conventions: Mapping[str, object], view: str) -> tuple[int, in
 
 
 def store_view(
-    recorded: RecordedView, path: Path, fps: float, video: VideoSettings, enlarged_from: tuple[int, int] | None = None
+    recorded: ViewImages, path: Path, fps: float, video: VideoSettings, enlarged_from: tuple[int, int] | None = None
 ) -> tuple[EpisodeVideo, ViewThumbnails, tuple[int, int]]:
     """Write a view's video to `path`, beside it the thumbnails of a video that was copied.
 
@@ -131,7 +131,7 @@ type _Format = tuple[ImageTransform, str, str]
 
 
 def _copied(
-    recorded: RecordedView, path: Path, fps: float, small: ThumbnailMaker, sampler: ImageSampler
+    recorded: ViewImages, path: Path, fps: float, small: ThumbnailMaker, sampler: ImageSampler
 ) -> _Format | None:
     if recorded.clip is None or recorded.step != 1:
         return None
@@ -153,7 +153,7 @@ def _copied(
 
 
 def _encoded(
-    recorded: RecordedView, path: Path, fps: float, video: VideoSettings, small: ThumbnailMaker, sampler: ImageSampler
+    recorded: ViewImages, path: Path, fps: float, video: VideoSettings, small: ThumbnailMaker, sampler: ImageSampler
 ) -> _Format:
     encoder: VideoEncoder | None = None
     transform = None
@@ -191,7 +191,7 @@ def _check_even_sides(size: tuple[int, int], pixel_format: str, view: str) -> No
         )
 
 
-def _pictures(recorded: RecordedView) -> Iterator[tuple[np.ndarray, bool, Callable[[], np.ndarray]]]:
+def _pictures(recorded: ViewImages) -> Iterator[tuple[np.ndarray, bool, Callable[[], np.ndarray]]]:
     """Luma (H, W), whether it has the full range, and the picture in colour, which costs only when it is called."""
     if recorded.clip is not None:
         for number, picture in enumerate(read_clip(recorded.clip, calibrated=recorded.calibrated)):

@@ -38,13 +38,13 @@ class TopicReadings(StrictModel):
         return len(self.names if self.names is not None else self.columns or ())
 
 
-class JointReadings(TopicReadings):
+class JointTopic(TopicReadings):
     """The joints of an arm, in the order of the embodiment."""
 
     unit: Literal["rad", "deg"] = "rad"
 
 
-class GripperReadings(TopicReadings):
+class GripperTopic(TopicReadings):
     """The gripper of an arm; several numbers (two fingers) are averaged."""
 
     range: GripperRange = Field(description="what the readings are when the gripper is closed and when it is open")
@@ -53,8 +53,8 @@ class GripperReadings(TopicReadings):
 class ArmReadings(StrictModel):
     """Joints and gripper of one arm, measured or commanded."""
 
-    joints: JointReadings
-    gripper: GripperReadings
+    joints: JointTopic
+    gripper: GripperTopic
 
 
 class ArmTopics(StrictModel):

@@ -110,7 +110,7 @@ class ArmTrack(StrictModel):
     gripper: GripperColumn | None = None
 
 
-class ArmColumns(StrictModel):
+class ArmTracks(StrictModel):
     """One arm; without `action` the action repeats the state."""
 
     name: Literal["left", "right"]
@@ -136,7 +136,7 @@ class LeRobotSourceConfig(ForeignSourceConfig):
     grippers: dict[str, GripperRange] = Field(
         default={}, description="state column -> its readings when closed and open; without `arms`"
     )
-    arms: tuple[ArmColumns, ...] | None = Field(
+    arms: tuple[ArmTracks, ...] | None = Field(
         default=None, min_length=1, description="left, right: columns of joints and grippers; null: the whole state"
     )
     collection: bool = Field(default=False, description="read every dataset below the folder")

@@ -102,7 +102,7 @@ def _text(value: float | None) -> str:
     return "(not visible)" if value is None else f"{value:.2f}"
 
 
-class Measurement(Protocol):
+class MeasuredEffect(Protocol):
     """A measured effect."""
 
     def score(self, unseen: float = UNSEEN_SCORE) -> float:
@@ -344,7 +344,7 @@ def measure(
     family: EvidenceFamily,
     frames: Mapping[str, NDArray[Any]],
     points: NDArray[Any] | None,
-) -> Measurement | None:
+) -> MeasuredEffect | None:
     """Measure the family's facts on chosen frames (n, h, w, 3) of each view.
 
     None without a head view, for an instruction that names nothing by its colour, or for an effect that cannot be measured (holding,
@@ -386,7 +386,7 @@ def soft_score(segmenter: Segmenter, trajectory: Trajectory) -> tuple[float, dic
     return measured.score(unseen=0.0), {n: math.nan if v is None else float(v) for n, v in vars(measured).items()}
 
 
-def facts(measured: Measurement | None, instruction: str, family: EvidenceFamily) -> Evidence:
+def facts(measured: MeasuredEffect | None, instruction: str, family: EvidenceFamily) -> Evidence:
     """The family's evidence from a measurement; null without one."""
     if measured is None:
         return SCHEMAS[family](observations="nothing in the instruction can be followed by its colour")

@@ -138,13 +138,13 @@ def assess_trust(
     setups = KnownRecordings.of(map(setup_vectors, filter(_has_head_camera, training)), config.novelty_level)
     rows = read_rows(folder / DECISIONS_FILE)
     predicted = [row for row in rows if row["method"] != TRUE_METHOD]
-    news: dict[str, dict[str, float | None]] = defaultdict(lambda: {"new_controls": None, "new_setup": None})
+    novelties: dict[str, dict[str, float | None]] = defaultdict(lambda: {"new_controls": None, "new_setup": None})
     for name in {row["episode_id"] for row in predicted if row["episode_id"] in tracks}:
         found = tracks.tracks(name)
-        news[name]["new_controls"] = controls.novelty(*control_vectors(found))
+        novelties[name]["new_controls"] = controls.novelty(*control_vectors(found))
         if _has_head_camera(found):
-            news[name]["new_setup"] = setups.novelty(*setup_vectors(found))
-    predicted = [{**row, **news[row["episode_id"]]} for row in predicted]
+            novelties[name]["new_setup"] = setups.novelty(*setup_vectors(found))
+    predicted = [{**row, **novelties[row["episode_id"]]} for row in predicted]
     trusted, methods = trust_verdicts(predicted, config, resamples=resamples, seed=seed)
     trusted += [{**dict.fromkeys(TRUST_COLUMNS), **row} for row in rows if row["method"] == TRUE_METHOD]
     trusted.sort(key=lambda row: (row["method"], row["episode_id"], row["seed"]))
