@@ -104,7 +104,7 @@ def write_latents(root, count, validation, frames=FRAMES):
     save_file(tensors, root / "00000.safetensors")
     pq.write_table(pa.Table.from_pylist(rows), root / "index.parquet")
     description = {
-        "layout": "groups", "start_step": 4, "strides": [1], "latent_shape": [CHANNELS, *GRID],
+        "layout": "groups", "start_step": 4, "clip_frames": None, "strides": [1], "latent_shape": [CHANNELS, *GRID],
         "image_size": list(IMAGE), "tokenizer": "synthetic",
     }  # fmt: skip
     (root / "store.json").write_text(json.dumps(description))

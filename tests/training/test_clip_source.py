@@ -11,14 +11,16 @@ from einops import rearrange
 from safetensors.torch import load_file, save_file
 
 from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.config import read_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import frames_to_video
-from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput, LatentInput
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler, latent_frame_count, longest_clip
 from worldline_core.training.clip_source import FrameSource, LatentRow, LatentStore, ResidentLatents, training_rows
-from worldline_core.training.encode_latents import choose_layout, encode_episode, encode_latents
+from worldline_core.training.encode_latents import choose_layout, encode_episode, encode_latents, stored_latent_frames
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 
@@ -45,23 +47,32 @@ def read(source, clip, views=VIEWS):
 
 @pytest.mark.parametrize("stride", [1, 2])
 @pytest.mark.parametrize("start_step", [2, 3, 4])
-@pytest.mark.parametrize("tokenizer", [Memoryless(), Remembering()])
-def test_a_clip_of_the_store_equals_direct_encoding(tmp_path, tokenizer, start_step, stride):
+@pytest.mark.parametrize(
+    ("tokenizer", "clip_frames"), [(Memoryless(), None), (Remembering(), None), (Remembering(), 13)]
+)
+def test_a_clip_of_the_store_equals_direct_encoding(tmp_path, tokenizer, clip_frames, start_step, stride):
     # White and black, -1 and 1, whose sums are exact.
     generator = torch.Generator().manual_seed(0)
     video = 255 * torch.randint(0, 2, (2, 3, 30, 2, 2), generator=generator, dtype=torch.uint8)
-    config = EncodeLatentsConfig(start_step=start_step, strides=(stride,), views=("a", "b"))
+    config = EncodeLatentsConfig(start_step=start_step, strides=(stride,), views=("a", "b"), clip_frames=clip_frames)
     layout = choose_layout(tokenizer, video[0], config)
     assert layout == ("clips" if isinstance(tokenizer, Remembering) else "groups")
-    save_file(encode_episode(tokenizer, "e", list(video), layout, config), tmp_path / "s.safetensors")
+    tensors = encode_episode(tokenizer, "e", list(video), layout, config)
+    assert sum(tensor.shape[2] for tensor in tensors.values()) == stored_latent_frames(30, layout, config)
+    save_file(tensors, tmp_path / "s.safetensors")
     video = video / 127.5 - 1
     row = LatentRow("e", 30, ("a", "b"), "s", "r", "train", "", "a", "s.safetensors")
     description = {"layout": layout, "start_step": start_step, "strides": [stride], "latent_shape": [3, 2, 2]}
-    store = LatentStore(tmp_path, description | {"image_size": [2, 2]}, [row])
+    description |= {"image_size": [2, 2], "clip_frames": clip_frames}
+    store = LatentStore(tmp_path, description, [row])
     resident = ResidentLatents(store, "cpu")
     checked = 0
     for start in range(0, 30, start_step):
-        for length in range(1, longest_clip(row.num_frames, start, stride) + 1, 4):
+        longest = longest_clip(row.num_frames, start, stride)
+        if clip_frames and longest > clip_frames:
+            with pytest.raises(DataError, match="does not fit the stored latents"):
+                read(store, Clip("e", start, longest, stride), ("a",))
+        for length in range(1, min(longest, clip_frames or longest) + 1, 4):
             clip = Clip("e", start, length, stride)
             expected = tokenizer.encode(video[:, :, list(clip.frames)])
             assert np.array_equal(read(store, clip, ("a", "b")), expected)
@@ -69,6 +80,19 @@ def test_a_clip_of_the_store_equals_direct_encoding(tmp_path, tokenizer, start_s
             assert torch.equal(resident.latents(numbers[None], "cpu")[0], expected[[1, 0]])
             checked += 1
     assert checked > 15
+
+
+def test_clips_longer_than_those_encoded_are_refused_before_training(world):
+    store = LatentStore.open(world.latents)
+    store.clip_frames = 13
+    sampler = ClipSampler(
+        store.rows, ClipSampling(lengths=(9, 17)), views=VIEWS, splits=["train"], start_step=4, batch_size=1, seed=0
+    )
+    with pytest.raises(ConfigError, match=r"clips.lengths[\s\S]*encode_latents.clip_frames to 17"):
+        ClipLoader(store, views=VIEWS).batches(sampler, LatentInput())
+    section = {"encode_latents": {"clip_frames": 29}}
+    with pytest.raises(ValueError, match=r"train_stage1.clips.lengths: 33 frames, encode_latents.clip_frames: 29"):
+        PipelineConfig.model_validate(read_config("tiny", None) | section)
 
 
 def test_resident_batches_are_those_of_the_store(world):

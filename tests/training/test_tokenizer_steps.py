@@ -17,7 +17,15 @@ from worldline_core.scale.mapping import RunnerConfig, SerialMapper, Shard
 from worldline_core.store.artifact_files import digest_folder, read_json_lines
 from worldline_core.training import encode_latents as encoding
 from worldline_core.training.clip_config import EncodeLatentsConfig
-from worldline_core.training.encode_latents import SHARD_FILE, EncodeWork, claim_device, encode_latents
+from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.clip_source import LatentStore
+from worldline_core.training.encode_latents import (
+    SHARD_FILE,
+    EncodeWork,
+    claim_device,
+    encode_latents,
+    stored_latent_frames,
+)
 from worldline_core.training.train_tokenizer import train_tokenizer
 from worldline_core.training.training_config import TokenizerConfig
 
@@ -137,6 +145,20 @@ def test_killed_and_resumed_in_another_order_with_other_threads(inputs, undistur
     assert all(row.status == "kept" and row.seconds and row.stored_bytes > 0 for row in rows)
     stored = sum(path.stat().st_size for path in tmp_path.glob("*.safetensors"))
     assert 0.9 * stored < sum(row.stored_bytes for row in rows) < stored
+
+
+def test_fewer_starts_are_stored_on_a_small_disk(inputs, undisturbed, tmp_path):
+    rows = EpisodeSet.open(inputs["episodes"]).rows
+    need = sum(128 * 3 * stored_latent_frames(row.video_frames, "groups", ENCODING) for row in rows)
+    for spare, steps in ((0, 4), (-1, 8)):
+        encode_latents(ENCODING.model_copy(update={"disk": need + spare}), inputs, tmp_path / str(steps))
+        store = LatentStore.open(tmp_path / str(steps))
+        assert store.start_step == steps
+        assert store.read(Clip("episode-003", 8, 9, 1), ("head",)).shape == (1, 4, 3, 4, 4)
+        stored = sum(row.stored_bytes for row in read_account(tmp_path / str(steps)))
+        assert stored == need if not spare else stored < need
+    with pytest.raises(ConfigError, match=r"do not fit the disk[\s\S]*clip_frames"):
+        encode_latents(ENCODING.model_copy(update={"disk": 1000}), inputs, tmp_path / "none")
 
 
 @pytest.mark.slow

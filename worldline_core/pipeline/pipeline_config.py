@@ -261,6 +261,24 @@ class PipelineConfig(StrictModel):
         return self
 
     @model_validator(mode="after")
+    def _latents_reach_as_far_as_clips(self) -> PipelineConfig:
+        """Refuse what training would refuse after all latents are encoded."""
+        for name, stage in (
+            ("train_stage1", self.train_stage1),
+            ("train_stage2", self.train_stage2),
+            ("distill", self.distill),
+        ):
+            longest, encoded = 0 if stage is None else max(stage.clips.lengths), self.encode_latents.clip_frames
+            if (
+                stage is not None
+                and not isinstance(stage.input, FrameInput)
+                and encoded is not None
+                and longest > encoded
+            ):
+                raise ValueError(f"{name}.clips.lengths: {longest} frames, encode_latents.clip_frames: {encoded}")
+        return self
+
+    @model_validator(mode="after")
     def _distilled_views_are_trained(self) -> PipelineConfig:
         """Refuse what distillation would refuse after Stage II, and what latents lack; without `distill.views` take those they have."""
         wanted = self.distill.views

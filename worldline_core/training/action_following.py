@@ -106,6 +106,7 @@ class ActionFollowing:
             self.frame = max(1, round(config.seconds * fps))
             frames = 1 + math.ceil(self.frame / frames_per_unit) * frames_per_unit
             # Neighbours exchange their controls: those of one robot, where there are several.
+            loader.source.require_length(frames, "action_following.seconds")
             places = sorted(
                 self._places(alike, views, frames),
                 key=lambda place: loader.source.row(place.clip.episode_id).embodiment,

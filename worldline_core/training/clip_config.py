@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, ByteSize, Field, model_validator
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import ImageSize, StrictModel
@@ -117,6 +117,9 @@ class EncodeLatentsConfig(StrictModel):
 
     ``start_step``: clips may start at multiples of it. ``strides``: temporal strides that training may ask for.
     ``views``: those that are encoded of an episode that has them, beside its task-facing one.
+    ``clip_frames``: most frames of a clip that training may ask for; None: all that follow its start. A tokenizer with a long memory
+    stores each start's clip by itself, so this decides how much is stored.
+    ``disk``: most bytes that the latents may take: ``start_step`` is doubled until they fit.
     """
 
     splits: tuple[str, ...] | None = None
@@ -124,5 +127,13 @@ class EncodeLatentsConfig(StrictModel):
     image_size: ImageSize = (64, 96)
     start_step: int = Field(default=4, ge=1)
     strides: tuple[int, ...] = Field(default=(1,), min_length=1)
+    clip_frames: int | None = Field(default=None, ge=1 + TEMPORAL_FACTOR)
+    disk: ByteSize | None = Field(default=None, gt=0)
     episodes_per_shard: int = Field(default=16, ge=1)
     device: str = "cpu"
+
+    @model_validator(mode="after")
+    def _frames_the_tokenizer_codes(self) -> Self:
+        if self.clip_frames is not None and (self.clip_frames - 1) % TEMPORAL_FACTOR:
+            raise ValueError(f"clip_frames {self.clip_frames}: a causal tokenizer codes clips of 4 k + 1 frames")
+        return self

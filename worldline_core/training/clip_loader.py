@@ -243,7 +243,11 @@ class ClipLoader:
         Args:
             run: folder in which skipped clips are written down.
             stop: nothing is read from this micro-step on.
+
+        Raises:
+            ConfigError: the source has no clips of this length.
         """
+        self.source.require_length(sampler.longest, "clips.lengths")
         dataset = ClipDataset(self.source, sampler, reading)
         pinned = torch.device(self.device).type == "cuda" and not isinstance(self.source, ResidentLatents)
         ahead: tuple[int, Iterator[ReadBatch | WorldLineError]] | None = None

@@ -166,6 +166,8 @@ class ClipSampler:
                 got=f"{len(candidates)} episodes, the longest with {longest} frames",
             )
         self._kind_weights = _normalised(kind_weights)
+        self.longest = max(kind.length for kind in self._kinds)
+        """Frames of the longest clips that are drawn."""
 
     def clips(self, index: int) -> ClipBatch:
         """The clips of this process's micro-step ``index``."""

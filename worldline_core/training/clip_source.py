@@ -55,6 +55,7 @@ class ClipSource(ABC):
         start_step: clips start at multiples of it.
         latent_shape: (c, h, w) of one view's latent frame.
         image_size: (H, W) of the frames that the latents are of.
+        clip_frames: most frames of a clip; None: all that the episode has.
         description: at least ``tokenizer`` (its fingerprint).
     """
 
@@ -62,6 +63,7 @@ class ClipSource(ABC):
     start_step: int
     latent_shape: tuple[int, int, int]
     image_size: tuple[int, int]
+    clip_frames: int | None = None
     description: dict[str, Any]
 
     def __init__(self, rows: Sequence[ClipRow]) -> None:
@@ -82,6 +84,14 @@ class ClipSource(ABC):
                 next_step="encode the latents of the same EpisodeSet that is trained on",
             )
         return self._by_id[episode_id]
+
+    def require_length(self, frames: int, where: str) -> None:
+        """Raises ConfigError where clips of so many frames, which the setting ``where`` asks for, are not held."""
+        if self.clip_frames is not None and frames > self.clip_frames:
+            raise ConfigError(
+                "Longer clips are asked for than the latents were encoded for", where=where, expected=f"at most {self.clip_frames}",
+                got=f"{frames} frames", next_step=f"set encode_latents.clip_frames to {frames} and encode again, or ask for shorter ones",
+            )  # fmt: skip
 
     @abstractmethod
     def read(self, clip: Clip, views: tuple[str, ...]) -> Shaped[Tensor, "v ..."]:
@@ -110,7 +120,7 @@ def group_key(episode_id: str, stride: int, phase: int) -> str:
 
 
 def clip_key(episode_id: str, stride: int, start: int) -> str:
-    """Tensor name of the latents of the clip that starts at ``start`` and runs to the end of the episode."""
+    """Tensor name of the latents of the longest clip that starts at ``start``."""
     return f"{episode_id}/clips/{stride}/{start}"
 
 
@@ -128,7 +138,7 @@ class LatentStore(ClipSource):
     - ``groups`` (tokenizers whose later latent frames depend on their own four frames only): a single-frame latent for
       every start frame, and for every stride and phase the latents of the groups of four frames that follow;
     - ``clips`` (tokenizers with a longer memory): for every stride and start frame the latents of the whole remaining
-      clip.
+      clip, or of ``clip_frames`` frames.
     """
 
     rows: list[LatentRow]
@@ -141,6 +151,7 @@ class LatentStore(ClipSource):
         self.strides: tuple[int, ...] = tuple(description["strides"])
         self.latent_shape = tuple(description["latent_shape"])
         self.image_size = tuple(description["image_size"])
+        self.clip_frames = description["clip_frames"]
         self._shard_of = {row.episode_id: row.shard for row in rows}
         self._shards: dict[str, Any] = {}
 
@@ -211,7 +222,7 @@ class LatentStore(ClipSource):
                 expected=self.strides,
                 got=clip.stride,
             )
-        longest = longest_clip(row.num_frames, clip.start, clip.stride)
+        longest = min(longest_clip(row.num_frames, clip.start, clip.stride), self.clip_frames or row.num_frames)
         if clip.start % self.start_step or clip.start < 0 or clip.num_frames > longest:
             raise DataError(
                 "A clip does not fit the stored latents of its episode.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import logging
 import platform
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +31,10 @@ from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 from worldline_core.training.clip_config import EncodeLatentsConfig
+from worldline_core.training.clip_sampler import latent_frame_count, longest_clip
 from worldline_core.training.clip_source import DESCRIPTION, INDEX, LatentRow, Layout, clip_key, group_key, single_key
+
+logger = logging.getLogger(__name__)
 
 SHARD_FILE = "{:05d}.safetensors"
 _SPAN = 2 * TEMPORAL_FACTOR + 1
@@ -64,14 +68,16 @@ def encode_episode(
     for stride in config.strides:
         period = TEMPORAL_FACTOR * stride
         for start in range(0, count, config.start_step):
-            steps = TEMPORAL_FACTOR * ((count - 1 - start) // stride // TEMPORAL_FACTOR)
-            indices = range(start, start + stride * steps + 1, stride)
+            frames = longest_clip(count, start, stride)
+            if layout == "clips":
+                frames = min(frames, config.clip_frames or frames)
+            indices = range(start, start + stride * (frames - 1) + 1, stride)
             if layout == "clips":
                 tensors[clip_key(episode_id, stride, start)] = stacked(indices)
                 continue
             # The first clip of each phase yields every group of that phase.
             key = group_key(episode_id, stride, (start + stride) % period)
-            if key in tensors or steps == 0:
+            if key in tensors or frames == 1:
                 continue
             groups = stacked(indices)[:, :, 1:]
             missing = (start + stride) // period
@@ -79,6 +85,54 @@ def encode_episode(
                 groups = torch.cat([torch.zeros_like(groups[:, :, :1]).expand(-1, -1, missing, -1, -1), groups], 2)
             tensors[key] = groups.contiguous()
     return tensors
+
+
+def stored_latent_frames(count: int, layout: Layout, config: EncodeLatentsConfig) -> int:
+    """Latent frames that `encode_episode` stores of each view of an episode of ``count`` frames."""
+    starts = range(0, count, config.start_step)
+    lengths = {(stride, start): longest_clip(count, start, stride) for stride in config.strides for start in starts}
+    if layout == "clips":
+        return sum(latent_frame_count(min(length, config.clip_frames or length)) for length in lengths.values())
+    total, phases = len(starts), set[tuple[int, int]]()
+    for (stride, start), length in lengths.items():
+        missing, phase = divmod(start + stride, TEMPORAL_FACTOR * stride)
+        if length > 1 and (stride, phase) not in phases:
+            phases.add((stride, phase))
+            total += missing + latent_frame_count(length) - 1
+    return total
+
+
+def within_disk(
+    config: EncodeLatentsConfig, rows: Sequence[EpisodeRow], layout: Layout, latent_frame_bytes: int
+) -> EncodeLatentsConfig:
+    """The settings with the smallest doubled ``start_step`` with which latents of some episodes fit ``config.disk``.
+
+    Args:
+        latent_frame_bytes: of one view's latent frame.
+
+    Raises:
+        ConfigError: they do not fit with one clip of each episode.
+    """
+    if config.disk is None:
+        return config
+    longest, tried = max(row.video_frames for row in rows), config
+    while True:
+        frames = (len(_views(row, tried)) * stored_latent_frames(row.video_frames, layout, tried) for row in rows)
+        if (need := latent_frame_bytes * sum(frames)) <= config.disk:
+            break
+        if tried.start_step >= longest:
+            raise ConfigError(
+                "The latents do not fit the disk space they are given", where="encode_latents.disk",
+                expected=f"{config.disk / 1e9:.3g} GB", got=f"{need / 1e9:.3g} GB with one clip of each of {len(rows)} episodes",
+                next_step="give more, set clip_frames, encode fewer splits or views, or train from frames (input.kind: frames)",
+            )  # fmt: skip
+        tried = tried.model_copy(update={"start_step": 2 * tried.start_step})
+    if tried.start_step != config.start_step:
+        logger.warning(
+            "Clips start at every %d-th frame, not every %d-th, so that latents fit %.3g GB.",
+            tried.start_step, config.start_step, config.disk / 1e9,
+        )  # fmt: skip
+    return tried
 
 
 def choose_layout(tokenizer: VideoTokenizer, video: UInt8[Tensor, "3 n h w"], config: EncodeLatentsConfig) -> Layout:
@@ -214,13 +268,17 @@ def encode_latents(
 
     Raises:
         DataError: if no episode is selected.
+        ConfigError: if the latents do not fit ``config.disk``.
         ArtifactError: if frames and index disagree, or an episode cannot be encoded.
     """
     episodes = EpisodeSet.open(inputs["episodes"])
     selected = _select(episodes, config)
     tokenizer = load_tokenizer(inputs["tokenizer"], config.device)
     with _one_thread():
-        layout = choose_layout(tokenizer, read_videos(episodes, selected[0], config, _SPAN)[0], config)
+        video = read_videos(episodes, selected[0], config, _SPAN)[0]
+        layout = choose_layout(tokenizer, video, config)
+        size = encode_clip(tokenizer, video[:, :1], config.device).nbytes
+    config = within_disk(config, [episodes.rows[index] for index in selected], layout, size)
     fingerprint = tokenizer_fingerprint(tokenizer, Path(inputs["tokenizer"]))
     del tokenizer  # each process that encodes loads its own
     (output / "run").mkdir(parents=True, exist_ok=True)
@@ -243,6 +301,7 @@ def encode_latents(
     description = {
         "layout": layout,
         "start_step": config.start_step,
+        "clip_frames": config.clip_frames if layout == "clips" else None,
         "strides": list(config.strides),
         "views": list(config.views),
         "image_size": list(config.image_size),
