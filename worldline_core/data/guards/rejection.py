@@ -118,7 +118,12 @@ def all_of(faults: Sequence[RejectedInputError], where: object) -> RejectedInput
 
 
 @contextmanager
-def unreadable(what: str, where: object, faults: tuple[type[Exception], ...]) -> Iterator[None]:
+def unreadable(
+    what: str,
+    where: object,
+    faults: tuple[type[Exception], ...],
+    next_step: str = "copy the file again; it may be damaged",
+) -> Iterator[None]:
     """Turns what a library raises for a damaged file into a rejection.
 
     Raises: RejectedInputError (unreadable; out_of_memory where the library was refused memory).
@@ -132,7 +137,7 @@ def unreadable(what: str, where: object, faults: tuple[type[Exception], ...]) ->
             what,
             where=where,
             got=str(error),
-            next_step="copy the file again; it may be damaged",
+            next_step=next_step,
         ) from error
 
 

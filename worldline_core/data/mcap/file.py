@@ -269,7 +269,12 @@ class SplitMcap(McapFile):
             yield from part._records(topics, start_ns, stop_ns)
 
 
-_reading = partial(unreadable, "MCAP file is damaged or was not finished", faults=_DAMAGE)
+_reading = partial(
+    unreadable,
+    "MCAP file is damaged or was not finished",
+    faults=_DAMAGE,
+    next_step="copy the file again, or try `mcap recover`",
+)
 _OTHER_FORMATS = {
     b"\x28\xb5\x2f\xfd": ("packed as a whole by zstd", "unpack it: zstd -d FILE"),
     b"\x1f\x8b": ("packed as a whole by gzip", "unpack it: gunzip FILE"),
