@@ -6,10 +6,11 @@ import base64
 import errno
 import json
 import pickle
+import re
 import shutil
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -22,13 +23,16 @@ from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.client.schemas.sorting import ArtifactSort, TaskRunSort
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
-from flows.pipeline import prepare
+from flows.pipeline import chain as pipeline_chain
+from flows.pipeline import pipeline, prepare
 from tasks.execution import run_page
-from tasks.execution.artifact_task import variant
+from tasks.execution.artifact_task import ArtifactTask, task_names, variant
 from tasks.execution.chain import outline
 from tasks.execution.prefect_artifacts import show_in_prefect
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, DataError, WorldLineError
+from worldline_core.pipeline import memory_estimate
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.scale.mapping import RunnerConfig
 
@@ -170,6 +174,34 @@ def test_steps_side_by_side_give_the_artifacts_of_one_process(
         sources = {names[source.model_dump()["id"]] for found in run.task_inputs.values() for source in found}
         expected = {"filter": {"curate"}, "render_actions": {"filter"}, "render_actions.banks": {"curate.banks"}}
         assert sources == expected.get(run.name, set()), run.name
+
+
+@pytest.mark.slow
+def test_prefect_draws_the_chain_of_the_pipeline(
+    storage: Path, tmp_path: Path, project_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every task run of the real flow, and what it waits for; the work itself is left out."""
+    monkeypatch.chdir(project_root)
+
+    def work(_config: StrictModel, _inputs: Mapping[str, Path], output: Path, **_: object) -> dict[str, object]:
+        (output / "made").write_text("")
+        return {}
+
+    monkeypatch.setattr(ArtifactTask, "load_function", lambda _: work)
+    monkeypatch.setattr(memory_estimate, "require_memory", lambda *_: None)
+    calls = outline(pipeline_chain, PipelineConfig.load("smoke"))
+    pipeline.with_options(name=tmp_path.name)("smoke", None, (), tmp_path / "store")
+    runs = task_runs(tmp_path.name, len(calls))
+    names = {run.id: run.name for run in runs}
+    drawn = {
+        run.name: {names[source.model_dump()["id"]] for found in run.task_inputs.values() for source in found}
+        for run in runs
+    }
+    assert drawn == {name: {source.name for source in call.upstream} for name, call in calls.items()}
+    steps = (project_root / "README.md").read_text().partition("sources ")[2].partition("```")[0]
+    in_readme = {step for step in re.findall(r"[a-z]\w+", steps) if step in task_names()}
+    assert in_readme == {call.task.name for call in calls.values()} & in_readme
+    assert len(in_readme) == 12
 
 
 def task_runs(flow_name: str, count: int, states: dict[str, str] | None = None) -> list[Any]:
