@@ -18,6 +18,7 @@ from tests.data.test_source_robotwin import write_episode as write_robotwin
 from tests.data.test_source_unitree_h5 import write_hdf5, write_transitions
 from tests.discovery.recorded_sets import motion, pictures, write_so101, write_video
 from tests.mcap.conftest import robot
+from worldline_core.calibration.check import episodes_of_config
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import decode_video
@@ -41,6 +42,7 @@ def init(tmp_path: Path, name: str = "raw", **answers: object) -> tuple[Discover
     config = PipelineConfig.load(None, path, [*answered, "curate.near_duplicates=false"])
     counts = curate(config.curate, {}, tmp_path / "curated")
     assert counts["kept"] + counts["quarantined"] == counts["found"]
+    assert len(episodes_of_config(path, answered)[0]) == counts["found"]  # as `worldline calibrate` reads it
     return found, config, counts
 
 

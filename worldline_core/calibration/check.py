@@ -16,7 +16,7 @@ import numpy as np
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck, as_json, diagnosis_picture, page
 from worldline_core.calibration.diagnosis import Explanation, SourceDiagnosis, diagnose_source
-from worldline_core.config import apply_overrides, read_yaml, validate
+from worldline_core.config import apply_overrides, load_config, read_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.episode_checks import check_camera, check_times, check_values
 from worldline_core.data.episodes.conventions import RecordedConventions
@@ -72,10 +72,10 @@ def repairing_lines(item: ListedEpisode, explanation: Explanation) -> tuple[str,
 
 def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[ListedEpisode], dict[str, str]]:
     """The episodes of every source in a file's `curate` section, and its kinematic descriptions by embodiment."""
-    values = apply_overrides(read_yaml(path), overrides)
+    values = apply_overrides(read_config(None, path), overrides)
     if not values.get("curate"):
         raise ConfigError("The file configures no source", where=path, expected="a section `curate` with `sources`")
-    config = validate(CurateConfig, values["curate"], where=f"{path}: curate")
+    config = load_config(CurateConfig, path=path, overrides=overrides, section="curate")
     descriptions = (values.get("render_actions") or {}).get("description_paths") or {}
     return episodes_of_sources(config.sources), {str(name): str(file) for name, file in descriptions.items()}
 
