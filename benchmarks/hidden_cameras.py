@@ -41,19 +41,19 @@ class HiddenCameras(EpisodeRecorder):
         with mock.patch.dict(BODIES, {body: replace(BODIES[body], wrist=moved)}):
             super().__init__(body)
         azimuth, rise = random.uniform(-np.pi, np.pi), np.radians(random.uniform(20, 65))
-        fovy = float(random.uniform(28, 60))
-        distance = random.uniform(0.5, 0.75) / (2 * np.tan(np.radians(fovy) / 2))
+        self.fovy_deg = float(random.uniform(28, 60))
+        distance = random.uniform(0.5, 0.75) / (2 * np.tan(np.radians(self.fovy_deg) / 2))
         away = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])
         self.target = np.array(CENTRE) + random.normal(0, 0.05, 3)
         self.eye = self.target + max(distance, 0.6) * away
         self.roll = np.radians(random.normal(0, UPRIGHT_ROLL_DEG))
-        self.scene.model.cam_fovy[self.scene.model.camera("head").id] = fovy
 
     def _set_scene(self, renderer: SceneRenderer, scene_id: str, jitter: np.random.Generator) -> None:
         renderer.set_look(SCENES[scene_id])
         self._paint_body(jitter, repaint=False)
         renderer.place_cameras(self.eye, self.target)
         head = self.scene.model.camera("head").id
+        self.scene.model.cam_fovy[head] = self.fovy_deg  # the look has its own
         half, back = self.roll / 2, self.scene.model.cam_quat[head].copy()
         w, x, y, z = back
         c, s = np.cos(half), np.sin(half)  # about the camera's own axis
