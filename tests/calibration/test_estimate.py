@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.sources.calibration_file import add_calibrated_view, mounted_camera, read_calibration
+from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 
@@ -50,9 +52,9 @@ def test_a_camera_is_made_exact_from_a_start_nearby(bank: Loaded, kinematics: Ar
     size = views[0].camera
     true = bank[0][0].cameras["head"].resized(size.width, size.height)
     start = moved_camera(true, np.array([0.05, -0.06, 0.04, 0.03, 0.05, 0.05, 0.1, 0.0]))
-    fitted = fit_still(views, start, 0.5, (2.5, 1.2), 6)
+    fitted = fit_still(views, start, 0.5, (2.5, 1.2), 6, 2.0)
     assert tools_apart(start, true, recorded) > 0.06
-    assert tools_apart(fitted.camera, true, recorded) < 0.03
+    assert tools_apart(fitted.camera, true, recorded) < 0.04
     assert abs(fitted.lag) < 0.2
     assert min(agreement(view, fitted) for view in views) > 0.6
 
@@ -72,6 +74,17 @@ def test_a_still_camera_is_found_and_bad_sets_are_unsure(tmp_path: Path) -> None
         (found,) = estimate_views(iter(benchmark.SPOILED[spoil](loaded)), robot, len(loaded))
         assert found.verdict == "unsure", spoil
         assert not camera_file([found])["views"]
+
+
+def test_an_episode_whose_video_cannot_be_read_is_left_out(bank: Loaded, kinematics: ArmKinematics) -> None:
+    def cut_off() -> Iterator[np.ndarray]:
+        yield from bank[1][1]["head"][:5]
+        raise DataError("Video and states differ in length")
+
+    recorded = recorded_views(iter([bank[0], (bank[1][0], {"head": cut_off()})]), kinematics, 2)["head"]
+    assert [episode.episode_id for episode in recorded.episodes] == [bank[0][0].episode_id]
+    with pytest.raises(DataError, match="differ in length"):
+        recorded_views(iter([(bank[1][0], {"head": cut_off()})]), kinematics, 1)
 
 
 def test_what_cannot_be_estimated_is_named(bank: Loaded, kinematics: ArmKinematics) -> None:

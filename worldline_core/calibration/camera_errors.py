@@ -115,6 +115,14 @@ class KindOfError:
         return {1: 1.96, 2: 2.45, 3: 2.80}[len(self.estimate)]
 
 
+def kinds_of_error(estimate: np.ndarray, covariance: np.ndarray, shown: np.ndarray | None) -> tuple[KindOfError, ...]:
+    """Each kind of an estimate (8,) and its covariance (8, 8) in the units of KINDS, and by `shown` (2, 8) its effect in the picture."""
+    parts = [(name, unit, np.eye(PARAMETERS)[part]) for name, (part, unit) in KINDS.items()]
+    if shown is not None:
+        parts.append(("in the picture", "% of the width", shown))
+    return tuple(KindOfError(n, u, A @ estimate, A @ covariance @ A.T) for n, u, A in parts)
+
+
 @dataclass(frozen=True, eq=False)
 class CameraError:
     """The error of one camera, all kinds at once: the change that makes its pictures fit best.
@@ -153,10 +161,7 @@ class CameraError:
     @cached_property
     def kinds(self) -> tuple[KindOfError, ...]:
         """Each kind whatever the others are; beside them where it moves the robot in the picture, if that is known."""
-        parts = [(name, unit, np.eye(PARAMETERS)[part]) for name, (part, unit) in KINDS.items()]
-        if self.shown is not None:
-            parts.append(("in the picture", "% of the width", self.shown))
-        return tuple(KindOfError(n, u, A @ self.estimate, A @ self.covariance @ A.T) for n, u, A in parts)
+        return kinds_of_error(self.estimate, self.covariance, self.shown)
 
     @property
     def squares(self) -> float:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice
 
 import cv2
 import numpy as np
@@ -15,12 +15,17 @@ from worldline_core.calibration.estimate.camera_search import MotionOfSteps
 from worldline_core.calibration.observation import GRAY_WIDTH, Motion, measured_motion, observe, read
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
+
+logger = logging.getLogger(__name__)
 
 FINE_WIDTH = 2 * GRAY_WIDTH
 CHANGE_FROM, TEXTURE_FROM, SURE_ABOVE, LEAST_TRUST = 2.0, 2.0, 6.0, 0.15
 """Grey levels; and the trust in flow where nothing is to be seen."""
+SHARED_SURFACES, SHARED_CAPSULES = 2.0, 8.0
+"""Variance of a still camera that more episodes do not reduce, in variances of one episode; from recordings whose cameras are known."""
 MOST_FRAMES, FEWEST_FRAMES = 800, 9
 """Pictures of a view that are used of all episodes together, and fewer of one episode tell nothing."""
 
@@ -68,6 +73,11 @@ class RecordedView:
     surfaces: bool
     episodes: tuple[ViewOfEpisode, ...]
 
+    @property
+    def shared(self) -> float:
+        """Variance that more episodes do not reduce."""
+        return SHARED_SURFACES if self.surfaces else SHARED_CAPSULES
+
     def of(self, episodes: Sequence[ViewOfEpisode]) -> RecordedView:
         return replace(self, episodes=tuple(episodes))
 
@@ -104,36 +114,38 @@ def certainty(motion: Motion) -> np.ndarray:
 def recorded_views(
     loaded: Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]], kinematics: ArmKinematics, count: int
 ) -> dict[str, RecordedView]:
-    """The views of about `count` episodes, each gone through once.
+    """The views of about `count` episodes, each gone through once. An episode whose videos cannot be read is left out with a warning.
 
-    Raises: DataError when images or kinematics do not fit an episode, or recorded cameras say nothing of the robot.
+    Raises: DataError when no episode's videos can be read, pictures differ in size, or the states say nothing of the robot.
     """
     found: dict[str, list[ViewOfEpisode]] = {}
     sizes: dict[str, tuple[int, int]] = {}
     every, frame_s, surfaces = 1, 1.0, True
+    faults: list[DataError | RejectedInputError] = []
     for episode, frames in loaded:
         every = max(1, round(episode.fps / ESTIMATED_AT_HZ))
         frame_s = every / episode.fps
         reading = read(observe(replace(episode, cameras={}), {}, kinematics), RecordedConventions())
         if reading is None:
             raise DataError("The states do not say where the robot is", where=f"episode {episode.episode_id}")
+        try:
+            pictures = {view: _thinned(images, every) for view, images in frames.items()}
+        except (DataError, RejectedInputError) as error:
+            faults.append(error)
+            continue
         surfaces = reading.shape == "surfaces"
         joints = episode.state_kind == "joints"
         openings = kinematics.gripper(episode.state.astype(np.float64)).numpy() if joints else None
         length = len(reading.tools[::every])
         kept = _busiest(reading.points[::every], max(FEWEST_FRAMES, MOST_FRAMES // count))
-        for view, images in frames.items():
-            gray: list[np.ndarray] = []
-            for image in islice(images, 0, None, every):
-                if view not in sizes:
-                    sizes[view] = image.shape[:2]
-                if image.shape[:2] != sizes[view]:
+        for view, (shown_sizes, gray) in pictures.items():
+            for size in shown_sizes:
+                if size != sizes.setdefault(view, size):
                     raise DataError(
                         "Pictures of one view differ in size", where=f"episode {episode.episode_id}, view {view}",
-                        expected=f"{sizes[view][1]}x{sizes[view][0]}", got=f"{image.shape[1]}x{image.shape[0]}",
+                        expected=f"{sizes[view][1]}x{sizes[view][0]}", got=f"{size[1]}x{size[0]}",
                         next_step="give each size a source of its own",
                     )  # fmt: skip
-                gray.append(_fine_gray(image))
             frames_of = slice(kept.start, min(kept.stop, len(gray), length))
             if frames_of.stop - frames_of.start < FEWEST_FRAMES:
                 continue
@@ -143,10 +155,25 @@ def recorded_views(
                 reading.tools[::every][frames_of], gripper,
             )  # fmt: skip
             found.setdefault(view, []).append(shown)
+    if faults and not found:
+        raise faults[0]
+    if faults:
+        logger.warning("Videos of %d episodes cannot be used, the first: %s", len(faults), faults[0])
     return {
         view: RecordedView(view, sizes[view], every, frame_s, surfaces, tuple(episodes))
         for view, episodes in found.items()
     }
+
+
+def _thinned(images: Iterable[np.ndarray], every: int) -> tuple[list[tuple[int, int]], list[np.ndarray]]:
+    """(height, width) of each kept picture, and the pictures in grey."""
+    sizes, gray = list[tuple[int, int]](), list[np.ndarray]()
+    # The last ones are read, too: only then is the number of pictures known.
+    for number, image in enumerate(images):
+        if number % every == 0:
+            sizes.append(image.shape[:2])
+            gray.append(_fine_gray(image))
+    return sizes, gray
 
 
 def _busiest(points: np.ndarray, count: int) -> slice:

@@ -22,8 +22,9 @@ from worldline_core.calibration.camera_errors import (
 from worldline_core.data.episodes.episode import CameraTrack
 
 FOCAL = LAG - 1
-FOCAL_PRIOR, LAG_PRIOR = 0.6, 3.0
-"""Standard deviations of the logarithm of the focal length in widths of the picture, and of the lag [frames]."""
+USUAL_FOCAL, FOCAL_PRIOR, LAG_PRIOR = 0.8, 0.4, 3.0
+"""Focal length of usual cameras in widths of the picture (64 degrees; 95 % of them between 35 and 100), standard deviations of its
+logarithm and of the lag [frames]."""
 DAMPING, LARGEST_DAMPING = 1e-3, 1e3
 TOLERATED = 0.3
 """Loss of log-likelihood in a step: the slopes leave out how the robot's outline covers the cells."""
@@ -47,10 +48,14 @@ class FittedCamera:
 
 
 def fit_still(
-    views: Sequence[StillView], start: CameraTrack, lag: float, blurs: Sequence[float], rounds: int
+    views: Sequence[StillView], start: CameraTrack, lag: float, blurs: Sequence[float], rounds: int, shared: float
 ) -> FittedCamera:
-    """The camera that explains all episodes best, from a start; `rounds` steps on maps of each blur at most."""
-    return climb(lambda camera, lag, blur: equations_at(views, camera, lag, blur), start, lag, blurs, rounds)
+    """The camera that explains all episodes best, from a start; `rounds` steps on maps of each blur at most.
+
+    Args:
+        shared: variance that more episodes do not reduce, in variances of one episode.
+    """
+    return climb(lambda camera, lag, blur: equations_at(views, camera, lag, blur, shared), start, lag, blurs, rounds)
 
 
 def climb(
@@ -83,17 +88,26 @@ def climb(
     return FittedCamera(camera, lag, now.information, now.likelihood)
 
 
-def equations_at(views: Sequence[StillView], camera: CameraTrack, lag: float, blur: float) -> Equations:
-    """Normal equations of all episodes at a camera, with the prior of focal length and lag."""
+def equations_at(views: Sequence[StillView], camera: CameraTrack, lag: float, blur: float, shared: float) -> Equations:
+    """Normal equations of all episodes at a camera, with the prior of focal length and lag.
+
+    Episodes share errors, so the information is too large by `inflation`: the prior is made as much stronger.
+    """
     theta = np.zeros(PARAMETERS)
     theta[LAG] = lag
     found = [view.at(camera).equations(theta, blur) for view in views]
     information = sum((each.information for each in found), np.zeros((PARAMETERS, PARAMETERS)))
     gradient = sum((each.gradient for each in found), np.zeros(PARAMETERS))
     likelihood = sum(each.likelihood for each in found)
-    focal = float(np.log(camera.K[0, 0] / camera.width))
+    focal = float(np.log(camera.K[0, 0] / camera.width / USUAL_FOCAL))
     for index, value, deviation in ((FOCAL, focal, FOCAL_PRIOR), (LAG, lag, LAG_PRIOR)):
-        information[index, index] += deviation**-2
-        gradient[index] -= value / deviation**2
-        likelihood -= value**2 / (2 * deviation**2)
+        weight = inflation(len(views), shared) / deviation**2
+        information[index, index] += weight
+        gradient[index] -= weight * value
+        likelihood -= weight * value**2 / 2
     return Equations(information, gradient, likelihood)
+
+
+def inflation(episodes: int, shared: float) -> float:
+    """Variance of an estimate from episodes that share errors, in variances as if they shared none."""
+    return 1 + episodes * shared

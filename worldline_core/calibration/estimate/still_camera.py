@@ -58,21 +58,29 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
     few = recorded.of(episodes[:: max(1, len(episodes) // ROUGH_EPISODES)])
     rough_views = few.still_views(fine=False)
     camera = recorded.unknown_camera(fine=False)
-    rough = [fit_still(rough_views, _at(camera, each), lag, ROUGH_BLURS, 5) for each in found[:STARTS_REFINED]]
+    rough = [
+        fit_still(rough_views, _at(camera, each), lag, ROUGH_BLURS, 5, recorded.shared)
+        for each in found[:STARTS_REFINED]
+    ]
     distinct = _distinct(rough, recorded)
     mirrored_views = [view.mirrored() for view in rough_views]
     mirrored = [
-        fit_still(mirrored_views, _at(camera, each), lag, ROUGH_BLURS, 5)
+        fit_still(mirrored_views, _at(camera, each), lag, ROUGH_BLURS, 5, recorded.shared)
         for each in search_cameras(_mirrored(motion))[: STARTS_REFINED // 3]
     ]
     gain = max(fit.likelihood for fit in mirrored) - distinct[0].likelihood
     views = recorded.still_views(fine=True)
     fine = recorded.unknown_camera(fine=True)
-    fits = [fit_still(views, _enlarged(each.camera, fine), each.lag, FINE_BLURS, 6) for each in distinct[:2]]
+    fits = [
+        fit_still(views, _enlarged(each.camera, fine), each.lag, FINE_BLURS, 6, recorded.shared)
+        for each in distinct[:2]
+    ]
     fits.sort(key=lambda fit: -fit.likelihood)
     best = fits[0]
     halves = tuple(
-        fit_still(views[part::2], best.camera, best.lag, FINE_BLURS[-1:], 6) for part in (0, 1) if views[part::2]
+        fit_still(views[part::2], best.camera, best.lag, FINE_BLURS[-1:], 6, recorded.shared)
+        for part in (0, 1)
+        if views[part::2]
     )
     others = halves[::-1] if len(halves) == 2 else (best, best)
     agreements = np.array([agreement(view, others[i % 2]) for i, view in enumerate(views)])

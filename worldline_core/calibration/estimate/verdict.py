@@ -17,13 +17,13 @@ from worldline_core.calibration.camera_errors import (
     LAG,
     PARAMETERS,
     SCALE,
-    CameraError,
     KindOfError,
     StillView,
+    kinds_of_error,
     projected,
 )
 from worldline_core.calibration.estimate.recordings import RecordedView
-from worldline_core.calibration.estimate.refine import FittedCamera, equations_at
+from worldline_core.calibration.estimate.refine import FittedCamera, equations_at, inflation
 from worldline_core.calibration.estimate.still_camera import (
     AGREEMENT_BLUR,
     StillCamera,
@@ -31,12 +31,10 @@ from worldline_core.calibration.estimate.still_camera import (
     tools_apart,
     tools_in_view,
 )
-from worldline_core.calibration.estimate.wrist_camera import LEAST_WRIST_AGREEMENT, WristCamera
+from worldline_core.calibration.estimate.wrist_camera import LEAST_WRIST_AGREEMENT, SHARED_WRIST_CAMERA, WristCamera
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import Resize, project_points
 
-SHARED_SURFACES, SHARED_CAPSULES = 2.0, 8.0
-"""Variance that more episodes do not reduce, in variances of one episode; from recordings whose cameras are known."""
 LEAST_AGREEMENT, LEAST_EPISODE = 0.5, 0.25
 """Cosine of predicted and measured flow on episodes that are held out: the median, and of one that says nothing else."""
 RIVAL_DEVIATIONS = 3.0
@@ -45,7 +43,6 @@ LARGEST_HALVES_APART, LARGEST_INTERVAL = 0.035, 6.0
 MIRRORED_GAIN = -20.0
 """Log-likelihood above which mirrored pictures cannot be told apart; of usual sets it is -90 to -260."""
 LEAST_IN_VIEW = 0.1
-SHARED_WRIST_CAMERA = 1.5
 FEWEST_FINGER_STEPS = 20
 LARGEST_WRIST_HALVES_APART, LARGEST_WRIST_INTERVAL = 0.05, 10.0
 """The same of wrist cameras, which are nearer to what they see."""
@@ -119,7 +116,7 @@ def too_little(recorded: RecordedView) -> str | None:
 def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     """The estimate of a still view with its intervals and all reasons against it."""
     fitted, views = found.fitted, recorded.still_views(fine=True)
-    error = _error(recorded, fitted, views)
+    kinds = _intervals(recorded, fitted, shown_by(fitted, views), recorded.shared)
     reasons: list[str] = []
     typical = float(np.median(found.agreements))
     if typical < LEAST_AGREEMENT:
@@ -144,7 +141,7 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     halves = 100 * tools_apart(found.halves[0].camera, found.halves[1].camera, recorded)
     if halves > 100 * LARGEST_HALVES_APART:
         reasons.append(f"two halves of the episodes give cameras {halves:.1f} % of the width apart")
-    interval = next((k.half_interval for k in error.kinds if k.kind == "in the picture"), np.inf)
+    interval = kinds[-1].half_interval
     if interval > LARGEST_INTERVAL:
         reasons.append(f"the robot's place in the picture is known to {interval:.1f} % of the width only")
     moved = _moved_at(recorded, found, views)
@@ -156,7 +153,7 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
         reasons.append(f"{len(low)} of {len(recorded.episodes)} episodes do not fit")
     if typical < LEAST_AGREEMENT:  # then nothing else means anything
         reasons, moved = reasons[:1], None
-    estimate = _estimate(recorded, fitted, error, typical, reasons, wrist=False)
+    estimate = _estimate(recorded, fitted, kinds, typical, reasons, wrist=False)
     agreements = found.rival_agreements
     return replace(
         estimate,
@@ -170,13 +167,9 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
 def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
     """The estimate of a wrist view with its intervals and all reasons against it."""
     fitted = found.fitted
-    scale = np.append(SCALE[:-1], recorded.every)
     _, _, ahead, slope = projected(np.zeros((1, 1, 3)), fitted.camera)
-    shown = 100 / fitted.camera.width * np.c_[slope[:, :, 0, 0], np.zeros(2)] / scale
-    information = fitted.information / np.outer(scale, scale)
-    error = CameraError(
-        recorded.view, np.zeros(PARAMETERS), information, SHARED_WRIST_CAMERA, shown, len(recorded.episodes)
-    )
+    shown = 100 / fitted.camera.width * np.c_[slope[:, :, 0, 0], np.zeros(2)]
+    kinds = _intervals(recorded, fitted, shown, SHARED_WRIST_CAMERA)
     reasons: list[str] = []
     typical, known = found.agreement, int(np.isfinite(found.agreements).sum())
     if known < FEWEST_EPISODES:
@@ -203,17 +196,17 @@ def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
         reasons.append("the tool is behind the camera")
     elif halves > 100 * LARGEST_WRIST_HALVES_APART:
         reasons.append(f"two halves of the episodes give cameras {halves:.1f} % of the width apart")
-    interval = error.kinds[-1].half_interval
+    interval = kinds[-1].half_interval
     if interval > LARGEST_WRIST_INTERVAL:
         reasons.append(f"the tool's place in the picture is known to {interval:.1f} % of the width only")
     notes = ("the mount was searched: the description has none, or another one",) if found.searched else ()
-    return replace(_estimate(recorded, fitted, error, typical, reasons, wrist=True), notes=notes)
+    return replace(_estimate(recorded, fitted, kinds, typical, reasons, wrist=True), notes=notes)
 
 
 def _estimate(
     recorded: RecordedView,
     fitted: FittedCamera,
-    error: CameraError,
+    kinds: tuple[KindOfError, ...],
     typical: float,
     reasons: Sequence[str],
     *,
@@ -225,7 +218,7 @@ def _estimate(
         verdict="unsure" if reasons else "sure",
         camera=full_size(fitted.camera, recorded.image_size),
         lag_frames=fitted.lag * recorded.every,
-        intervals=error.kinds,
+        intervals=kinds,
         agreement=typical,
         reasons=tuple(reasons),
         episodes=len(recorded.episodes),
@@ -247,13 +240,15 @@ def full_size(camera: CameraTrack, image_size: tuple[int, int]) -> CameraTrack:
     return CameraTrack(camera.view, K, camera.T_base_camera, width, height)
 
 
-def _error(recorded: RecordedView, fitted: FittedCamera, views: Sequence[StillView]) -> CameraError:
-    """The error that the estimate may have, as the doctor states it: none was found, this much may be there."""
+def _intervals(
+    recorded: RecordedView, fitted: FittedCamera, shown: np.ndarray, shared: float
+) -> tuple[KindOfError, ...]:
+    """The errors of each kind that the estimate may have. The last is that of the robot's place in the picture, of which `shown`
+    (2, 8) [% of the width] is the displacement by each parameter.
+    """
     scale = np.append(SCALE[:-1], recorded.every)
-    shared = SHARED_SURFACES if recorded.surfaces else SHARED_CAPSULES
-    information = fitted.information / np.outer(scale, scale)
-    shown = shown_by(fitted, views) / scale
-    return CameraError(recorded.view, np.zeros(PARAMETERS), information, shared, shown, len(views))
+    covariance = np.linalg.inv(fitted.information) * inflation(len(recorded.episodes), shared)
+    return kinds_of_error(np.zeros(PARAMETERS), covariance * np.outer(scale, scale), shown / scale)
 
 
 def _moved_at(recorded: RecordedView, found: StillCamera, views: Sequence[StillView]) -> str | None:
@@ -261,7 +256,7 @@ def _moved_at(recorded: RecordedView, found: StillCamera, views: Sequence[StillV
     fitted, count = found.fitted, len(views)
     places, weak = np.zeros((count, 2)), np.diag(np.array([0.2] * 3 + [0.2] * 3 + [0.02, 0.3]) ** -2.0)
     for i, view in enumerate(views):
-        own = equations_at([view], fitted.camera, fitted.lag, AGREEMENT_BLUR)
+        own = equations_at([view], fitted.camera, fitted.lag, AGREEMENT_BLUR, recorded.shared)
         change = np.linalg.solve(own.information + weak, own.gradient)
         change[LAG] = 0.0
         places[i] = view.at(fitted.camera).shown(np.zeros(PARAMETERS)) @ change

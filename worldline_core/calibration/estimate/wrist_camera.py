@@ -26,7 +26,7 @@ from worldline_core.calibration.camera_errors import (
 )
 from worldline_core.calibration.estimate.mount_search import mounts_around
 from worldline_core.calibration.estimate.recordings import RecordedView, ViewOfEpisode, certainty
-from worldline_core.calibration.estimate.refine import LAG_PRIOR, FittedCamera, climb
+from worldline_core.calibration.estimate.refine import LAG_PRIOR, FittedCamera, climb, inflation
 from worldline_core.calibration.evidence import MIN_OPENING_STEP
 from worldline_core.calibration.observation import tool_travel
 from worldline_core.data.episodes.episode import CameraTrack
@@ -50,7 +50,10 @@ MOST_COVERED, BLIND = 0.7, pose_from_rotation(np.array([0.0, 0.0, 9.0]), np.eye(
 """Share of the picture above which a hand covers too much of it to judge a mount; a camera far ahead of the hand, which it never sees."""
 RIVAL_APART, RIVAL_TURNED = 0.05, 0.15
 """A rival shows the tool elsewhere [widths], or is turned against the best camera [rad]."""
-WRIST_FOCAL_PRIOR = 0.5
+USUAL_WRIST_FOCAL, WRIST_FOCAL_PRIOR = 0.6, 0.4
+"""Focal length of usual wrist cameras in widths of the picture (80 degrees), and standard deviation of its logarithm."""
+SHARED_WRIST_CAMERA = 1.5
+"""Variance that more episodes do not reduce, in variances of one episode."""
 ROUNDS, BLURS = 8, (1.8, 1.0)
 
 
@@ -140,7 +143,8 @@ def _seen(points: np.ndarray, radii: np.ndarray, camera: CameraTrack) -> np.ndar
         nearer = (depth > NEAR_M) & (depth < depth[:, None] - HIDDEN_BEHIND_M)
         hidden = (beside & nearer).any(axis=1)
         for i in np.flatnonzero(~hidden & ~palm):
-            before = uv[palm & nearer[i]].astype(np.float32)
+            # Few points stand for the palm: its surface is as near as their discs reach.
+            before = uv[palm & (depth > NEAR_M) & (depth - radii < depth[i] - HIDDEN_BEHIND_M)].astype(np.float32)
             hidden[i] = len(before) > 2 and cv2.pointPolygonTest(cv2.convexHull(before), uv[i].tolist(), False) >= 0
         seen += ~hidden
     return seen > len(chosen) / 2
@@ -290,9 +294,9 @@ def _equations(
     likelihood = sum(each.likelihood for each in found)
     apart = rigid_inverse(camera.T_base_camera)[0] @ prior_at.T_base_camera[0]  # towards the prior
     towards = np.concatenate([cv2.Rodrigues(apart[:3, :3])[0][:, 0], apart[:3, 3]])
-    focal = float(np.log(camera.K[0, 0] / prior_at.K[0, 0]))
+    focal = float(np.log(camera.K[0, 0] / camera.width / USUAL_WRIST_FOCAL))
     towards = np.append(towards, [-focal, -lag])
-    weight = np.append(prior, [WRIST_FOCAL_PRIOR, LAG_PRIOR]) ** -2.0
+    weight = np.append(prior, [WRIST_FOCAL_PRIOR, LAG_PRIOR]) ** -2.0 * inflation(len(evidence), SHARED_WRIST_CAMERA)
     return Equations(
         information + np.diag(weight), gradient + weight * towards, likelihood - float(weight @ towards**2) / 2
     )
