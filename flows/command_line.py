@@ -175,6 +175,12 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
         type=Path,
         help="where cameras.json and pictures go (default: artifacts/calibration/<name>_estimate)",
     )
+    estimate.add_argument(
+        "--segmenter",
+        choices=("sam3", "learned", "colour"),
+        help="use its masks of the robot as well, in views that stand still",
+    )
+    estimate.add_argument("--weights", type=Path, metavar="FOLDER", help="weights of that segmenter")
     estimate.add_argument("--json", action="store_true", help="print JSON instead of lines")
     estimate.set_defaults(run=_calibrate_estimate)
 
@@ -325,8 +331,18 @@ def _calibrate_estimate(arguments: argparse.Namespace) -> None:
         from worldline_core.calibration.estimate.estimate import estimate_command
         from worldline_core.calibration.estimate.estimate_report import as_json, estimate_text
 
+        mask_robot = None
+        if arguments.segmenter is not None:
+            from worldline_core.evaluation.segmenters.segmenter import open_segmenter
+
+            weights = arguments.weights
+            mask_robot = open_segmenter(arguments.segmenter, learned=weights, sam3=weights).segment
         found = estimate_command(
-            arguments.config, overrides=arguments.overrides, views=arguments.views, output=arguments.output
+            arguments.config,
+            overrides=arguments.overrides,
+            views=arguments.views,
+            output=arguments.output,
+            mask_robot=mask_robot,
         )
     print(json.dumps(as_json(found), indent=1) if arguments.json else estimate_text(found))
     raise SystemExit(0 if found.sure else 1)

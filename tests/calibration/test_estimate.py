@@ -87,6 +87,29 @@ def test_an_episode_whose_video_cannot_be_read_is_left_out(bank: Loaded, kinemat
         recorded_views(iter([(bank[1][0], {"head": cut_off()})]), kinematics, 1)
 
 
+def test_what_moves_outside_of_the_robot_s_masks_does_not_count(bank: Loaded, kinematics: ArmKinematics) -> None:
+    recorded = recorded_views(iter(bank[:2]), kinematics, 2, colour=True)["head"]
+    camera = bank[0][0].cameras["head"]
+    seen: list[np.ndarray] = []
+
+    def right_half(video: np.ndarray, points: np.ndarray) -> np.ndarray:
+        seen.append(points)
+        masks = np.zeros(video.shape[:3], bool)
+        masks[:, :, video.shape[2] // 2 :] = True
+        return masks
+
+    (plain, _), (masked, _) = recorded.episodes, recorded.masked(right_half, camera).episodes
+    columns = plain.fine.change.shape[2]
+    assert np.array_equal(masked.fine.flow[:, :, columns // 2 + 1 :], plain.fine.flow[:, :, columns // 2 + 1 :])
+    left = slice(None, columns // 2 - 1)
+    assert np.abs(plain.fine.flow[:, :, left]).max() > 1
+    assert not np.abs(masked.fine.flow[:, :, left]).any() and not masked.fine.change[:, :, left].any()
+    # The tools are where the camera shows them: inside of the picture most of the time.
+    assert plain.colour is not None
+    height, width = plain.colour.shape[1:3]
+    assert np.mean((seen[0] > 0) & (seen[0] < [width, height])) > 0.8
+
+
 def test_what_cannot_be_estimated_is_named(bank: Loaded, kinematics: ArmKinematics) -> None:
     for episodes, reason in ((bank[:2], "2 episodes"), (benchmark.SPOILED["still"](bank), "not enough motion")):
         (found,) = estimate_views(iter(episodes), kinematics, len(episodes))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,8 @@ from worldline_core.calibration.check import (
 )
 from worldline_core.calibration.estimate.estimate_config import CAMERAS, EstimateConfig
 from worldline_core.calibration.estimate.estimate_report import as_json, headline, page, view_picture
-from worldline_core.calibration.estimate.recordings import RecordedView, recorded_views
-from worldline_core.calibration.estimate.still_camera import estimate_still
+from worldline_core.calibration.estimate.recordings import MaskRobot, RecordedView, recorded_views
+from worldline_core.calibration.estimate.still_camera import estimate_still, refine_with_masks
 from worldline_core.calibration.estimate.verdict import (
     SourceEstimate,
     ViewEstimate,
@@ -53,17 +54,25 @@ PICTURES = 3
 
 
 def estimate_views(
-    loaded: Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]], kinematics: ArmKinematics, count: int
+    loaded: Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]],
+    kinematics: ArmKinematics,
+    count: int,
+    mask_robot: MaskRobot | None = None,
 ) -> list[ViewEstimate]:
     """The camera of every view of about `count` episodes, by the images by view (gone through once) and the states alone.
 
+    Args:
+        mask_robot: what moves outside of its masks does not count in still views.
+
     Raises: DataError as `recorded_views`.
     """
-    views = recorded_views(loaded, kinematics, count).values()
-    return [_estimate(view, kinematics) for view in with_progress(views, "calibrate estimate: fitting", "view")]
+    views = recorded_views(loaded, kinematics, count, colour=mask_robot is not None).values()
+    return [
+        _estimate(view, kinematics, mask_robot) for view in with_progress(views, "calibrate estimate: fitting", "view")
+    ]
 
 
-def _estimate(recorded: RecordedView, kinematics: ArmKinematics) -> ViewEstimate:
+def _estimate(recorded: RecordedView, kinematics: ArmKinematics, mask_robot: MaskRobot | None) -> ViewEstimate:
     arms = {arm.wrist_view: (i, arm.T_tool_mount) for i, arm in enumerate(arms_of_embodiment(kinematics))}
     arm, mount = arms.get(recorded.view, (None, None))
     reason = too_few(recorded)
@@ -74,13 +83,29 @@ def _estimate(recorded: RecordedView, kinematics: ArmKinematics) -> ViewEstimate
         return ViewEstimate(recorded.view, arm is not None, "unsure", None, reasons=(reason,), episodes=count)
     if arm is not None:
         return judge_wrist(recorded, estimate_wrist(recorded, arm, mount))
-    return judge_still(recorded, estimate_still(recorded))
+    found = estimate_still(recorded)
+    if mask_robot is None:
+        return judge_still(recorded, found)
+    masked = recorded.masked(mask_robot, found.fitted.camera)
+    refined = refine_with_masks(masked, found)
+    if np.median(refined.agreements) > np.median(found.agreements):
+        return judge_still(masked, refined)
+    plain = judge_still(recorded, found)
+    return replace(plain, notes=(*plain.notes, "the segmenter's masks do not agree with what moves, and are not used"))
 
 
 def estimate_command(
-    config: Path, *, overrides: Sequence[str] = (), views: Sequence[str] = (), output: Path | None = None
+    config: Path,
+    *,
+    overrides: Sequence[str] = (),
+    views: Sequence[str] = (),
+    output: Path | None = None,
+    mask_robot: MaskRobot | None = None,
 ) -> SourceEstimate:
     """Estimate the cameras of a configuration's source: of `views`, or of those that have none (all where all have one).
+
+    Args:
+        mask_robot: masks of a segmenter that are used as well.
 
     Raises:
         ConfigError: the file has a mistake, or configures several sources.
@@ -93,7 +118,8 @@ def estimate_command(
             "Cameras are estimated of one source", where=config, expected="one source with episodes",
             got=", ".join(sorted(sources)) or "none", next_step="--set 'curate.sources=[...]' with one of them",
         )  # fmt: skip
-    return _estimate_source(listed, descriptions, views, output or OUTPUT_ROOT / f"{config.stem}_estimate")
+    folder = output or OUTPUT_ROOT / f"{config.stem}_estimate"
+    return _estimate_source(listed, descriptions, views, folder, mask_robot)
 
 
 def estimate_cameras(config: EstimateConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -110,7 +136,11 @@ def estimate_cameras(config: EstimateConfig, inputs: Mapping[str, Path], output:
 
 
 def _estimate_source(
-    listed: Sequence[ListedEpisode], descriptions: Mapping[str, str], views: Sequence[str], folder: Path
+    listed: Sequence[ListedEpisode],
+    descriptions: Mapping[str, str],
+    views: Sequence[str],
+    folder: Path,
+    mask_robot: MaskRobot | None = None,
 ) -> SourceEstimate:
     chosen = _readable(listed)
     first = chosen[0].load()
@@ -126,7 +156,7 @@ def _estimate_source(
                 yield found.episode, {view: episode_images(found, view) for view in wanted if view in found.views}
                 progress.advance()
 
-    estimates = estimate_views(loaded(), kinematics, len(chosen))
+    estimates = estimate_views(loaded(), kinematics, len(chosen), mask_robot)
     pictures = dict(_pictures(estimates, chosen, kinematics, folder))
     cameras = folder / CAMERAS if any(each.verdict == "sure" for each in estimates) else None
     found = SourceEstimate(chosen[0].source, tuple(estimates), folder, cameras)

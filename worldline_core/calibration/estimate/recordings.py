@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,16 +12,19 @@ import numpy as np
 
 from worldline_core.calibration.camera_errors import ESTIMATED_AT_HZ, StillView, delayed
 from worldline_core.calibration.estimate.camera_search import MotionOfSteps
-from worldline_core.calibration.observation import GRAY_WIDTH, Motion, measured_motion, observe, read
+from worldline_core.calibration.observation import GRAY_WIDTH, Motion, cell_means, measured_motion, observe, read
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
+from worldline_core.geometry.cameras import project_points
 from worldline_core.geometry.kinematics import ArmKinematics
 
 logger = logging.getLogger(__name__)
 
-FINE_WIDTH = 2 * GRAY_WIDTH
+MaskRobot = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Masks (n, h, w) of the robot in pictures (n, h, w, 3), given the tools' places (n, a, 2) [px]: `Segmenter.segment`."""
+FINE_WIDTH, MASKED_WIDTH = 2 * GRAY_WIDTH, 320
 CHANGE_FROM, TEXTURE_FROM, SURE_ABOVE, LEAST_TRUST = 2.0, 2.0, 6.0, 0.15
 """Grey levels; and the trust in flow where nothing is to be seen."""
 SHARED_SURFACES, SHARED_CAPSULES = 2.0, 8.0
@@ -33,7 +36,8 @@ MOST_FRAMES, FEWEST_FRAMES = 800, 9
 @dataclass(frozen=True, eq=False)
 class ViewOfEpisode:
     """One view of one episode, thinned: grey pictures (n, h, FINE_WIDTH), and of the robot points (n, p, 3) with radii (p,)
-    [m], tool poses (n, a, 4, 4) and gripper openings (n, a), None where the state has none."""
+    [m], tool poses (n, a, 4, 4) and gripper openings (n, a), None where the state has none. With masks of the robot
+    (n, h, FINE_WIDTH), what moves outside of them does not count."""
 
     episode_id: str
     gray: np.ndarray
@@ -41,10 +45,17 @@ class ViewOfEpisode:
     radii: np.ndarray
     tools: np.ndarray
     gripper: np.ndarray | None
+    colour: np.ndarray | None = None
+    masks: np.ndarray | None = None
 
     @cached_property
     def fine(self) -> Motion:
-        return measured_motion(self.gray, exact=True)
+        motion = measured_motion(self.gray, exact=True)
+        if self.masks is None:
+            return motion
+        near = np.maximum(self.masks[1:], self.masks[:-1]).astype(np.float32)
+        robot = np.stack([cv2.dilate(cells, np.ones((3, 3))) for cells in cell_means(near)])
+        return replace(motion, flow=motion.flow * robot[..., None], change=motion.change * robot)
 
     @cached_property
     def rough_gray(self) -> np.ndarray:
@@ -96,6 +107,25 @@ class RecordedView:
             StillView(camera, e.points, e.radii, m, certainty(m)) for e, m in zip(self.episodes, motions, strict=True)
         ]
 
+    def masked(self, mask_robot: MaskRobot, camera: CameraTrack) -> RecordedView:
+        """The same with masks of the robot, begun at the tools' places in the pictures of a camera."""
+        episodes: list[ViewOfEpisode] = []
+        for episode in self.episodes:
+            if episode.colour is None:
+                raise ValueError("masks need the coloured pictures")
+            height, width = episode.colour.shape[1:3]
+            points, depth = project_points(
+                episode.tools[:, :, :3, 3].reshape(-1, 3), camera.resized(width, height).K, camera.T_base_camera
+            )
+            points[depth <= 0] = np.nan
+            found = mask_robot(episode.colour, points.reshape(len(episode.tools), -1, 2))
+            across, down = episode.gray.shape[2], episode.gray.shape[1]
+            masks = np.stack(
+                [cv2.resize(m.astype(np.uint8), (across, down), interpolation=cv2.INTER_AREA) for m in found]
+            )
+            episodes.append(replace(episode, masks=masks))
+        return self.of(episodes)
+
     def motion(self, delay: float) -> MotionOfSteps:
         """All steps of all episodes, with pictures that trail by `delay` frames."""
         points = [delayed(e.points, delay) for e in self.episodes]
@@ -112,9 +142,14 @@ def certainty(motion: Motion) -> np.ndarray:
 
 
 def recorded_views(
-    loaded: Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]], kinematics: ArmKinematics, count: int
+    loaded: Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]],
+    kinematics: ArmKinematics,
+    count: int,
+    *,
+    colour: bool = False,
 ) -> dict[str, RecordedView]:
-    """The views of about `count` episodes, each gone through once. An episode whose videos cannot be read is left out with a warning.
+    """The views of about `count` episodes, each gone through once, with coloured pictures if `colour`. An episode whose videos
+    cannot be read is left out with a warning.
 
     Raises: DataError when no episode's videos can be read, pictures differ in size, or the states say nothing of the robot.
     """
@@ -129,7 +164,7 @@ def recorded_views(
         if reading is None:
             raise DataError("The states do not say where the robot is", where=f"episode {episode.episode_id}")
         try:
-            pictures = {view: _thinned(images, every) for view, images in frames.items()}
+            pictures = {view: _thinned(images, every, colour=colour) for view, images in frames.items()}
         except (DataError, RejectedInputError) as error:
             faults.append(error)
             continue
@@ -138,7 +173,7 @@ def recorded_views(
         openings = kinematics.gripper(episode.state.astype(np.float64)).numpy() if joints else None
         length = len(reading.tools[::every])
         kept = _busiest(reading.points[::every], max(FEWEST_FRAMES, MOST_FRAMES // count))
-        for view, (shown_sizes, gray) in pictures.items():
+        for view, (shown_sizes, gray, coloured) in pictures.items():
             for size in shown_sizes:
                 if size != sizes.setdefault(view, size):
                     raise DataError(
@@ -152,7 +187,7 @@ def recorded_views(
             gripper = None if openings is None else openings[::every][frames_of]
             shown = ViewOfEpisode(
                 episode.episode_id, np.stack(gray[frames_of]), reading.points[::every][frames_of], reading.radii,
-                reading.tools[::every][frames_of], gripper,
+                reading.tools[::every][frames_of], gripper, np.stack(coloured[frames_of]) if colour else None,
             )  # fmt: skip
             found.setdefault(view, []).append(shown)
     if faults and not found:
@@ -165,15 +200,22 @@ def recorded_views(
     }
 
 
-def _thinned(images: Iterable[np.ndarray], every: int) -> tuple[list[tuple[int, int]], list[np.ndarray]]:
-    """(height, width) of each kept picture, and the pictures in grey."""
-    sizes, gray = list[tuple[int, int]](), list[np.ndarray]()
+def _thinned(
+    images: Iterable[np.ndarray], every: int, *, colour: bool
+) -> tuple[list[tuple[int, int]], list[np.ndarray], list[np.ndarray]]:
+    """(height, width) of each kept picture, the pictures in grey and, if `colour`, at most MASKED_WIDTH wide in colour."""
+    sizes, gray, coloured = list[tuple[int, int]](), list[np.ndarray](), list[np.ndarray]()
     # The last ones are read, too: only then is the number of pictures known.
     for number, image in enumerate(images):
         if number % every == 0:
             sizes.append(image.shape[:2])
             gray.append(_fine_gray(image))
-    return sizes, gray
+            if colour:
+                height, width = image.shape[:2]
+                scale = min(1.0, MASKED_WIDTH / width)
+                size = (round(width * scale), round(height * scale))
+                coloured.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    return sizes, gray, coloured
 
 
 def _busiest(points: np.ndarray, count: int) -> slice:

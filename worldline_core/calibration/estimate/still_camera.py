@@ -77,16 +77,33 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
     ]
     fits.sort(key=lambda fit: -fit.likelihood)
     best = fits[0]
+    halves, agreements = _by_halves(views, best, recorded.shared)
+    rival = next((fit for fit in fits[1:] if tools_apart(best.camera, fit.camera, recorded) > RIVAL_APART), None)
+    rivals = None if rival is None else np.array([agreement(view, rival) for view in views])
+    return StillCamera(best, halves, agreements, found[0].score, rival, rivals, gain)
+
+
+def refine_with_masks(masked: RecordedView, found: StillCamera) -> StillCamera:
+    """The same camera and rival by what moves within the robot's masks."""
+    views, rival = masked.still_views(fine=True), found.rival
+    best = fit_still(views, found.fitted.camera, found.fitted.lag, FINE_BLURS, 6, masked.shared)
+    halves, agreements = _by_halves(views, best, masked.shared)
+    rivals = None if rival is None else np.array([agreement(view, rival) for view in views])
+    return replace(found, fitted=best, halves=halves, agreements=agreements, rival_agreements=rivals)
+
+
+def _by_halves(
+    views: Sequence[StillView], best: FittedCamera, shared: float
+) -> tuple[tuple[FittedCamera, ...], np.ndarray]:
+    """The cameras of the even and of the odd episodes, and the agreement of each episode with that of the other half."""
     halves = tuple(
-        fit_still(views[part::2], best.camera, best.lag, FINE_BLURS[-1:], 6, recorded.shared)
+        fit_still(views[part::2], best.camera, best.lag, FINE_BLURS[-1:], 6, shared)
         for part in (0, 1)
         if views[part::2]
     )
     others = halves[::-1] if len(halves) == 2 else (best, best)
     agreements = np.array([agreement(view, others[i % 2]) for i, view in enumerate(views)])
-    rival = next((fit for fit in fits[1:] if tools_apart(best.camera, fit.camera, recorded) > RIVAL_APART), None)
-    rivals = None if rival is None else np.array([agreement(view, rival) for view in views])
-    return StillCamera(best, halves, agreements, found[0].score, rival, rivals, gain)
+    return halves, agreements
 
 
 def agreement(view: StillView, fitted: FittedCamera) -> float:
