@@ -362,6 +362,10 @@ def _still(episodes: Recorded) -> Recorded:
     ]  # fmt: skip
 
 
+ANOTHER_ROBOT = "another robot"
+DECLARED_INSTEAD = {"ur5e": "viperx_graphite", "viperx": "ur5e_silver", "xarm7": "panda_ivory", "panda": "xarm7_white"}
+"""Robots of two arms with as many joints."""
+EXCHANGED = {"left_wrist": "right_wrist", "right_wrist": "left_wrist"}
 SPOILED: dict[str, Callable[[Recorded], Recorded]] = {
     "nothing": lambda episodes: episodes,
     "moved half way": _moved_half_way,
@@ -369,6 +373,8 @@ SPOILED: dict[str, Callable[[Recorded], Recorded]] = {
     "other states": _with_states_of_others,
     "states late by 3 frames": _late(3),
     "still": _still,
+    "wrists exchanged": lambda es: [(e, {v: f.get(EXCHANGED.get(v, v), i) for v, i in f.items()}) for e, f in es],
+    ANOTHER_ROBOT: lambda episodes: episodes,
     "wrist shown as head": lambda es: [(e, {"head": next(i for v, i in f.items() if v != "head")}) for e, f in es],
 }
 
@@ -396,6 +402,8 @@ def measure_estimates(sets: Iterator[tuple[str, ArmKinematics, Recorded]], spoil
             true = episodes[0][0]
             tools = np.concatenate([kinematics.tool_poses(e.state.astype(np.float64)).numpy() for e, _ in episodes])
             mounts = {arm.camera_view: number for number, arm in enumerate(kinematics.embodiment.arms)}
+            if spoil == ANOTHER_ROBOT:
+                kinematics = ArmKinematics(load_embodiment(DECLARED_INSTEAD[name.split("_")[0]]))
             for found in estimate_views(iter(SPOILED[spoil](episodes)), kinematics, len(episodes)):
                 said = found.reasons[0] if found.reasons else "; ".join(found.notes)
                 if found.camera is None or found.view not in true.cameras:
