@@ -87,7 +87,7 @@ def check_card(config: PipelineConfig, file: Path, memory: str) -> None:
     from worldline_core.config import validate
     from worldline_core.errors import ConfigError
     from worldline_core.model.tokenizers import require_device
-    from worldline_core.pipeline.memory_estimate import SizeSheet
+    from worldline_core.pipeline.size_sheet import SizeSheet
 
     require_device("cuda")
     card = {"config": config, "project": Path.cwd(), "devices": 1, "memory": memory}

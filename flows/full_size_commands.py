@@ -15,13 +15,14 @@ def add_plan_command(commands: argparse._SubParsersAction[argparse.ArgumentParse
     """Add the command to the parser of the whole command line."""
     plan = commands.add_parser(
         "plan",
-        help="memory that every stage of a preset takes, and the setting that would fit",
-        description="Memory a device of every stage, from the configuration alone; nothing is loaded."
-        " Exit status: 0 everything fits, 1 something does not.",
+        help="memory that every stage of a preset takes, planned hours, and the setting that would fit",
+        description="Memory a device of every stage and, of a card that is known, planned seconds and hours, from the configuration"
+        " alone; nothing is loaded. Exit status: 0 everything fits, 1 something does not.",
     )
     add_config_arguments(plan)
-    plan.add_argument("--gpus", type=int, default=8, help="devices that share the trainings (default: 8)")
-    plan.add_argument("--memory", default="80GB", metavar="SIZE", help="memory of each (default: 80GB)")
+    plan.add_argument("--gpus", type=int, default=1, help="devices that share the trainings (default: 1)")
+    plan.add_argument("--card", metavar="NAME", help="RTX 4090, H100, ... (default: the preset's own)")
+    plan.add_argument("--memory", metavar="SIZE", help="memory of each (default: the card's)")
     plan.set_defaults(run=_plan)
 
 
@@ -31,11 +32,11 @@ def _plan(arguments: argparse.Namespace) -> None:
     preset = arguments.preset or (None if arguments.config else "demo")
     if preset is not None:
         preset_path(preset)  # answers before torch is imported
-    from worldline_core.pipeline.memory_estimate import SizeSheet
     from worldline_core.pipeline.pipeline_config import PipelineConfig
+    from worldline_core.pipeline.size_sheet import SizeSheet
 
     config = PipelineConfig.load(preset, arguments.config, arguments.overrides)
-    machine = {"devices": arguments.gpus, "memory": arguments.memory}
+    machine = {"devices": arguments.gpus, "memory": arguments.memory, "card": arguments.card or config.card}
     sheet = validate(SizeSheet, {"config": config, "project": Path.cwd(), **machine}, where="worldline plan")
     rows = sheet.rows()
     print(sheet.as_text(rows))

@@ -22,6 +22,7 @@ from worldline_core.model.block_causal_attention import KVCache, block_bounds
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS as NODES
 from worldline_core.pipeline.memory_estimate import Sources, Training, trainings
+from worldline_core.pipeline.memory_trace import Held
 from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 FPS = torch.tensor([8.0, 30.0])
@@ -129,7 +130,7 @@ def test_stage2_says_in_part_what_blocks_of_clips_it_knows_should_become(make_mo
 
 
 def test_the_teacher_is_in_the_memory_sheet(make_model, monkeypatch):
-    monkeypatch.setattr(Training, "activations", lambda *_args, **_named: 100)
+    monkeypatch.setattr(Training, "_held", lambda *_args, **_named: Held(100, 0))
     source = Sources(None, None, (32, 32), (4, 4))
 
     def planned(**forcing):

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch.profiler import ProfilerActivity, profile
+from torch.utils.flop_counter import FlopCounterMode
 
 from flows.command_line import main
 from tasks.train_stage1 import train_stage1
@@ -14,18 +15,18 @@ from worldline_core.config import load_config
 from worldline_core.errors import ConfigError
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import MixtureConfig
-from worldline_core.pipeline import memory_estimate
+from worldline_core.pipeline import memory_estimate, memory_trace
 from worldline_core.pipeline.memory_estimate import (
     Estimate,
-    Held,
-    SizeSheet,
     Sources,
     Training,
     Work,
     parameter_counts,
     trainings,
 )
+from worldline_core.pipeline.memory_trace import Held
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.size_sheet import SizeSheet
 from worldline_core.store.store import ArtifactStore
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.trainer import ParameterGroup, train
@@ -86,11 +87,31 @@ def test_estimated_memory_is_what_the_allocator_hands_out(
 
 def test_a_deep_model_holds_what_two_shallow_ones_predict(monkeypatch):
     # The backward pass of deep models holds most where shallow ones do before it.
-    assert memory_estimate.extrapolated(lambda layers: Held(10 + layers, 2 * layers), 36) == (46, 72)
-    config = MixtureConfig(towers="generation", num_layers=6)
-    line = training_of(config).activations(sharded=False)
+    assert memory_trace.extrapolated(lambda layers: Held(10 + layers, 2 * layers, 3 + layers), 36) == (46, 72, 39)
+    config = MixtureConfig(towers="generation", num_layers=10)
+    line = training_of(config)._held(sharded=False, block=True)
     monkeypatch.setattr(memory_estimate, "extrapolated", lambda trace, layers: trace(layers))
-    assert line == pytest.approx(training_of(config).activations(sharded=False), rel=1e-3)
+    assert line == training_of(config)._held(sharded=False, block=True)
+
+
+def test_a_repeated_operation_holds_what_it_held_the_first_time(monkeypatch):
+    """Views, operations in place, several results, the backward pass: from memory, and each worked out anew."""
+    remembered = [training_of(TWO_LAYERS)._held(sharded=False, block=block) for block in (False, True, False)]
+    describe = memory_trace._describe
+    monkeypatch.setattr(memory_trace, "_describe", lambda *given: describe(*given) and False)
+    anew = [training_of(TWO_LAYERS)._held(sharded=False, block=block) for block in (False, True)]
+    assert remembered == [*anew, anew[0]]
+
+
+def test_operations_are_those_that_torch_counts():
+    config, model = TWO_LAYERS, build_world_model(TWO_LAYERS)
+    batch = SOURCE.batch(config, 1, config.views, 17)
+    with FlopCounterMode(display=False) as counter:
+        objective(model).loss(batch, torch.Generator(), 0)[0].backward()
+    tokens, width = 3 * 5 * 4 * 6, config.num_heads * config.head_dim
+    attention = config.num_layers * 14 * tokens**2 * width  # two products on the way there and five on the way back
+    held = training_of(config, 17, precision="fp32")._held(sharded=False, block=False)
+    assert held.operations == sum(counter.get_flop_counts()["Global"].values()) + attention
 
 
 def test_checkpointing_and_more_devices_are_proposed_in_this_order():
@@ -106,7 +127,7 @@ def test_checkpointing_and_more_devices_are_proposed_in_this_order():
 
 
 def test_parts_are_shared_out_but_for_what_is_frozen_and_whole(monkeypatch):
-    monkeypatch.setattr(Training, "activations", lambda *_args, **_named: 100)
+    monkeypatch.setattr(Training, "_held", lambda *_args, **_named: Held(100, 0))
     monkeypatch.setattr(memory_estimate, "parameter_counts", lambda *_: (1000, 10))
     model = build_world_model(TWO_LAYERS)
     work = Work(lambda _: None, (model,), (model,), {"tokenizer": torch.nn.Linear(1, 1)})
@@ -130,7 +151,7 @@ def test_parts_are_shared_out_but_for_what_is_frozen_and_whole(monkeypatch):
 
 def sheet(preset, *overrides, devices=1):
     config = PipelineConfig.load(preset, overrides=overrides)
-    values = {"config": config, "project": Path(__file__).parents[2], "devices": devices, "memory": "80GB"}
+    values = {"config": config, "project": Path(__file__).parents[2], "devices": devices, "card": "H100"}
     return SizeSheet.model_validate(values)
 
 

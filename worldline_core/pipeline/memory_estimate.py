@@ -1,28 +1,20 @@
 """Memory of trainings on so many devices, and the refusal of one that cannot fit.
 
-Activations are counted by running a stage's own objective on tensors that have shapes and no values. torch's MemTracker gives the
-same figures within 0.4 % for a single pass, but refuses modules that are called several times before a backward pass, as the
-tokenizers and Stage III do.
+Activations are counted by running a stage's own objective on tensors that have shapes and no values (`memory_trace`).
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
-from pydantic import ByteSize, Field
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from worldline_core.config import StrictModel
 from worldline_core.distillation.auxiliary_losses import PerceptualLoss
@@ -33,15 +25,13 @@ from worldline_core.distillation.distribution_matching import DistributionMatchi
 from worldline_core.distillation.teacher_trajectories import TrajectoryBatch, teacher_trajectories
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.errors import ConfigError
-from worldline_core.model.checkpoint import DESCRIPTION, SINGLE_PRECISION, read_checkpoint_info
+from worldline_core.model.checkpoint import SINGLE_PRECISION, read_checkpoint_info
 from worldline_core.model.lpips import LPIPS
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import MixtureConfig, WorldModelConfig, cosmos3_config
-from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.progress import Progress
-from worldline_core.shipped import project_path
+from worldline_core.model.world_model_config import MixtureConfig, WorldModelConfig
+from worldline_core.pipeline.memory_trace import Held, extrapolated, traced
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_sampler import Clip, latent_frame_count
@@ -51,83 +41,19 @@ from worldline_core.training.relational import ClipSimilarities, RelationalTerm,
 from worldline_core.training.stage1 import is_trained
 from worldline_core.training.stage2 import stage2_model_config
 from worldline_core.training.trainer import autocast
-from worldline_core.training.training_config import RelationalConfig, Stage1Config, Stage2Config, TrainerConfig
+from worldline_core.training.training_config import (
+    RelationalConfig,
+    ShardingConfig,
+    Stage1Config,
+    Stage2Config,
+    TrainerConfig,
+)
 from worldline_core.training.video_teacher import teacher_outline
 
-WHOLE = 8
-"""Most layers of a model that is traced as it is."""
 USABLE = 0.92
 """Share of a device's memory that a stage may fill; the rest is for the driver, communication and fragmentation."""
 
 AnyStage = Stage1Config | Stage2Config | DistillConfig
-
-
-class Held(NamedTuple):
-    """Most bytes held at once until the loss is there, and from then on, without gradients of parameters."""
-
-    forward: float
-    backward: float
-
-
-class _Tracker(TorchDispatchMode):
-    """Follows the storages that a computation allocates and frees.
-
-    Decisions that depend on values (a loss is finite, a text is padded) see 0.5, 1 or True.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.live = self.most = 0
-        self._followed: set[int] = set()
-
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        if func is torch.ops.prim.device.default:
-            return args[0].device
-        if func is torch.ops.aten._local_scalar_dense.default:
-            return True if args[0].dtype == torch.bool else 0.5 if args[0].is_floating_point() else 1
-        result = func(*args, **(kwargs or {}))
-        unknown = [storage for storage in _storages(result) if storage._cdata not in self._followed]
-        given = {storage._cdata for storage in _storages((args, kwargs))} if unknown else set[int]()
-        for storage in unknown:
-            if storage._cdata not in given and storage._cdata not in self._followed:  # else it is no new memory
-                self._followed.add(storage._cdata)
-                self.live += storage.nbytes()
-                self.most = max(self.most, self.live)
-                weakref.finalize(storage, self._freed, storage._cdata, storage.nbytes())
-        return result
-
-    def _freed(self, key: int, size: int) -> None:
-        self._followed.remove(key)
-        self.live -= size
-
-
-def _storages(values: Any) -> list[torch.UntypedStorage]:
-    return [value.untyped_storage() for value in tree_leaves(values) if isinstance(value, Tensor)]
-
-
-def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> Held:
-    """Bytes that ``work`` holds and, with `parameters` that are trained, the backward pass of the loss that it returns.
-
-    Call it within a FakeTensorMode; what exists before (the weights) is not counted.
-    """
-    trained = [parameter for parameter in parameters if parameter.requires_grad]
-    for parameter in trained:
-        parameter.register_post_accumulate_grad_hook(lambda one: setattr(one, "grad", None))
-    with _Tracker() as tracker:
-        loss = work()
-        forward, tracker.most = tracker.most, tracker.live
-        if trained:
-            loss.backward()
-    return Held(forward, tracker.most)
-
-
-def extrapolated(trace: Callable[[int], Held], layers: int) -> Held:
-    """``trace(layers)``; of deep models by a straight line through two shallow ones, for layers are equal."""
-    if layers <= WHOLE:
-        return trace(layers)
-    return Held(*(a + (b - a) * (layers - 3) for a, b in zip(trace(3), trace(4), strict=True)))
 
 
 def to_bfloat16(model: nn.Module) -> None:
@@ -185,44 +111,55 @@ class Sources:
     def largest(
         self, model: WorldModelConfig, trainer: TrainerConfig, clips: ClipSampling, views: Sequence[str], text: int = 0
     ) -> Batch:
-        """The largest micro-batch: the longest clips, in all views where steps are joint, else in one."""
+        """The largest micro-batch, of the longest clips."""
+        views, count = self.shown(trainer, clips, views)
+        return self.batch(model, count, views, max(clips.lengths), text)
+
+    @staticmethod
+    def shown(trainer: TrainerConfig, clips: ClipSampling, views: Sequence[str]) -> tuple[Sequence[str], int]:
+        """All views where steps are joint, else one, and the number of clips in a micro-batch."""
         joint = clips.view_weights is None or {JOINT, SUBSET} & clips.view_weights.keys()
         count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
-        return self.batch(model, count * trainer.batch_size, views, max(clips.lengths), text)
+        return views, count * trainer.batch_size
 
     def video(self, frames: int, views: int = 1) -> Tensor:
         """Pictures of a clip; clips are encoded one by one, and so are their views."""
         return torch.empty(views, 3, frames, *self.image_size)
 
     @cache  # noqa: B019 - a few sources a process
-    def encoding(self, frames: int, precision: Literal["bf16", "fp32"]) -> float:
-        """Most bytes held while the tokenizer encodes a clip."""
+    def encoding(self, frames: int, precision: Literal["bf16", "fp32"]) -> Held:
+        """What the tokenizer takes to encode a view of a clip."""
         trainer = TrainerConfig(steps=1, precision=precision)
         with FakeTensorMode(), torch.no_grad(), autocast(trainer):
             tokenizer = tokenizer_outline(self.tokenizer)
-            return traced(lambda: tokenizer.encode(self.video(frames))).forward
+            return traced(lambda: tokenizer.encode(self.video(frames)))
 
     @cache  # noqa: B019 - a few sources a process
-    def teaching(self, frames: int, views: int, precision: Literal["bf16", "fp32"]) -> float:
-        """Most bytes held while the relational teacher looks at a clip."""
+    def teaching(self, frames: int, views: int, precision: Literal["bf16", "fp32"]) -> Held:
+        """What the relational teacher takes to look at a clip."""
         trainer = TrainerConfig(steps=1, precision=precision)
         with FakeTensorMode(), torch.no_grad(), autocast(trainer):
             features = teacher_outline(self.teacher)[1]
-            return traced(lambda: features(self.video(frames, views))).forward
+            return traced(lambda: features(self.video(frames, views)))
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Memory of one stage on one device.
+    """Memory of one stage on one device, and the length of it.
 
     Attributes:
         parameters: trained ones, or those of a model that only predicts.
         parts: bytes at the worst moment, by name.
+        operations: of a step on the longest clips, on each device; None where they are not in bfloat16.
+        steps: of the stage; None where `minutes` say how long it trains.
     """
 
     title: str
     parameters: int
     parts: Mapping[str, float]
+    operations: float | None = None
+    steps: int | None = None
+    minutes: float | None = None
 
     @property
     def total(self) -> float:
@@ -266,8 +203,8 @@ class Training:
     Attributes:
         work: a step with a model of some depth, made without values.
         trained: whether a parameter gets gradients, by its name.
-        turns: numbers of steps, one of each kind that the training takes (distribution matching alternates).
-        before: most bytes held before each step's forward pass, where clips are encoded or a teacher looks at them.
+        turns: numbers of steps, one of each kind that the training takes (distribution matching alternates), and their shares.
+        before: what is done before a step's forward pass, and how often: clips are encoded, a teacher looks at them.
     """
 
     title: str
@@ -275,8 +212,8 @@ class Training:
     model: WorldModelConfig
     work: Callable[[WorldModel], Work]
     trained: Callable[[str], bool] = lambda _: True
-    turns: Sequence[int] = (0,)
-    before: Sequence[Callable[[], float]] = ()
+    turns: Mapping[int, float] = field(default_factory=lambda: {0: 1.0})
+    before: Sequence[tuple[int, Callable[[], Held]]] = ()
 
     def outline(self, layers: int) -> Work:
         """The step of a model of so many layers; call it within a FakeTensorMode."""
@@ -286,15 +223,15 @@ class Training:
         return self.work(network)
 
     @cache  # noqa: B019 - a few trainings a process
-    def activations(self, *, sharded: bool) -> float:
-        """Most bytes of activations of a micro-step."""
+    def _held(self, sharded: bool, block: bool) -> Held:
+        """A micro-step; its operations are a mean over the kinds of steps."""
         trainer = self.trainer.model_copy(update={"device": "cpu"})  # tensors without values follow a CPU's paths
 
         def trace(step: int, layers: int) -> Held:
             with FakeTensorMode():
                 work = self.outline(layers)
                 for one in (*work.models, *work.scores):
-                    one.checkpointing = trainer.sharding.checkpointing
+                    one.checkpointing = "block" if block else "none"
                     if sharded and trainer.precision == "bf16":
                         to_bfloat16(one)
 
@@ -304,43 +241,55 @@ class Training:
 
                 return traced(loss, [value for one in work.models for value in one.parameters()])
 
-        steps = (max(extrapolated(partial(trace, step), self.model.num_layers)) for step in self.turns)
-        return max([*steps, *(held() for held in self.before)])
+        steps = {step: extrapolated(partial(trace, step), self.model.num_layers) for step in self.turns}
+        before = [(times, held()) for times, held in self.before]
+        most = max([*(max(held[:2]) for held in steps.values()), *(held.forward for _, held in before)])
+        operations = sum(share * steps[step].operations for step, share in self.turns.items())
+        return Held(most, 0, operations + sum(times * held.operations for times, held in before))
 
-    @cache  # noqa: B019 - a few trainings a process
-    def estimate(self, devices: int) -> Estimate:
-        """Memory on each of so many devices that share the training."""
-        trainer, shards = self.trainer, min(self.trainer.sharding.shards or devices, devices)
-        micro_steps = trainer.accumulation
-        if trainer.global_batch is not None:
-            micro_steps = -(-trainer.global_batch // (trainer.batch_size * devices))
+    @cached_property
+    def _outside(self) -> tuple[int, int, Mapping[str, float]]:
+        """Numbers of trained models and of frozen scores, and bytes of other models."""
         with FakeTensorMode():
             work = self.outline(1)
+        return len(work.models), len(work.scores), whole_bytes(work.whole)
+
+    def micro_steps(self, devices: int) -> int:
+        """Micro-steps of a step on each of so many devices."""
+        whole, batch = self.trainer.global_batch, self.trainer.batch_size
+        return self.trainer.accumulation if whole is None else -(-whole // (batch * devices))
+
+    def estimate(self, devices: int, sharding: ShardingConfig | None = None) -> Estimate:
+        """Memory on each of so many devices that share the training, as it is configured or with another sharding."""
+        trainer, sharding = self.trainer, sharding or self.trainer.sharding
+        shards, micro_steps = min(sharding.shards or devices, devices), self.micro_steps(devices)
+        held = self._held(sharded=shards > 1, block=sharding.checkpointing == "block")
+        models, scores, whole = self._outside
         trained, block = parameter_counts(self.model, self.trained)
-        own, part = 4 * len(work.models) * trained / shards, 4 * trained / shards
-        summed = micro_steps == 1 or trainer.sharding.reduce_every_micro_step
+        part = 4 * trained / shards
+        summed = micro_steps == 1 or sharding.reduce_every_micro_step
         parts = {
-            "weights": own,
-            "moments": 2 * own,
+            "weights": models * part,
+            "moments": 2 * models * part,
             "average": part,
-            **whole_bytes(work.whole),
-            "frozen scores": len(work.scores) * part,
+            **whole,
+            "frozen scores": scores * part,
             # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
             "gathered": 0 if shards == 1 else block * (2 * 2 + 2 + 4),
             "gradients": part if summed else 4 * trained,
-            "activations": self.activations(sharded=shards > 1),
+            "activations": held.forward,
         }
-        return Estimate(self.title, len(work.models) * trained, {name: size for name, size in parts.items() if size})
+        operations = micro_steps * held.operations if trainer.precision == "bf16" else None
+        parts = {name: size for name, size in parts.items() if size}
+        return Estimate(self.title, models * trained, parts, operations, trainer.steps, trainer.minutes)
 
     def fitting_setting(self, devices: int, memory: float) -> str:
         """The nearest setting with which this training would fit devices of ``memory`` bytes; empty where it does."""
         if self.estimate(devices).fits(memory):
             return ""
-        changes = {"checkpointing": "block", "reduce_every_micro_step": True, "shards": None}
-        sharding = self.trainer.sharding.model_copy(update=changes)
-        block = replace(self, trainer=self.trainer.model_copy(update={"sharding": sharding}))
+        block = ShardingConfig(checkpointing="block", reduce_every_micro_step=True)
         for count in (devices * 2**power for power in range(11)):
-            if (need := block.estimate(count)).fits(memory):
+            if (need := self.estimate(count, block)).fits(memory):
                 several = "" if count == 1 else f", reduce_every_micro_step: true, on {count} devices"
                 return f"trainer.sharding.checkpointing: block{several} ({gigabytes(need.total)} GB a device)"
         return "shorter clips, devices of more memory, or a smaller model"
@@ -364,16 +313,19 @@ class _Similarities(ClipSimilarities):
 def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> list[Training]:
     """The trainings of one step, in their order."""
     frames = isinstance(config.input, FrameInput)
+
+    def encoded(clips: ClipSampling, views: Sequence[str], trainer: TrainerConfig) -> tuple[int, Callable[[], Held]]:
+        shown, count = source.shown(trainer, clips, views)
+        return count * len(shown), partial(source.encoding, max(clips.lengths), trainer.precision)
+
     if isinstance(config, DistillConfig):
         model, first = model.model_copy(update={"towers": "generation"}), config.teacher_forcing.trainer
         return [
             Training(
                 f"distill: {part.replace('_', ' ')}", getattr(config, part).trainer, model,
                 partial(_distillation, part, config, source),
-                turns=(0, CYCLE - 1) if part == "distribution_matching" else (0,),
-                before=[partial(source.encoding, max(config.first_clips.lengths), first.precision)]
-                if part == "teacher_forcing" and frames
-                else [],
+                turns={0: 1 - 1 / CYCLE, CYCLE - 1: 1 / CYCLE} if part == "distribution_matching" else {0: 1.0},
+                before=[encoded(config.first_clips, config.views, first)] if part == "teacher_forcing" and frames else [],
             )
             for part in ("teacher_forcing", "trajectory_regression", "distribution_matching")
         ]  # fmt: skip
@@ -382,9 +334,7 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
 
     def work(network: WorldModel) -> Work:
         batch, term = source.largest(model, config.trainer, config.clips, model.views, text), None
-        tokenizer, whole = tokenizer_outline(source.tokenizer), dict[str, nn.Module]()
-        if frames:
-            whole["tokenizer"] = tokenizer
+        whole: dict[str, nn.Module] = {"tokenizer": tokenizer_outline(source.tokenizer)} if frames else {}
         if relational is not None:
             whole["teacher"] = teacher_outline(source.teacher)[0]
             term = RelationalTerm(relational, _Similarities(relational), network.config.num_layers)
@@ -397,11 +347,15 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
         return Work(run, (network,), whole=whole)
 
     title = {"base": "base", "stage1": "stage I"}[config.kind] if isinstance(config, Stage1Config) else "stage II"
-    longest, precision, before = max(config.clips.lengths), config.trainer.precision, list[Callable[[], float]]()
+    longest, precision, before = (
+        max(config.clips.lengths),
+        config.trainer.precision,
+        list[tuple[int, Callable[[], Held]]](),
+    )
     if frames:
-        before.append(partial(source.encoding, longest, precision))
+        before.append(encoded(config.clips, model.views, config.trainer))
     if relational is not None:
-        before.append(partial(source.teaching, longest, len(model.views), precision))
+        before.append((config.trainer.batch_size, partial(source.teaching, longest, len(model.views), precision)))
     return [Training(title, config.trainer, model, work, is_trained if text else lambda _: True, before=before)]
 
 
@@ -410,9 +364,11 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
     first, model = config.teacher_forcing, network.config
     clips = config.first_clips if part == "teacher_forcing" else config.clips
     batch = source.largest(model, getattr(config, part).trainer, clips, config.views)
-    tokenizer, whole = tokenizer_outline(source.tokenizer), dict[str, nn.Module]()
-    if isinstance(config.input, FrameInput):
-        whole["encoder"] = tokenizer  # it stays there, though the later steps use the latents of the trajectories
+    whole: dict[str, nn.Module] = {}
+    if isinstance(
+        config.input, FrameInput
+    ):  # it stays there, though the later steps use the latents of the trajectories
+        whole["encoder"] = tokenizer_outline(source.tokenizer)
     models, scores, distance = [network], list[WorldModel](), None
     if part == "teacher_forcing":
         scores = [build_world_model(model)] if first.teacher_share else []
@@ -465,11 +421,17 @@ def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sou
 
             return traced(run)
 
-    held, count = extrapolated(trace, model.num_layers).forward, parameter_counts(model)[0]
+    traced_once, count = extrapolated(trace, model.num_layers), parameter_counts(model)[0]
+    held, steps = traced_once.forward, regression.trajectories
+    # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
+    passes = (1 + sum(steps.substeps)) / (1 + config.spec.steps)
+    operations = passes * traced_once.operations
     if encoder:
-        held = max(held, source.encoding(batch.clips[0].num_frames, trainer.precision))
+        encoding = source.encoding(batch.clips[0].num_frames, trainer.precision)
+        held, operations = max(held, encoding.forward), operations + clips * len(batch.views) * encoding.operations
     parts = {"weights": 4 * count, **whole_bytes(encoder), "activations": held}
-    return Estimate(f"distill: trajectories (a shard of {clips} clips)", count, parts)
+    title, shards = f"distill: trajectories (a shard of {clips} clips)", -(-steps.clips // clips)
+    return Estimate(title, count, parts, operations if trainer.precision == "bf16" else None, shards)
 
 
 def stage_rows(
@@ -537,84 +499,3 @@ def _sources(config: AnyStage, inputs: Mapping[str, Path]) -> Sources | None:
         return None
     latents = LatentStore.open(Path(inputs["latents"]))
     return Sources(tokenizer, teacher, latents.image_size, latents.latent_shape[1:])
-
-
-class SizeSheet(StrictModel):
-    """The trainings of one preset on so many devices of one kind; ``project``: folder that the preset's paths begin in."""
-
-    config: PipelineConfig
-    project: Path
-    devices: int = Field(default=8, ge=1)
-    memory: ByteSize
-
-    @property
-    def model(self) -> WorldModelConfig:
-        """Shape of Stage I's model: that of the base checkpoint, of the backbone to import as models.base, or the configured
-        one."""
-        base = self.folder("base")
-        if base is not None and (base / DESCRIPTION).is_file():
-            return read_checkpoint_info(base).config
-        if self.config.import_backbone is not None and self.config.models.base is not None:
-            return cosmos3_config(
-                self.config.import_backbone.size,
-                fps=self.config.import_backbone.fps,
-                **self.config.import_backbone.changes,
-            )
-        if self.config.train_stage1 is None:
-            raise ConfigError(
-                "The size of the model is not known.",
-                where="models.base",
-                expected="a base checkpoint, import_backbone, or train_stage1.model",
-            )
-        return self.config.train_stage1.model
-
-    def folder(self, name: str) -> Path | None:
-        """Folder of outside weights, if it is here."""
-        path = getattr(self.config.models, name)
-        folder = None if path is None else project_path(self.project, path)
-        return folder if folder is not None and folder.is_dir() else None
-
-    def source(self, stage: AnyStage) -> Sources:
-        """The pictures and latents that a stage reads: its own frames, or those of the cache."""
-        reading = stage.input if isinstance(stage.input, FrameInput) else self.config.encode_latents
-        return Sources.of(self.folder("tokenizer"), self.folder("teacher"), reading.image_size)
-
-    def _rows(self) -> list[Callable[[], Row]]:
-        generation = self.model.model_copy(update={"towers": "generation"})
-        stages = (
-            (self.config.train_stage1, self.model),
-            (self.config.train_stage2, generation),
-            (self.config.distill, generation),
-        )
-        given = ((stage, model) for stage, model in stages if stage is not None)
-        return [row for s, m in given for row in stage_rows(s, m, self.source(s), self.devices, self.memory)]
-
-    def row(self, number: int) -> Row:
-        """One line of the sheet."""
-        return self._rows()[number]()
-
-    def rows(self) -> list[Row]:
-        """Memory of every training in the order of a run, and the setting with which it would fit; a core each."""
-        numbers = range(len(self._rows()))
-        with (
-            Progress("worldline plan", len(numbers), "training") as progress,
-            ProcessPoolExecutor(len(os.sched_getaffinity(0)), multiprocessing.get_context("fork")) as pool,
-        ):
-            # The last ones take longest.
-            waiting = {number: pool.submit(self.row, number) for number in reversed(numbers)}
-            for _ in as_completed(waiting.values()):
-                progress.advance()
-        return [waiting[number].result() for number in numbers]
-
-    def as_text(self, rows: Iterable[Row]) -> str:
-        """The sheet as a Markdown table; the last column names the setting with which a stage would fit."""
-        lines = [
-            f"{self.devices} devices of {gigabytes(self.memory)} GB ({USABLE:.0%} of it usable)\n",
-            "| stage | parameters | GB a device | of that | fits |",
-            "|---|---|---|---|---|",
-        ]
-        for row, setting in rows:
-            count = f"{row.parameters / 1e9:.2f} G" if row.parameters >= 1e9 else f"{row.parameters / 1e6:.1f} M"
-            fits = f"no: set {setting}" if setting else "yes"
-            lines.append(f"| {row.title} | {count} | {gigabytes(row.total)} | {row.describe_parts()} | {fits} |")
-        return "\n".join(lines)

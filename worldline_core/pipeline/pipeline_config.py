@@ -22,6 +22,7 @@ from worldline_core.evaluation.evaluation_config import (
 )
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.model.world_model_config import ImportBackboneConfig
+from worldline_core.pipeline.cards import CardName
 from worldline_core.recorder.attempts import RecordingConfig
 from worldline_core.report.context import ReportConfig
 from worldline_core.rollout.rollout_config import ImportRolloutsConfig, RolloutConfig
@@ -96,6 +97,9 @@ def _drop_unusable_rollouts(values: dict[str, Any], written: Mapping[str, Any]) 
 class PipelineConfig(StrictModel):
     """Everything that `worldline pipeline` does."""
 
+    card: CardName | None = Field(
+        default=None, description="what the sizes are made for; only `worldline plan` reads it"
+    )
     models: ModelPaths
     import_backbone: ImportBackboneConfig | None = Field(default=None, description="only for `task import_backbone`")
     record: dict[str, RecordingConfig] = Field(

@@ -1,0 +1,151 @@
+"""The sheet of a preset on so many cards: memory of every stage, planned seconds a step and hours."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+from pydantic import ByteSize, Field
+
+from worldline_core.config import StrictModel
+from worldline_core.errors import ConfigError
+from worldline_core.model.checkpoint import DESCRIPTION, read_checkpoint_info
+from worldline_core.model.world_model_config import WorldModelConfig, cosmos3_config
+from worldline_core.pipeline.cards import CARDS, UTILISATION, CardName
+from worldline_core.pipeline.memory_estimate import USABLE, AnyStage, Estimate, Row, Sources, gigabytes, stage_rows
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.progress import Progress
+from worldline_core.shipped import project_path
+from worldline_core.training.clip_config import FrameInput
+
+
+class SizeSheet(StrictModel):
+    """The trainings of one preset on so many devices of one kind.
+
+    Attributes:
+        project: folder that the preset's paths begin in.
+        card: whose speed counts, and whose memory where `memory` does not say otherwise.
+    """
+
+    config: PipelineConfig
+    project: Path
+    devices: int = Field(default=1, ge=1)
+    memory: ByteSize | None = None
+    card: CardName | None = None
+
+    @property
+    def bytes(self) -> float:
+        """Memory of a device."""
+        if self.memory is not None:
+            return self.memory
+        if self.card is None:
+            raise ConfigError(
+                "The memory of a device is not known", where="worldline plan", next_step="give --memory 24GB or --card"
+            )
+        return CARDS[self.card].memory
+
+    @property
+    def model(self) -> WorldModelConfig:
+        """Shape of Stage I's model: that of the base checkpoint, of the backbone to import as models.base, or the configured
+        one."""
+        base = self.folder("base")
+        if base is not None and (base / DESCRIPTION).is_file():
+            return read_checkpoint_info(base).config
+        if self.config.import_backbone is not None and self.config.models.base is not None:
+            return cosmos3_config(
+                self.config.import_backbone.size,
+                fps=self.config.import_backbone.fps,
+                **self.config.import_backbone.changes,
+            )
+        if self.config.train_stage1 is None:
+            raise ConfigError(
+                "The size of the model is not known.",
+                where="models.base",
+                expected="a base checkpoint, import_backbone, or train_stage1.model",
+            )
+        return self.config.train_stage1.model
+
+    def folder(self, name: str) -> Path | None:
+        """Folder of outside weights, if it is here."""
+        path = getattr(self.config.models, name)
+        folder = None if path is None else project_path(self.project, path)
+        return folder if folder is not None and folder.is_dir() else None
+
+    def source(self, stage: AnyStage) -> Sources:
+        """The pictures and latents that a stage reads: its own frames, or those of the cache."""
+        reading = stage.input if isinstance(stage.input, FrameInput) else self.config.encode_latents
+        return Sources.of(self.folder("tokenizer"), self.folder("teacher"), reading.image_size)
+
+    def _rows(self) -> list[Callable[[], Row]]:
+        generation = self.model.model_copy(update={"towers": "generation"})
+        stages = (
+            (self.config.train_stage1, self.model),
+            (self.config.train_stage2, generation),
+            (self.config.distill, generation),
+        )
+        given = ((stage, model) for stage, model in stages if stage is not None)
+        return [row for s, m in given for row in stage_rows(s, m, self.source(s), self.devices, self.bytes)]
+
+    def row(self, number: int) -> Row:
+        """One line of the sheet."""
+        return self._rows()[number]()
+
+    def _finished(self) -> Iterator[tuple[int, Row]]:
+        """Lines by their numbers as they are done, a core each; those that take longest are begun first."""
+        numbers = range(len(self._rows()))
+        with ProcessPoolExecutor(len(os.sched_getaffinity(0)), multiprocessing.get_context("fork")) as pool:
+            waiting = {pool.submit(self.row, number): number for number in reversed(numbers)}
+            try:
+                for future in as_completed(waiting):
+                    yield waiting[future], future.result()
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
+
+    def rows(self) -> list[Row]:
+        """Memory of every training in the order of a run, and the setting with which it would fit."""
+        made: dict[int, Row] = {}
+        with Progress("worldline plan", len(self._rows()), "training") as progress:
+            for number, row in self._finished():
+                made[number] = row
+                progress.advance()
+        return [made[number] for number in sorted(made)]
+
+    def fits(self) -> bool:
+        """Returns whether every training fits; the first one that does not ends the work."""
+        return all(not setting for _, (_, setting) in self._finished())
+
+    def as_text(self, rows: Iterable[Row]) -> str:
+        """The sheet as a Markdown table; the last column names the setting with which a stage would fit."""
+        devices = "1 device" if self.devices == 1 else f"{self.devices} devices"
+        lines = [f"{devices} of {gigabytes(self.bytes)} GB ({USABLE:.0%} of it usable)"]
+        if self.card is not None:
+            speed = f"{UTILISATION:.0%} of the {CARDS[self.card].operations / 1e12:.0f} TFLOPS of {self.card} (bf16)"
+            lines += ["", f"Seconds and hours are planned, not measured: operations of the longest clips at {speed}."]
+        timed = " s a step | hours |" if self.card is not None else ""
+        lines += ["", f"| stage | parameters | GB a device | of that |{timed} fits |"]
+        lines.append("|---" * (lines[-1].count("|") - 1) + "|")
+        hours = 0.0
+        for row, setting in rows:
+            count = f"{row.parameters / 1e9:.2f} G" if row.parameters >= 1e9 else f"{row.parameters / 1e6:.1f} M"
+            fits = f"no: set {setting}" if setting else "yes"
+            if self.card is not None:
+                seconds, taken = self._times(row)
+                hours += taken or 0
+                timed = f" {_figure(seconds)} | {_figure(taken)} |"
+            lines.append(f"| {row.title} | {count} | {gigabytes(row.total)} | {row.describe_parts()} |{timed} {fits} |")
+        return "\n".join([*lines, *([f"\nIn all {_figure(hours)} hours (planned)."] if self.card is not None else [])])
+
+    def _times(self, row: Estimate) -> tuple[float | None, float | None]:
+        """Planned seconds of a step, and hours of the stage; None where they cannot be said."""
+        speed = UTILISATION * CARDS[self.card].operations if self.card is not None else None
+        seconds = None if speed is None or row.operations is None else row.operations / speed
+        if row.minutes is not None:
+            return seconds, row.minutes / 60
+        return seconds, None if seconds is None or row.steps is None else seconds * row.steps / 3600
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.0f}" if value >= 10 else f"{value:.2g}"
