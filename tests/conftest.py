@@ -189,21 +189,27 @@ def _start_prefect_server(folder: Path) -> tuple[int, int]:
 def make_model() -> Callable[..., WorldModel]:
     """Very small world models (4 latent channels, 9 action channels) whose every weight is random: no path is silent."""
     import torch
+    from pydantic import TypeAdapter
 
     from worldline_core.model.networks import build_world_model
-    from worldline_core.model.world_model_config import MixtureConfig
+    from worldline_core.model.world_model_config import NetworkConfig
 
     small = {
-        "latent_channels": 4, "hidden_size": 24, "num_layers": 2, "num_heads": 2, "num_kv_heads": 1, "head_dim": 12,
-        "intermediate_size": 32, "rope_sections": (2, 2, 2), "towers": "generation",
+        "latent_channels": 4, "hidden_size": 24, "num_layers": 2, "num_heads": 2, "head_dim": 12, "intermediate_size": 32,
+        "towers": "generation",
     }  # fmt: skip
+    own = {
+        "mixture": {"num_kv_heads": 1, "rope_sections": (2, 2, 2)},
+        "wan": {"text_size": 10, "text_length": 6, "prompt_length": 2},
+    }
 
-    def make(seed: int = 0, *, scale: float = 0.2, **changes: object) -> WorldModel:
+    def make(seed: int = 0, *, scale: float = 0.2, network: str = "mixture", **changes: object) -> WorldModel:
         generator = torch.Generator().manual_seed(seed)
-        model = build_world_model(MixtureConfig.model_validate(small | changes))
+        values = small | own[network] | changes | {"network": network}
+        model = build_world_model(TypeAdapter(NetworkConfig).validate_python(values))
         with torch.no_grad():
-            for parameter in model.parameters():
-                parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
+            for value in model.state_dict().values():
+                value.copy_(torch.randn(value.shape, generator=generator) * scale)
         return model.eval()
 
     return make

@@ -14,7 +14,7 @@ from flows.pipeline import chain
 from tasks.execution.chain import outline
 from tests.distillation.conftest import SIGMA, trainer, write_inputs
 from tests.rollout.conftest import SIZE, mixed_views, small_model
-from tests.training.conftest import FRAME_INPUT, write_tokenizer
+from tests.training.conftest import FRAME_INPUT, stage1, stage2, write_tokenizer
 from worldline_core.actions.episode_tracks import ActionTracks, write_index
 from worldline_core.config import load_config
 from worldline_core.data.episodes.episode import VIEWS
@@ -31,10 +31,11 @@ from worldline_core.distillation.teacher_trajectories import (
 )
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
-from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
+from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint, write_weights
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import TrainedClips
+from worldline_core.model.world_model_config import TrainedClips, WanConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rollout.rollout import long_rollout
 from worldline_core.rollout.worldline import WorldLine
@@ -44,6 +45,8 @@ from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch
 from worldline_core.training.clip_source import FrameSource, LatentStore
 from worldline_core.training.encode_latents import encode_latents
+from worldline_core.training.stage1 import train_stage1
+from worldline_core.training.stage2 import train_stage2
 
 
 def config(**changes):
@@ -431,6 +434,48 @@ def recorded(inputs, tmp_path, make_model, make_contract):
     contract = make_contract(sigma_px_ref=SIGMA, tokenizer=tokenizer)
     save_checkpoint(folders["stage2"], make_model(0), kind="stage2", action_contract=contract)
     return folders
+
+
+@pytest.mark.slow
+def test_wan_goes_the_whole_way_from_text_to_a_simulator(recorded, tmp_path):
+    """Stage I on stored texts, Stage II on maps, distillation, and both models rolled out."""
+    shape = {
+        "network": "wan", "latent_channels": 4, "hidden_size": 24, "num_layers": 2, "num_heads": 2, "head_dim": 12,
+        "intermediate_size": 32, "text_size": 10, "text_length": 6,
+    }  # fmt: skip
+    texts = {f"move {number}": torch.randn(2 + number, 10) for number in range(3)}
+    write_weights(tmp_path / "texts.safetensors", texts, torch.float32)
+    first = stage1(
+        model=shape, text={"kind": "stored", "path": str(tmp_path / "texts.safetensors")}, trainer=trainer(8),
+        clips={"lengths": [9], "view_weights": {"primary": 1}}, text_dropout=0.5,
+    )  # fmt: skip
+    train_stage1(first, recorded, tmp_path / "stage1")
+    given = recorded | {"stage1": tmp_path / "stage1", "stage2": tmp_path / "stage2"}
+    train_stage2(stage2(6, trainer=trainer(6), clips={"lengths": [17]}), given, tmp_path / "stage2")
+    distill(config(**QUICK), given, tmp_path / "causal")
+    parts = {"attn1", "attn2", "ffn", "time_proj", "text_embedder", "scale_shift_table", "proj_in", "proj_out"}
+    before = build_world_model(WanConfig.model_validate(shape))
+    before.initialise(torch.Generator().manual_seed(0))
+    for kind in ("stage1", "stage2", "causal"):
+        model, info = load_checkpoint(tmp_path / kind, expect_kind=kind)
+        assert isinstance(info.config, WanConfig)
+        changed = {
+            name
+            for name, new in model.named_parameters()
+            if not torch.allclose(new, before.get_parameter(name), atol=1e-4)
+        }
+        assert all(any(part in name for name in changed) for part in parts)
+        assert any("action_encoder.proj" in name for name in changed) is (kind != "stage1")
+        before = model
+        if kind == "stage1":
+            continue
+        world = WorldLine.from_pretrained(
+            tmp_path / kind, tokenizer=recorded["tokenizer"], bfloat16=False, clip_frames=9
+        )
+        maps = torch.randn(1, 3, 9, 5, 4, 4)
+        session = world.session(torch.zeros(1, 3, 3, 32, 32), [42])
+        pictures = [session.step(maps[:, :, :, at : at + 3]) for at in (0, 2)]
+        assert all(len(picture[0]["head"]) == 8 for picture in pictures)
 
 
 def online(**changes):

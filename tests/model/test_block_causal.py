@@ -13,9 +13,12 @@ FRAMES = 7
 SPEC = CausalSpec(block_size=BLOCK, sink_blocks=1, recent_blocks=3, anchor_blocks=None, sigmas=(1.0, 0.0))
 
 
-@pytest.fixture(scope="module", params=["velocity", "first_frame_residual"])
+NETWORKS = [{}, {"prediction": "first_frame_residual"}, {"network": "wan"}]
+
+
+@pytest.fixture(scope="module", params=NETWORKS, ids=str)
 def model(request, make_model):
-    return make_model(prediction=request.param).requires_grad_(False)
+    return make_model(**request.param).requires_grad_(False)
 
 
 def clip(frames=FRAMES, batch=2):
@@ -82,9 +85,11 @@ def blockwise(model, spec, given, rates=None):
 
 
 @pytest.mark.parametrize("window", WINDOWS)
-@pytest.mark.parametrize(("fps", "prediction"), [(None, "first_frame_residual"), ((8.0, 20.0), "velocity")])
-def test_every_block_of_a_long_clip_sees_what_the_cache_shows_it(make_model, window, fps, prediction):
-    model = make_model(3, fps=None if fps is None else 30.0, prediction=prediction).requires_grad_(False)
+@pytest.mark.parametrize(
+    ("fps", "changes"), [(None, {"prediction": "first_frame_residual"}), ((8.0, 20.0), {}), (None, {"network": "wan"})]
+)
+def test_every_block_of_a_long_clip_sees_what_the_cache_shows_it(make_model, window, fps, changes):
+    model = make_model(3, fps=None if fps is None else 30.0, **changes).requires_grad_(False)
     spec = SPEC.model_copy(update={"sink_blocks": window[0], "recent_blocks": window[1]})
     noisy, clean, maps, sigma = given = clip(1 + 7 * BLOCK)
     rates = None if fps is None else torch.tensor(fps)
@@ -96,9 +101,10 @@ def test_every_block_of_a_long_clip_sees_what_the_cache_shows_it(make_model, win
     assert torch.allclose(unlimited, velocity, atol=1e-3) == (sum(window) >= 7)
 
 
-def test_a_pass_that_is_computed_again_reads_the_window_it_read_first(make_model):
+@pytest.mark.parametrize("network", ["mixture", "wan"])
+def test_a_pass_that_is_computed_again_reads_the_window_it_read_first(make_model, network):
     """Activation checkpointing runs the layers once more, when later blocks are already in the cache."""
-    model, gradients = make_model(), []
+    model, gradients = make_model(network=network), []
     _, clean, _, sigma = clip()
     for model.checkpointing in ("none", "block"):
         cache = KVCache(1, 1)
@@ -128,9 +134,9 @@ def test_future_frames_and_actions_leave_past_blocks_unchanged(model):
     assert not torch.allclose(frames_of(before, 5, 7), frames_of(after, 5, 7))
 
 
-def test_the_write_pass_is_the_conditioned_form_and_not_sigma_zero(model):
-    """What a block leaves in the cache has no time embedding, which a noisy pass at sigma 0 has."""
-    _, clean, _, _ = clip()
+def test_the_write_pass_is_the_conditioned_form_and_not_sigma_zero(make_model):
+    """What a block leaves in the cache has no time embedding, which a noisy pass at sigma 0 has (Wan's clean frames are at time 0)."""
+    (_, clean, _, _), model = clip(), make_model()
     observed, block = frames_of(clean, 0, 1), frames_of(clean, 1, 3)
     cache = KVCache(1, 3)
     model.write_block(observed, cache)

@@ -12,16 +12,17 @@ from torch.profiler import ProfilerActivity, profile
 
 from tests.model.test_checkpoint import most_bytes
 from worldline_core.errors import CheckpointError, UnavailableError
+from worldline_core.model.backbone import import_backbone
 from worldline_core.model.checkpoint import fill, load_checkpoint
-from worldline_core.model.cosmos3 import config_from_diffusers, import_backbone, read_cosmos3
+from worldline_core.model.cosmos3 import config_from_diffusers, read_cosmos3
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import ImportBackboneConfig, cosmos3_config
 
 
 def load_cosmos3(folder, **options):
-    model, tensors, report = read_cosmos3(folder, **options)
-    fill(model, tensors, where=folder, dtype=torch.float32)
-    return model, report
+    found = read_cosmos3(folder, **options)
+    fill(found.model, found.tensors, where=folder, dtype=torch.float32)
+    return found.model, found
 
 
 SHAPE = {
@@ -83,8 +84,8 @@ def test_diffusers_weights_give_the_same_velocity_and_gradients(kind, seed, tmp_
     theirs.save_pretrained(tmp_path / "transformer", max_shard_size="40KB")
     assert len(list((tmp_path / "transformer").glob("*.safetensors"))) > 1
     model, report = load_cosmos3(tmp_path, fps=16.0)
-    assert report["ignored"] == ["lm_head.weight"]
-    assert report["new"] == sorted(n for n, _ in model.named_parameters() if n.startswith("action_encoder."))
+    assert report.ignored == ["lm_head.weight"]
+    assert report.new == sorted(n for n, _ in model.named_parameters() if n.startswith("action_encoder."))
     latents = torch.randn(1, 6, 4, 4, 6, generator=torch.Generator().manual_seed(seed))
     text = [3, 1, 4, 1, 5, 9, 2]
     for sigma, fps in ((0.9, 16.0), (0.3, 10.0)):
@@ -152,14 +153,14 @@ def test_the_generation_tower_alone_equals_both_without_text(kind, tmp_path):
     random_transformer(kind).save_pretrained(tmp_path)
     both, _ = load_cosmos3(tmp_path)
     alone, report = load_cosmos3(tmp_path, changes={"towers": "generation"})
-    assert "embed_tokens.weight" in report["ignored"]
+    assert "embed_tokens.weight" in report.ignored
     latents = torch.randn(1, 3, 6, 2, 4, 6, generator=torch.Generator().manual_seed(5))
     sigma = torch.tensor([0.5])
     assert torch.equal(both(latents, sigma).velocity, alone(latents, sigma).velocity)
 
 
 def test_a_missing_folder_and_damaged_folders_are_named(diffusers_model, tmp_path):
-    with pytest.raises(UnavailableError, match="Cosmos3 weights are not here"):
+    with pytest.raises(UnavailableError, match="backbone's weights are not here"):
         load_cosmos3(tmp_path / "nothing")
     for size, damage, message in (
         ("40KB", Path.unlink, "A weight file is missing"),

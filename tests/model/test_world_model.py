@@ -128,9 +128,9 @@ def test_shapes_that_do_not_fit_are_refused(build):
             model(clip, sigma, **given)
 
 
-@pytest.fixture
-def film(make_model):
-    return make_model(action_conditioning="vectors", native_size=SIZE)
+@pytest.fixture(params=["mixture", "wan"])
+def film(request, make_model):
+    return make_model(network=request.param, action_conditioning="vectors", native_size=SIZE)
 
 
 def test_a_new_branch_of_vectors_changes_nothing_and_is_trainable(film):

@@ -13,10 +13,10 @@ from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.networks import build_world_model
 from worldline_core.store.artifact_files import digest_folder
-from worldline_core.training.adapters import merge_adapter
+from worldline_core.training.adapters import add_adapters, merge_adapter
 from worldline_core.training.processes import hold_weights
 from worldline_core.training.stage2 import train_stage2
-from worldline_core.training.training_config import MergeAdapterConfig
+from worldline_core.training.training_config import LoRAConfig, MergeAdapterConfig
 
 LORA = {"rank": 3, "scale": 0.5}
 
@@ -59,6 +59,13 @@ def test_an_adapter_changes_its_layers_by_a_low_rank_and_merges_to_the_same_byte
     for name in ("model.safetensors", "checkpoint.json"):
         assert (again / name).read_bytes() == (trained / name).read_bytes()
     assert info.metadata["start"]["kind"] == "base"
+
+
+@pytest.mark.parametrize(("network", "adapted"), [("mixture", 7), ("wan", 10)])
+def test_attention_and_feed_forward_of_every_network_are_adapted(make_model, network, adapted):
+    model = make_model(network=network)
+    add_adapters(model, LoRAConfig(**LORA), 0)
+    assert sum(name.endswith("lora_A.default.weight") for name, _ in model.named_parameters()) == 2 * adapted
 
 
 def test_peft_reads_the_adapter(inputs, trained):

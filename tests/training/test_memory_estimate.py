@@ -14,7 +14,7 @@ from tests.model.test_checkpoint import most_bytes
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError
 from worldline_core.model.networks import build_world_model
-from worldline_core.model.world_model_config import MixtureConfig
+from worldline_core.model.world_model_config import MixtureConfig, WanConfig
 from worldline_core.pipeline import memory_estimate, memory_trace
 from worldline_core.pipeline.memory_estimate import (
     Estimate,
@@ -38,6 +38,7 @@ SIZES = (
     (MixtureConfig(towers="generation", hidden_size=64, num_heads=1, num_layers=4, intermediate_size=192), 17),
     (MixtureConfig(towers="generation"), 33),
     (MixtureConfig(towers="generation", hidden_size=384, num_heads=6, num_layers=6, intermediate_size=1152), 33),
+    (WanConfig(hidden_size=128, num_heads=2, num_layers=4, intermediate_size=384, text_size=64, text_length=16), 17),
 )
 TWO_LAYERS = MixtureConfig(towers="generation", num_layers=2)
 BLOCK = {"checkpointing": "block", "reduce_every_micro_step": True}
@@ -59,6 +60,7 @@ def training_of(config, frames=33, **trainer):
         pytest.param(2, "fp32", 2, "none", marks=pytest.mark.slow),
         pytest.param(0, "fp32", 1, "none", id="gradients come as activations go"),
         (0, "bf16", 2, "block"),
+        pytest.param(3, "fp32", 2, "none", id="Wan", marks=pytest.mark.slow),
         pytest.param(1, "bf16", 2, "block", marks=pytest.mark.slow),
     ],
 )

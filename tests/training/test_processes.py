@@ -66,10 +66,12 @@ def trainer(steps, batch_size, **changes):
 
 
 @pytest.fixture(scope="module")
-def inputs(world, teacher, tmp_path_factory):
+def inputs(world, teacher, make_model, tmp_path_factory):
     model, folder = build_world_model(MixtureConfig.model_validate(TINY_MODEL)), tmp_path_factory.mktemp("base")
     model.initialise(torch.Generator().manual_seed(0))
     save_checkpoint(folder, model, kind="base", action_contract=None)
+    wan = make_model(network="wan")
+    save_checkpoint(folder / "wan", wan, kind="base", action_contract=None)  # with a prompt among its weights
     return {**world.inputs, "stage1": folder, "teacher": teacher}
 
 
@@ -119,6 +121,7 @@ def runs(inputs, run_processes, tmp_path_factory):
         stage1(one, inputs, "text"),
         stage2(one, inputs, "plain"),
         stage2(one, inputs, "terms", relational=terms),
+        stage2(one, inputs | {"stage1": inputs["stage1"] / "wan"}, "wan"),
     ]
     assert run_processes(one, alone, count=1) == [0], (one / "log").read_text()[-3000:]
     assert run_processes(one, [stage2(one, inputs, "half", kill_before=11)], count=1) == [-9]
@@ -127,6 +130,7 @@ def runs(inputs, run_processes, tmp_path_factory):
         stage1(two, inputs, "text"),
         stage2(two, inputs, "plain"),
         stage2(two, inputs, "terms", relational=terms),
+        stage2(two, inputs | {"stage1": inputs["stage1"] / "wan"}, "wan"),
         stage2(two, inputs, "again", sharding={"checkpointing": "block", "reduce_every_micro_step": True}),
         stage2(two, inputs, "killed", kill_before=11),
     ]
@@ -153,6 +157,7 @@ def runs(inputs, run_processes, tmp_path_factory):
         pytest.param("one/plain", "two/plain", id="two"),
         pytest.param("one/text", "two/text", id="two, text"),
         pytest.param("one/terms", "two/terms", id="two, relational terms"),
+        pytest.param("one/wan", "two/wan", id="two, Wan"),
         pytest.param("one/plain", "two/again", id="two, blocks again"),
         pytest.param("one/plain", "one/killed", id="two, then one"),
         pytest.param("one/plain", "two/half", id="one, then two"),

@@ -9,6 +9,7 @@ from torch.testing._internal.distributed.fake_pg import FakeStore
 
 from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.errors import ConfigError
+from worldline_core.model.mixture import MixtureModel
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.training.processes import own_part, place_model
@@ -21,10 +22,8 @@ SPEC = CausalSpec(block_size=2, sink_blocks=1, recent_blocks=1, anchor_blocks=No
 Make = Callable[..., WorldModel]
 
 
-@pytest.fixture
-def make_small(make_model):
-    """Makes models with both towers."""
-    return partial(make_model, towers="both", vocab_size=20)
+OWN = {"mixture": {"vocab_size": 20}, "wan": {}}
+"""Networks, and what a small model of each needs besides."""
 
 
 def sample(frames=7):
@@ -35,7 +34,8 @@ def sample(frames=7):
 
 def clip_pass(model):
     latents, maps, sigma = sample()
-    text = model.encode_text(torch.arange(12).reshape(2, 6))
+    ids = torch.arange(12).reshape(2, 6)
+    text = model.encode_text(ids if isinstance(model, MixtureModel) else ids[..., None].expand(2, 6, 10) / 10)
     return model(latents, sigma, action_maps=maps, text=text).velocity
 
 
@@ -59,14 +59,22 @@ PASSES = [clip_pass, teacher_forcing_pass, rollout_pass]
 def gradients(model, passing):
     """Gradients of a pass, and how often the first block ran."""
     calls = []
-    model.layers[0].mlp_moe_gen.up_proj.register_forward_hook(lambda *_: calls.append(1))  # pyright: ignore[reportAttributeAccessIssue]
+    feed_forward = model.layers[0].mlp_moe_gen.up_proj if isinstance(model, MixtureModel) else model.layers[0].ffn[0]
+    feed_forward.register_forward_hook(lambda *_: calls.append(1))
     passing(model).square().mean().backward()
     return {name: value.grad for name, value in model.named_parameters() if value.grad is not None}, len(calls)
 
 
-@pytest.mark.parametrize("passing", PASSES)
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_blocks_computed_again_and_compiled_ones_give_the_same_gradients(make_small, passing, compiled):
+@pytest.mark.parametrize(
+    ("network", "passing", "compiled"),
+    [
+        *((network, passing, False) for network in OWN for passing in PASSES),
+        *(pytest.param("mixture", passing, True, marks=pytest.mark.slow) for passing in PASSES),
+        pytest.param("wan", teacher_forcing_pass, True, marks=pytest.mark.slow),
+    ],
+)
+def test_blocks_computed_again_and_compiled_ones_give_the_same_gradients(make_model, network, passing, compiled):
+    make_small = partial(make_model, network=network, towers="both", **OWN[network])
     # In tests every function is wrapped to check its shapes, and each wrapper counts as compiling the same one again.
     torch._dynamo.reset()
     plain, once = gradients(make_small(), passing)
@@ -88,10 +96,11 @@ def group_of_64():
 
 
 @pytest.mark.usefixtures("group_of_64")
-@pytest.mark.parametrize("shards", [None, 8])
-def test_one_of_64_holds_a_64th_of_everything(make_model, shards):
-    sizes = {"hidden_size": 64, "intermediate_size": 128, "head_dim": 64, "num_heads": 2, "num_kv_heads": 1}
-    model = make_model(**sizes, rope_sections=(16, 8, 8))
+@pytest.mark.parametrize(("shards", "own"), [(None, {}), (8, {}), (8, {"network": "wan", "head_dim": 32})])
+def test_one_of_64_holds_a_64th_of_everything(make_model, shards, own):
+    mixture = {"num_kv_heads": 1, "rope_sections": (16, 8, 8)}
+    sizes = {"hidden_size": 64, "intermediate_size": 128, "head_dim": 64, "num_heads": 2}
+    model = make_model(**sizes | (own or mixture))
     matrices = {name for name, value in model.named_parameters() if value.shape[0] % 64 == 0}
     whole = {name: value.numel() for name, value in model.named_parameters()}
     place_model(model, ShardingConfig(shards=shards), precision="bf16", device="cpu")

@@ -122,7 +122,7 @@ def test_text_that_does_not_fit_the_model_is_refused(tmp_path):
     for config, size, error, message in (
         (TextConfig(), 100, ConfigError, "vocabulary is too small"),
         (TextConfig(kind="cosmos3", path=str(tmp_path)), 20, ConfigError, "vocabulary is too small"),
-        (TextConfig(kind="cosmos3"), 300, ConfigError, "needs a folder"),
+        (TextConfig(kind="cosmos3"), 300, ConfigError, "needs a folder or a file"),
         (TextConfig(kind="cosmos3", path=str(tmp_path / "none")), 151_936, UnavailableError, "is not here"),
     ):
         with pytest.raises(error, match=message):

@@ -1,4 +1,4 @@
-"""Pretrained Cosmos3 weights (a local diffusers folder) as the base checkpoint that Stage I starts from."""
+"""Pretrained Cosmos3 weights in a local folder of diffusers."""
 
 from __future__ import annotations
 
@@ -6,25 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from pydantic import ValidationError
-from torch import Tensor
 
-from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.model.checkpoint import check_fit, read_weights, save_checkpoint
-from worldline_core.model.layers import new_action_tensors
-from worldline_core.model.mixture import MixtureModel, is_text_parameter
-from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import (
-    Cosmos3Size,
-    ImportBackboneConfig,
-    MixtureConfig,
-    cosmos3_config,
-)
-from worldline_core.store.artifact_files import read_json
+from worldline_core.errors import CheckpointError
+from worldline_core.model.backbone_folder import SINGLE, Pretrained, transformer_folder
+from worldline_core.model.checkpoint import read_weights
+from worldline_core.model.mixture import is_text_parameter
+from worldline_core.model.world_model_config import Cosmos3Size, MixtureConfig, cosmos3_config
 
 CLASS_NAME = "Cosmos3OmniTransformer"
-SINGLE = "diffusion_pytorch_model.safetensors"
 _KINDS: dict[Cosmos3Size, dict[str, object]] = {
     "nano": {"hidden_act": "silu", "qk_norm_for_text": True, "use_und_k_norm_for_gen": False},
     "edge": {"hidden_act": "relu2", "qk_norm_for_text": False, "use_und_k_norm_for_gen": True},
@@ -104,14 +94,10 @@ def read_cosmos3(
     changes: Mapping[str, object] | None = None,
     size: Cosmos3Size | None = None,
     revision: str | None = None,
-) -> tuple[WorldModel, dict[str, Tensor], dict[str, list[str]]]:
-    """A model on the meta device, and all of its weights: views of the mapped files, and those that are new; and the names of the
-    weights that were left out (``ignored``) and that are new (``new``).
-
-    The action branch is new: its output layer is zero, so the model starts as the pretrained one.
+) -> Pretrained:
+    """Cosmos3 from a transformer in diffusers format, or a pipeline with a ``transformer`` subfolder.
 
     Args:
-        folder: a transformer in diffusers format, or a pipeline with a ``transformer`` subfolder.
         changes: fields of the config to set besides (view slots, their unit, the generation tower alone).
         size: refuse another; None takes any.
         revision: commit of the hub that the folder must be of; None takes any.
@@ -120,21 +106,7 @@ def read_cosmos3(
         UnavailableError: there is no such folder.
         CheckpointError: the folder is incomplete, damaged, or holds another architecture.
     """
-    root = folder / "transformer" if (folder / "transformer").is_dir() else folder
-    if not (root / "config.json").is_file():
-        raise UnavailableError(
-            "The Cosmos3 weights are not here",
-            where=folder,
-            expected="a diffusers folder with config.json and *.safetensors",
-            next_step=f"download nvidia/Cosmos3-{f'{size or "nano"}'.title()} in diffusers format and give its folder",
-        )
-    if revision is not None and (found := hub_revision(folder)) != revision:
-        raise CheckpointError(
-            "Weights of another revision" if found else "The folder does not say which revision it is of", where=folder,
-            expected=revision, got=found,
-            next_step="download it with huggingface_hub (hf download --revision), which notes the commit; or change import_backbone.revision",
-        )  # fmt: skip
-    raw = read_json(root / "config.json")
+    root, raw = transformer_folder(folder, f"nvidia/Cosmos3-{f'{size or "nano"}'.title()}", revision)
     config = config_from_diffusers(raw, where=root / "config.json", fps=fps, expected=size)
     config = MixtureConfig.model_validate(config.model_dump() | dict(changes or {}))
     tensors = read_weights(root / SINGLE, None)
@@ -143,38 +115,4 @@ def read_cosmos3(
         name for name in tensors if name.startswith(UNUSED_PARAMETERS) or (without_text and is_text_parameter(name))
     }
     kept = {name: tensor for name, tensor in tensors.items() if name not in ignored}
-    with torch.device("meta"):
-        model = MixtureModel(config)
-    with torch.random.fork_rng(devices=()):
-        torch.manual_seed(0)
-        new = new_action_tensors(config)
-    if model.view_embedding is not None:
-        new["view_embedding"] = torch.zeros(model.view_embedding.shape)
-    tensors = kept | new
-    check_fit({name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}, tensors, root)
-    return model, tensors, {"ignored": sorted(ignored), "new": sorted(new)}
-
-
-def hub_revision(folder: Path) -> str | None:
-    """Commit that a downloaded folder is of: a snapshot of the hub's cache has it as name, a local folder beside each file."""
-    resolved = folder.resolve()
-    if resolved.parent.name == "snapshots":
-        return resolved.name
-    notes = sorted((folder / ".cache" / "huggingface" / "download").rglob("config.json.metadata"))
-    commits = {note.read_text(encoding="utf-8", errors="replace").partition("\n")[0].strip() for note in notes}
-    return commits.pop() if len(commits) == 1 else None
-
-
-def import_backbone(config: ImportBackboneConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    """Load ``inputs['diffusers']`` (a Cosmos3 folder in diffusers format) and write a base checkpoint.
-
-    Weights go from file to file: what is held is one file of the result.
-    """
-    model, tensors, report = read_cosmos3(
-        inputs["diffusers"], fps=config.fps, changes=config.changes, size=config.size, revision=config.revision
-    )
-    save_checkpoint(
-        output, model, kind="base", action_contract=None, metadata={"source": "Cosmos3 in diffusers format", **report},
-        dtype=getattr(torch, config.dtype), state_dict=tensors,
-    )  # fmt: skip
-    return {"parameters": sum(parameter.numel() for parameter in model.parameters()), "ignored": len(report["ignored"])}
+    return Pretrained.of(config, kept, root, ignored=ignored)

@@ -118,13 +118,14 @@ def grouped_attention(queries: Tensor, keys: Tensor, values: Tensor, mask: Tenso
 
 @dataclass(frozen=True)
 class TextContext:
-    """Keys and values of a text in every layer. They depend on neither the video nor sigma: compute them once.
+    """What each layer reads of a text: its keys and values there, or its tokens (Wan). They depend on neither the video nor sigma:
+    compute them once.
 
     ``ignored``: the video does not see the text. Only the way back passes through the text tower, with zero gradients,
     because processes that share its weights must gather them together.
     """
 
-    layers: tuple[tuple[Tensor, Tensor], ...]
+    layers: tuple[tuple[Tensor, ...], ...]
     mask: Bool[Tensor, "b m"] | None
     size: int
     ignored: bool = False

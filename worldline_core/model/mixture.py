@@ -14,7 +14,6 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from worldline_core.errors import ConfigError
 from worldline_core.model.layers import (
     GenerationAttention,
     RMSNorm,
@@ -194,6 +193,7 @@ def is_text_parameter(name: str) -> bool:
 class MixtureModel(WorldModel):
     """The world model over Cosmos3's network, or a small one of its form."""
 
+    layer_passes = ("understand",)
     small = (*WorldModel.small, "embed_tokens")
     residual = ("to_add_out.weight", "to_out.weight", "down_proj.weight")
     adapted = r"layers\.\d+\.(self_attn\.(add_[qkv]_proj|to_add_out)|mlp_moe_gen\.\w+_proj)"
@@ -221,21 +221,9 @@ class MixtureModel(WorldModel):
         """Text begins at 0; the video follows it at a distance."""
         return 0.0 if text is None or text.ignored else text.size + self._mixture.temporal_margin
 
-    def encode_text(self, text_ids: Tensor, text_mask: Tensor | None = None) -> TextContext:
-        """Run the understanding tower over right-padded token ids ``(b m)``.
-
-        Raises:
-            ConfigError: the model was built or loaded without its understanding tower.
-        """
-        if self.config.towers != "both":
-            raise ConfigError(
-                "This model has no understanding tower, so it takes no text",
-                expected='towers="both"',
-                got=self.config.towers,
-                next_step="load the Stage I checkpoint with both towers, or leave the text out",
-            )
+    def _read_text(self, text_ids: Tensor, mask: Tensor) -> TextContext:
+        """Run the understanding tower over token ids ``(b m)``."""
         size = text_ids.shape[1]
-        mask = torch.ones_like(text_ids, dtype=torch.bool) if text_mask is None else text_mask.bool()
         cosine, sine = self.rotation(text_positions(mask.sum(dim=1), size))
         by = (rearrange(cosine, "b n d -> b 1 n d"), rearrange(sine, "b n d -> b 1 n d"))
         tokens = self.embed_tokens(text_ids)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from worldline_core.model.mixture import MixtureModel
+from worldline_core.model.wan import WanModel
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import MixtureConfig, WorldModelConfig
+from worldline_core.model.world_model_config import MixtureConfig, WanConfig, WorldModelConfig
 
 
 def build_world_model(config: WorldModelConfig) -> WorldModel:
@@ -12,5 +13,7 @@ def build_world_model(config: WorldModelConfig) -> WorldModel:
     match config:
         case MixtureConfig():
             return MixtureModel(config)
+        case WanConfig():
+            return WanModel(config)
         case _:
             raise TypeError(f"{type(config).__name__} describes no network")

@@ -1,4 +1,4 @@
-"""Task text as token ids: UTF-8 bytes for the embedded models, the backbone's own chat prompt at full size.
+"""Task text as a model takes it: UTF-8 bytes for the embedded models, Cosmos3's own chat prompt, stored embeddings for Wan.
 
 Cosmos3 was trained to read a chat: a system prompt (Nano alone), the instruction, and the clip's length and size.
 """
@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Protocol
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
-from worldline_core.model.world_model_config import MixtureConfig, TextConfig, WorldModelConfig
+from worldline_core.model.checkpoint import read_weights
+from worldline_core.model.world_model_config import MixtureConfig, TextConfig, WanConfig, WorldModelConfig
 from worldline_core.store.artifact_files import read_json
 
 SYSTEM_PROMPT = "You are a helpful assistant who will generate videos from a give prompt."
@@ -142,11 +143,11 @@ END_OF_TEXT = 1
 
 
 class TextEncoder(Protocol):
-    """Texts, each with the clip it describes, to right-padded ids and a mask that is True on real tokens."""
+    """Texts, each with the clip it describes, to right-padded ids (or embeddings) and a mask that is True on real tokens."""
 
     def __call__(
         self, texts: Sequence[str], clips: Sequence[ClipFacts]
-    ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]: ...
+    ) -> tuple[Int[Tensor, "b n"] | Float[Tensor, "b n s"], Bool[Tensor, "b n"]]: ...
 
 
 class ByteText:
@@ -165,6 +166,32 @@ class ByteText:
         return padded([[*(byte + BYTE_OFFSET for byte in text), END_OF_TEXT] for text in cut], 0)
 
 
+class EmbeddedText:
+    """Embeddings of texts from a file (``import_backbone.prompts``); what encoded them is not needed any more."""
+
+    def __init__(self, path: Path, size: int) -> None:
+        self.path, self.embeddings = path, read_weights(path, None)
+        if any(value.ndim != 2 or value.shape[1] != size for value in self.embeddings.values()):
+            raise CheckpointError(
+                "Embeddings of texts have the wrong shape", where=path, expected=f"(tokens, {size}) by text",
+                got={text: tuple(value.shape) for text, value in self.embeddings.items()},
+            )  # fmt: skip
+
+    def __call__(
+        self, texts: Sequence[str], clips: Sequence[ClipFacts]
+    ) -> tuple[Float[Tensor, "b n s"], Bool[Tensor, "b n"]]:
+        """Embeddings of the texts alone. Raises: ConfigError for a text that is not in the file."""
+        missing = sorted(set(texts) - self.embeddings.keys())
+        if missing:
+            raise ConfigError(
+                "No embedding of this text is stored", where=self.path, expected=f"one of {len(self.embeddings)} texts",
+                got=missing[0], next_step="name every instruction of the recordings in import_backbone.prompts, and import again",
+            )  # fmt: skip
+        found = [self.embeddings[text].float() for text in texts]
+        real = [torch.ones(len(value), dtype=torch.bool) for value in found]
+        return pad_sequence(found, batch_first=True), pad_sequence(real, batch_first=True)
+
+
 def load_text_encoder(config: TextConfig, model: WorldModelConfig) -> TextEncoder:
     """The text encoder of a config, for a model of this configuration.
 
@@ -173,12 +200,20 @@ def load_text_encoder(config: TextConfig, model: WorldModelConfig) -> TextEncode
         UnavailableError: there is no tokenizer at ``path``.
         CheckpointError: the tokenizer there is not a Cosmos3 model's.
     """
+    if isinstance(model, WanConfig) != (config.kind == "stored"):
+        raise ConfigError(
+            "The model takes text otherwise", where="text.kind", got=config.kind,
+            expected="stored" if isinstance(model, WanConfig) else "bytes or cosmos3",
+        )  # fmt: skip
+    if config.kind != "bytes" and config.path is None:
+        raise ConfigError("This text needs a folder or a file.", where="text.path", expected="a path")
+    path = Path(config.path or "")
+    if isinstance(model, WanConfig):
+        return EmbeddedText(path, model.text_size)
     if config.kind == "bytes":
         encoder = ByteText(config.max_length)
-    elif config.path is None:
-        raise ConfigError("The backbone's text tokenizer needs a folder.", where="text.path", expected="a path")
     else:
-        encoder = Cosmos3Text(Path(config.path), max_length=config.max_length, system_prompt=config.system_prompt)
+        encoder = Cosmos3Text(path, max_length=config.max_length, system_prompt=config.system_prompt)
     if isinstance(model, MixtureConfig) and model.vocab_size < encoder.vocabulary_size:
         raise ConfigError(
             "The model's vocabulary is too small for this text.",

@@ -58,7 +58,7 @@ class WorldModel(nn.Module, ABC):
     """Predicts the velocity of multi-view latents from the first frame, action maps, and optionally text.
 
     A network has the parts that are declared here by the same names, says how it turns positions (`rotation`), runs over the
-    tokens (`_run`) and reads a text (`encode_text`). Its layers take (tokens, attention, number, condition).
+    tokens (`_run`) and reads a text (`_read_text`). Its layers take (tokens, attention, number, condition).
     """
 
     layers: nn.ModuleList
@@ -68,6 +68,8 @@ class WorldModel(nn.Module, ABC):
     action_encoder: ActionEncoder | None
     action_film: NativeActionFilm | None
 
+    layer_passes: tuple[str, ...] = ()
+    """Methods of a layer, besides its forward pass, that compute with its weights."""
     small: tuple[str, ...] = ("action_encoder.conv",)
     """Beginnings of the names of matrices that start small, whatever their fan-in."""
     residual: tuple[str, ...]
@@ -89,8 +91,7 @@ class WorldModel(nn.Module, ABC):
         """Rotary angles at (time, height, width) of tokens."""
 
     @abstractmethod
-    def encode_text(self, text_ids: Tensor, text_mask: Tensor | None = None) -> TextContext:
-        """What the layers read of right-padded texts, as the model's `TextEncoder` gives them."""
+    def _read_text(self, text_ids: Tensor, mask: Tensor) -> TextContext: ...
 
     @abstractmethod
     def _run(
@@ -154,6 +155,23 @@ class WorldModel(nn.Module, ABC):
     def action_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
         """The branches of the controls, trained at their own rate."""
         return ((name, parameter) for name, parameter in self.named_parameters() if is_action_parameter(name))
+
+    def encode_text(self, text_ids: Tensor, text_mask: Tensor | None = None) -> TextContext:
+        """What the layers read of right-padded texts: token ids ``(b m)`` or embeddings ``(b m s)``, as the model's `TextEncoder`
+        gives them.
+
+        Raises:
+            ConfigError: the model was built or loaded without its understanding tower.
+        """
+        if self.config.towers != "both":
+            raise ConfigError(
+                "This model has no understanding tower, so it takes no text",
+                expected='towers="both"',
+                got=self.config.towers,
+                next_step="load the Stage I checkpoint with both towers, or leave the text out",
+            )
+        every = torch.ones(text_ids.shape[:2], dtype=torch.bool, device=text_ids.device)
+        return self._read_text(text_ids, every if text_mask is None else text_mask.bool())
 
     def forward(
         self,

@@ -134,6 +134,47 @@ class MixtureConfig(WorldModelConfig):
         return self
 
 
+class WanConfig(WorldModelConfig):
+    """Hyper-parameters of :class:`~worldline_core.model.wan.WanModel`; :func:`wan_config` has the published ones."""
+
+    network: Literal["wan"] = "wan"
+    norm_eps: float = Field(default=1e-6, gt=0)
+    rope_theta: float = Field(default=10_000.0, gt=1)
+    text_size: int = Field(default=4096, ge=1)
+    """Values of the embedding of a token of text (umT5)."""
+    text_length: int = Field(default=512, ge=1)
+    """Tokens that every text is filled up to."""
+    prompt_length: int = Field(default=0, ge=0)
+    """Tokens of the model's own prompt, which it reads where it is given no text; 0: padding alone."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.hidden_size != self.num_heads * self.head_dim:
+            raise ValueError(
+                f"hidden_size must be num_heads * head_dim = {self.num_heads * self.head_dim}, got {self.hidden_size}"
+            )
+        if self.prompt_length > self.text_length:
+            raise ValueError(f"prompt_length {self.prompt_length} must fit text_length {self.text_length}")
+        return self
+
+
+def wan_config(**changes: object) -> WanConfig:
+    """Wan2.2-TI2V-5B, three views at 480x640: view slots as for Cosmos3, in pixels, so that rows stay near those it was trained on."""
+    published: dict[str, object] = {
+        "latent_channels": 48,
+        "hidden_size": 3072,
+        "num_layers": 30,
+        "num_heads": 24,
+        "head_dim": 128,
+        "intermediate_size": 14336,
+        "view_offsets": (0.0, 480.0, 992.0),
+        "view_offset_unit": "pixel",
+        "spatial_compression": 16,
+        "view_embedding": False,
+    }
+    return WanConfig.model_validate(published | changes)
+
+
 def _network(values: Any) -> str:
     """The network that values describe; a mixture where they do not say so."""
     named = (
@@ -144,7 +185,9 @@ def _network(values: Any) -> str:
     return "mixture" if named is None else str(named)
 
 
-NetworkConfig = Annotated[Annotated[MixtureConfig, Tag("mixture")], Discriminator(_network)]
+NetworkConfig = Annotated[
+    Annotated[MixtureConfig, Tag("mixture")] | Annotated[WanConfig, Tag("wan")], Discriminator(_network)
+]
 
 
 Cosmos3Size = Literal["nano", "edge"]
@@ -188,30 +231,51 @@ def cosmos3_config(size: Cosmos3Size, **changes: object) -> MixtureConfig:
 
 
 class TextConfig(StrictModel):
-    """``bytes`` needs nothing; ``cosmos3`` reads the backbone's tokenizer from the local folder ``path``.
+    """``bytes`` needs nothing; ``cosmos3`` reads the backbone's tokenizer from the local folder ``path``; ``stored`` reads umT5's
+    embeddings of the texts from the file ``path``, as ``import_backbone.prompts`` leaves them beside the weights (Wan).
 
     ``system_prompt``: the chat begins with one, as Cosmos3-Nano's; Cosmos3-Edge was trained without.
     ``max_length``: tokens of a text; longer instructions are cut.
     """
 
-    kind: Literal["bytes", "cosmos3"] = "bytes"
+    kind: Literal["bytes", "cosmos3", "stored"] = "bytes"
     path: str | None = None
     system_prompt: bool = True
     max_length: int = Field(default=48, ge=2)
 
     def files_read(self) -> dict[str, Path | None]:
-        """The tokenizer's folder, whose content counts in the keys of what reads it."""
+        """The folder or file read, whose content counts in the keys of what reads it."""
         return {"text": None if self.path is None else Path(self.path)}
 
 
 class ImportBackboneConfig(StrictModel):
-    """Import of pretrained weights: which, their frame rate and the stored type."""
+    """Import of pretrained weights: which, their frame rate and the stored type.
 
-    size: Cosmos3Size = "nano"
+    ``prompts``: Wan alone; texts whose umT5 embeddings are stored beside the weights, by the folder's own text encoder. The model
+    reads the first one where it is given no text, or padding alone where there is none.
+    """
+
+    size: Cosmos3Size | Literal["wan2.2-ti2v-5b"] = "nano"
     revision: str | None = Field(default=None, description="commit of the hub; published weights have been renewed")
-    fps: float = Field(default=30.0, gt=0, description="rate of clips that state none: positions advance by 24 / fps")
+    fps: float = Field(
+        default=30.0, gt=0, description="rate of clips that state none: Cosmos3's positions advance by 24 / fps"
+    )
     dtype: Literal["bfloat16", "float16"] = "bfloat16"
     changes: dict[str, Any] = Field(default={}, description="fields of the model's config to set besides (view slots)")
+    prompts: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _prompts_are_read(self) -> Self:
+        if self.prompts and self.size != "wan2.2-ti2v-5b":
+            raise ValueError(f"prompts: {self.size} reads texts by its own tower; leave them out")
+        return self
+
+    @property
+    def published(self) -> MixtureConfig | WanConfig:
+        """Shape of the model that the import makes of the published weights."""
+        if self.size == "wan2.2-ti2v-5b":
+            return wan_config(**self.changes)
+        return cosmos3_config(self.size, fps=self.fps, **self.changes)
 
 
 FULL_STEPS = 35

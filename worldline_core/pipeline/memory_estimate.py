@@ -30,7 +30,7 @@ from worldline_core.model.lpips import LPIPS
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import MixtureConfig, WorldModelConfig
+from worldline_core.model.world_model_config import MixtureConfig, WanConfig, WorldModelConfig
 from worldline_core.pipeline.memory_trace import Held, extrapolated, traced
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
@@ -104,7 +104,7 @@ class Sources:
             tuple(views),
             torch.empty(*size, model.latent_channels, count, *self.grid),
             None if text else torch.empty(*size, model.control_channels, count, *drawn),
-            torch.zeros(clips, text, dtype=torch.long) if text else None,
+            _text(model, clips, text) if text else None,
             torch.ones(clips, text, dtype=torch.bool) if text else None,
         )
 
@@ -141,6 +141,12 @@ class Sources:
         with FakeTensorMode(), torch.no_grad(), autocast(trainer):
             features = teacher_outline(self.teacher)[1]
             return traced(lambda: features(self.video(frames, views)))
+
+
+def _text(model: WorldModelConfig, clips: int, tokens: int) -> Tensor:
+    """Texts as the model takes them: ids, or embeddings."""
+    sizes = (model.text_size,) if isinstance(model, WanConfig) else ()
+    return torch.zeros(clips, tokens, *sizes, dtype=torch.float32 if sizes else torch.long)
 
 
 @dataclass(frozen=True)

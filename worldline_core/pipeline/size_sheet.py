@@ -13,7 +13,7 @@ from pydantic import ByteSize, Field
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import DESCRIPTION, read_checkpoint_info
-from worldline_core.model.world_model_config import WorldModelConfig, cosmos3_config
+from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline.cards import CARDS, UTILISATION, CardName
 from worldline_core.pipeline.memory_estimate import USABLE, AnyStage, Estimate, Row, Sources, gigabytes, stage_rows
 from worldline_core.pipeline.pipeline_config import PipelineConfig
@@ -55,11 +55,7 @@ class SizeSheet(StrictModel):
         if base is not None and (base / DESCRIPTION).is_file():
             return read_checkpoint_info(base).config
         if self.config.import_backbone is not None and self.config.models.base is not None:
-            return cosmos3_config(
-                self.config.import_backbone.size,
-                fps=self.config.import_backbone.fps,
-                **self.config.import_backbone.changes,
-            )
+            return self.config.import_backbone.published
         if self.config.train_stage1 is None:
             raise ConfigError(
                 "The size of the model is not known.",

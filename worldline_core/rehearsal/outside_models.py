@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from worldline_core.model.cosmos3 import SINGLE
+from worldline_core.model.backbone_folder import SINGLE
 from worldline_core.model.lpips import BACKBONE_FILE, HEADS_FILE, LAYERS
 from worldline_core.model.text import SYSTEM_PROMPT, VISION_START
 from worldline_core.model.tokenizers import WAN22_MEAN, WAN22_STD

@@ -175,6 +175,7 @@ def _record_skipped(run: Path, index: int, skipped: tuple[tuple[Clip, str], ...]
 class Batch:
     """One micro-batch. Outcome labels are not here on purpose: they never reach the model.
 
+    ``text_ids``: token ids of the texts, or their embeddings.
     ``fps``: frames per second of each clip as it is shown (a stride lowers the rate); None where no rates are known.
     ``frames``: where clips are read as frames, those that the latents are of.
     ``weights``: of the squared error, where some places count more than others (what the task moves).
@@ -184,7 +185,7 @@ class Batch:
     views: tuple[str, ...]
     latents: Float[Tensor, "b v c t h w"]
     action_maps: Float[Tensor, "b v a t #h #w"] | None = None
-    text_ids: Int[Tensor, "b n"] | None = None
+    text_ids: Int[Tensor, "b n"] | Float[Tensor, "b n s"] | None = None
     text_mask: Bool[Tensor, "b n"] | None = None
     frames: UInt8[Tensor, "b v frames height width 3"] | None = None
     fps: Float[Tensor, " b"] | None = None

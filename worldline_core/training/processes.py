@@ -239,7 +239,8 @@ def place_model(
     fully_shard(model.time_embedder, mesh=mesh, mp_policy=plain)
     for layer in model.layers:
         fully_shard(layer, mesh=mesh, mp_policy=policy)
-        register_fsdp_forward_method(layer, "understand")
+        for name in model.layer_passes:
+            register_fsdp_forward_method(layer, name)
     # Freed after every pass: averages are swapped in for validation, and a copy kept from before would be stale.
     fully_shard(model, mesh=mesh, mp_policy=policy, reshard_after_forward=True)
     for name in ("encode_text", "forward_block", "write_block", "forward_teacher_forcing"):

@@ -235,6 +235,8 @@ class Stage1Config(StageConfig):
             raise ValueError(
                 "lora adapts the video tower: set text_tower to frozen, or to stored where prompts are few"
             )
+        if self.text.kind == self.text_tower == "stored":
+            raise ValueError("text_tower stored is for a tower that reads texts; a model of stored embeddings has none")
         return self
 
     def weights_read(self) -> Mapping[str, Path | None]:
