@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import gc
 import multiprocessing
 import os
 import shutil
@@ -25,9 +24,6 @@ if TYPE_CHECKING:
     from worldline_core.model.world_model import WorldModel
     from worldline_core.model.world_model_config import ActionContract, CausalSpec
 
-os.fsync = lambda descriptor: None  # no test cuts the power, and thousands of files would wait for the disk
-gc.disable()  # until all is imported: nothing of it is garbage
-
 CHECKED_PACKAGES = ("geometry", "actions", "model", "training", "distillation", "rollout")
 """Of the core: their functions are called with shapes and types checked against the annotations, in tests only."""
 check_shapes_of([f"worldline_core.{name}" for name in CHECKED_PACKAGES])
@@ -41,13 +37,6 @@ PROJECT_ROOT = Path(__file__).resolve().parents[1]
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The rehearsal takes as long as all other slow tests on one core: begun last, it would keep the second one idle."""
     items.sort(key=lambda item: "tests/rehearsal/" not in item.nodeid)
-
-
-def pytest_collection_finish() -> None:
-    """What is imported by now stays: looking through it again and again for garbage took up to a tenth of the time."""
-    gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
-    gc.enable()
 
 
 @pytest.fixture
