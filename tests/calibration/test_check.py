@@ -17,12 +17,14 @@ from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.calibration import check as check_module
 from worldline_core.calibration import check_report
-from worldline_core.calibration.check import ListedEpisode, check_calibration, repairing_lines
+from worldline_core.calibration.check import GuardedSource, ListedEpisode, check_calibration, repairing_lines
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SourceDiagnosis
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import LoadedEpisode
+from worldline_core.data.guards.reader_process import ReaderLimits
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.sources.open import EpisodeSetSourceConfig
 from worldline_core.errors import DataError
 
 CLEAN, INVERTED = "ur5e_silver-test-s1-00000", "ur5e_silver-train-s1-00002"
@@ -107,6 +109,16 @@ def test_a_bad_episode_is_listed_and_the_rest_goes_on(episode: Episode, images: 
     assert "truncated_video: The file ends early; expected 24; got 12" in check_report.table_text(check)
     stored = json.loads((tmp_path / "diagnoses.json").read_text())
     assert [entry["reason"] for entry in stored["episodes"]] == reasons
+
+
+def test_recordings_are_read_in_a_process_with_limits_first(project_root: Path) -> None:
+    config = EpisodeSetSourceConfig(kind="episode_set", path=project_root / "artifacts/shipped/recordings")
+    source = GuardedSource(config, ReaderLimits())
+    first = source.episode_ids()[0]
+    assert source.load(first).episode.num_frames > 1
+    with pytest.raises(RejectedInputError) as caught:
+        GuardedSource(config, ReaderLimits(memory_gb=0.01)).load(first)
+    assert caught.value.reason == "out_of_memory"
 
 
 def made_up() -> check_report.CalibrationCheck:

@@ -128,7 +128,7 @@ def estimate_cameras(config: EstimateConfig, inputs: Mapping[str, Path], output:
     Raises: DataError as `estimate_command`.
     """
     del inputs  # they are in the configuration, and in the cache key
-    found = _estimate_source(episodes_of_sources([config.source]), config.description_paths, (), output)
+    found = _estimate_source(episodes_of_sources([config.source], config.reader), config.description_paths, (), output)
     verdicts = {view.view: view.verdict for view in found.views}
     for view in found.views:
         logger.info("%s", headline(view))

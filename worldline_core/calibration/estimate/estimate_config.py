@@ -11,6 +11,7 @@ from pydantic import Field
 from worldline_core.config import StrictModel
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
+from worldline_core.data.guards.reader_process import ReaderLimits
 from worldline_core.data.sources.open import SourceConfig
 
 CAMERAS = "cameras.json"
@@ -22,6 +23,7 @@ class EstimateConfig(StrictModel):
 
     source: SourceConfig
     description_paths: dict[str, str] = Field(default_factory=dict)
+    reader: ReaderLimits = ReaderLimits()
 
     @classmethod
     def of(cls, curate: CurateConfig, description_paths: Mapping[str, str]) -> Self | None:
@@ -30,7 +32,7 @@ class EstimateConfig(StrictModel):
         robot = getattr(source, "embodiment", NO_EMBODIMENT)
         if len(curate.sources) > 1 or getattr(source, "calibration", "") is not None or robot == NO_EMBODIMENT:
             return None
-        return cls(source=source, description_paths=dict(description_paths))
+        return cls(source=source, description_paths=dict(description_paths), reader=curate.reader)
 
     def weights_read(self) -> Mapping[str, Path | None]:
         return CurateConfig(sources=(self.source,)).weights_read()
