@@ -15,10 +15,12 @@ from pydantic import ValidationError
 from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
+from torchao.optim.subclass_8bit import OptimState8bit
 
 from worldline_core.errors import ArtifactError, ConfigError, StoppedError, TrainingError
 from worldline_core.store.store import ArtifactStore
 from worldline_core.training import processes
+from worldline_core.training.optimizers import make_optimizer
 from worldline_core.training.processes import BatchPlan
 from worldline_core.training.trainer import Objective, ParameterGroup, train
 from worldline_core.training.training_config import SavingConfig, TrainerConfig
@@ -148,6 +150,21 @@ def test_forms_that_save_memory_take_small_steps_and_go_on_with_the_same_bytes(t
     assert all(torch.equal(one, other) for one, other in zip(found, wanted, strict=True))
     assert (1 - wanted[0].mean()).item() == pytest.approx(12 * 2e-4, rel=0.15)
     assert 0 < (1 - wanted[1].mean()).item() < 12 * 2e-4
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_moments_are_rounded_to_the_nearest_as_torchao_does(signed):
+    parameter = nn.Parameter(torch.zeros(64, 256))
+    config = TrainerConfig.model_validate({"steps": 1, "optimizer": {"moments": "8bit"}})
+    found = make_optimizer(config, [[parameter]])._new_buffer(parameter, signed)
+    wanted = OptimState8bit.zeros(parameter.shape, signed, 256, parameter.device)
+    values = torch.randn(64, 256, generator=torch.Generator().manual_seed(0)) ** 5
+    values = values if signed else values.abs()
+    errors = [(moment.copy_(values).dequantize() - values).abs().mean().item() for moment in (found, wanted)]
+    assert torch.equal(found.scale, wanted.scale)
+    # Those that lie half way between two of the 256 values may go either way.
+    assert (found.codes != wanted.codes).float().mean() < 0.01
+    assert errors[0] == pytest.approx(errors[1], rel=1e-3)
 
 
 @pytest.mark.parametrize("error", [RuntimeError("[gloo/transport/tcp/pair.cc:544] Connection closed by peer"), None])

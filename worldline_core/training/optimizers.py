@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, cast
 
 import torch
@@ -39,8 +40,29 @@ def make_optimizer(config: TrainerConfig, groups: Sequence[Sequence[nn.Parameter
     }  # fmt: skip
     if not _saves_memory(config):
         return torch.optim.AdamW(parts, fused=True, **common)
+    adamw, moment = _torchao_classes()
+
+    class AdamW(adamw):
+        """With moments in float32 where they are not in 8 bits, whatever the dtype of the weights."""
+
+        def _new_buffer(self, p: Tensor, signed: bool) -> Tensor:
+            if settings.moments == "8bit" and in_eight_bits(p):
+                return moment.zeros(p.shape, signed, BLOCK, p.device, dtype=torch.float32)
+            return torch.zeros_like(p, dtype=torch.float32)
+
+    return AdamW(parts, bf16_stochastic_round=config.weights == "bf16", **common)
+
+
+@cache
+def _torchao_classes() -> tuple[Any, Any]:
+    """torchao's AdamW, and its moments in 8 bits with a quicker way to round on a CPU.
+
+    Raises:
+        UnavailableError: torchao is not installed.
+    """
     try:
         from torchao.optim import AdamW8bit
+        from torchao.optim.quant_utils import scale_tensor
         from torchao.optim.subclass_8bit import OptimState8bit
     except ImportError as error:
         raise UnavailableError(
@@ -48,15 +70,34 @@ def make_optimizer(config: TrainerConfig, groups: Sequence[Sequence[nn.Parameter
             next_step=installing("one-gpu"),
         ) from error  # fmt: skip
 
-    class AdamW(AdamW8bit):
-        """With moments in float32 where they are not in 8 bits, whatever the dtype of the weights."""
+    class Moment(OptimState8bit):
+        pass
 
-        def _new_buffer(self, p: Tensor, signed: bool) -> Tensor:
-            if settings.moments == "8bit" and in_eight_bits(p):
-                return OptimState8bit.zeros(p.shape, signed, BLOCK, p.device, dtype=torch.float32)
-            return torch.zeros_like(p, dtype=torch.float32)
+    copy = torch.ops.aten.copy_.default
+    other_copy = Moment._ATEN_OP_TABLE[Moment][copy]
 
-    return AdamW(parts, bf16_stochastic_round=config.weights == "bf16", **common)
+    @Moment.implements(copy)
+    def _(func: Any, types: Any, args: tuple[Any, ...], kwargs: Any) -> Any:
+        moment, values = args[0], args[1]
+        if not isinstance(moment, Moment) or isinstance(values, OptimState8bit) or values.device.type != "cpu":
+            return other_copy(func, types, args, kwargs)
+        scaled, scale = scale_tensor(values, moment.block_size)
+        # torchao's own search through the 256 values, for a GPU's compiler, takes a CPU 100 times as long as AdamW.
+        moment.codes.copy_(_codes_of_halves(moment.signed).take(scaled.half().view(torch.int16).long() + 2**15))
+        moment.scale.copy_(scale)
+        return moment
+
+    return AdamW8bit, Moment
+
+
+@cache
+def _codes_of_halves(signed: bool) -> Tensor:
+    """Code of the nearest of 256 values, for each number in half precision in the order of its bits."""
+    from torchao.optim.quant_utils import create_dynamic_map
+
+    values = torch.tensor(create_dynamic_map(signed))
+    halves = torch.arange(-(2**15), 2**15).to(torch.int16).view(torch.float16).float().nan_to_num(0)
+    return torch.bucketize(halves, (values[1:] + values[:-1]) / 2, right=True).to(torch.uint8)
 
 
 def empty_moments(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> dict[str, Tensor]:
