@@ -181,6 +181,7 @@ def recorded_views(
                         expected=f"{sizes[view][1]}x{sizes[view][0]}", got=f"{size[1]}x{size[0]}",
                         next_step="give each size a source of its own",
                     )  # fmt: skip
+            found.setdefault(view, [])
             frames_of = slice(kept.start, min(kept.stop, len(gray), length))
             if frames_of.stop - frames_of.start < FEWEST_FRAMES:
                 continue
@@ -189,7 +190,7 @@ def recorded_views(
                 episode.episode_id, np.stack(gray[frames_of]), reading.points[::every][frames_of], reading.radii,
                 reading.tools[::every][frames_of], gripper, np.stack(coloured[frames_of]) if colour else None,
             )  # fmt: skip
-            found.setdefault(view, []).append(shown)
+            found[view].append(shown)
     if faults and not found:
         raise faults[0]
     if faults:

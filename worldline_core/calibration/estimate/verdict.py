@@ -22,7 +22,7 @@ from worldline_core.calibration.camera_errors import (
     kinds_of_error,
     projected,
 )
-from worldline_core.calibration.estimate.recordings import RecordedView
+from worldline_core.calibration.estimate.recordings import FEWEST_FRAMES, RecordedView
 from worldline_core.calibration.estimate.refine import FittedCamera, equations_at, inflation
 from worldline_core.calibration.estimate.still_camera import (
     AGREEMENT_BLUR,
@@ -99,6 +99,8 @@ class SourceEstimate:
 def too_few(recorded: RecordedView) -> str | None:
     """Why a view has too few episodes; None where it has enough."""
     count = len(recorded.episodes)
+    if count == 0:
+        return f"no episode has {FEWEST_FRAMES} pictures: nothing is seen to move"
     return None if count >= FEWEST_EPISODES else f"{count} episodes: {FEWEST_EPISODES} are needed to hold some out"
 
 
