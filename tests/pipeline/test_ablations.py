@@ -18,7 +18,7 @@ import pytest
 from flows.ablations import compare_variants
 from tasks.execution.artifact_task import TaskCall
 from tasks.execution.chain import outline
-from worldline_core.config import load_config
+from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.scores import Score, summarise, write_scores
 from worldline_core.pipeline.ablations import choose_variants, matched_length, tokens_a_step, variant_config
@@ -145,7 +145,7 @@ def test_the_table_shows_numbers_counts_intervals_and_reasons(tmp_path: Path) ->
     budgets = {"8": {}, "32": {"success": planning, "gain": planning | {"mean": 0.25}, "banks": {"x": 1.0, "y": 0.5}}}
     write_json_atomic(tmp_path / "plan/summary.json", {"methods": {"banks_stage2": {"budgets": budgets}}})
     counts = ablation_table(config, inputs | {"evaluate_planning.full.0": tmp_path / "plan"}, tmp_path / "out")
-    assert (counts["cells"], counts["measured"]) == (21, 5)
+    assert (counts["cells"], counts["measured"]) == (24, 5)
     rows = table_rows(tmp_path / "out/table.parquet")
     full, head = rows["full", "held_out_robot_iou"], rows["head_only", "held_out_robot_iou"]
     assert (full["mean"], full["count"], full["paper"], full["difference"]) == (pytest.approx(0.7), 3, "0.5622", None)
@@ -185,6 +185,15 @@ def test_every_variant_is_trained_with_every_seed_on_the_same_data(tmp_path: Pat
     own.write_text("noise: {label: noise}\n")
     with pytest.raises(ConfigError, match=r"(?s)own\.yaml.*full: first"):
         choose_variants(file=own)
+
+
+def test_the_variants_of_one_card_train_what_they_say() -> None:
+    calls = outline(compare_variants, load, choose_variants(file=CONFIG_ROOT / "variants" / "one_card.yaml"))
+    trainings = [call.config for name, call in calls.items() if call.task.name == "train_stage2"]
+    forms = [(c.lora and c.lora.rank, c.trainer.optimizer.moments, c.trainer.weights) for c in trainings]
+    assert forms == [
+        (None, "fp32", "fp32"), (16, "fp32", "fp32"), (64, "fp32", "fp32"), (None, "8bit", "fp32"), (None, "8bit", "bf16")
+    ]  # fmt: skip
 
 
 def test_an_interval_over_seeds_and_recordings_is_wider_than_over_recordings(tmp_path: Path) -> None:

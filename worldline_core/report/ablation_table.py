@@ -28,6 +28,7 @@ COLUMNS = {
     "held_out_lpips": "held out: LPIPS ↓",
     "held_out_robot_iou": "held out: robot IoU ↑",
     "held_out_object_iou": "held out: object IoU ↑",
+    "held_out_tool_error": "held out: tool error [px] ↓",
     "ood_lpips": "out of domain: LPIPS ↓",
     "ood_robot_iou": "out of domain: robot IoU ↑",
     "success": "planning: success [%] ↑",
@@ -37,6 +38,7 @@ VIDEO_COLUMNS = {
     "held_out_lpips": ("test", "lpips"),
     "held_out_robot_iou": ("test", "robot_iou"),
     "held_out_object_iou": ("test", "object_iou_exact"),
+    "held_out_tool_error": ("test", "end_effector_error_px"),
     "ood_lpips": ("ood_test", "lpips"),
     "ood_robot_iou": ("ood_test", "robot_iou"),
 }
