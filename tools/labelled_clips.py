@@ -92,7 +92,7 @@ def with_sensor_noise(clip: Clip, random: np.random.Generator) -> Clip:
 
 
 def static(clip: Clip, random: np.random.Generator) -> Clip:
-    """The robot stands for 1.75 to 4 s before, in, or after the clip."""
+    """The robot is still for 1.75 to 4 s before, in, or after the clip."""
     count = clip.episode.num_frames
     length = int(random.integers(round(1.75 * clip.episode.fps), round(4 * clip.episode.fps) + 1))
     start = int(random.choice([0, int(random.integers(4, count - 4)), count - 1]))
@@ -240,7 +240,7 @@ def base_motion(clip: Clip, random: np.random.Generator) -> Clip:
 
 
 def textured_room(clip: Clip, random: np.random.Generator) -> Clip:
-    """The same furnished room as in `base_motion`, and the chassis stands: no fault."""
+    """The same furnished room as in `base_motion`, and the chassis is still: no fault."""
     return replace(_driven(clip, random, (0, 0)), fault="", bad=None)
 
 
@@ -255,8 +255,8 @@ def _driven(clip: Clip, random: np.random.Generator, span: tuple[int, int]) -> C
 def late_states(clip: Clip, random: np.random.Generator) -> Clip:
     """States and actions are 0.25 to 0.75 s late or early against pictures and camera poses."""
     lag, states, pictures = _lag(clip, random)
-    shown, told = at_frames(clip, pictures), at_frames(clip, states)
-    episode = replace(shown.episode, state=told.episode.state, action=told.episode.action)
+    shown, measured = at_frames(clip, pictures), at_frames(clip, states)
+    episode = replace(shown.episode, state=measured.episode.state, action=measured.episode.action)
     bad = np.ones(len(states), bool)
     return replace(shown, episode=episode, fault="time_alignment", bad=bad, severity=f"states {lag:+d}")
 
@@ -264,10 +264,10 @@ def late_states(clip: Clip, random: np.random.Generator) -> Clip:
 def late_pictures(clip: Clip, random: np.random.Generator) -> Clip:
     """Pictures of all cameras are 0.25 to 0.75 s late or early against states and camera poses."""
     lag, pictures, states = _lag(clip, random)
-    shown, told = at_frames(clip, pictures), at_frames(clip, states)
+    shown, measured = at_frames(clip, pictures), at_frames(clip, states)
     bad = np.ones(len(states), bool)
     return replace(
-        told, frames=shown.frames, masks=shown.masks, fault="time_alignment", bad=bad, severity=f"pictures {lag:+d}"
+        measured, frames=shown.frames, masks=shown.masks, fault="time_alignment", bad=bad, severity=f"pictures {lag:+d}"
     )
 
 

@@ -24,7 +24,7 @@ def shipped_folder() -> Path:
 
 
 def project_path(project: Path, path: Path) -> Path:
-    """A folder that a preset names: relative ones lie in ``project``; ``artifacts/shipped`` comes with the project where
+    """A folder that a preset names: relative ones are in ``project``; ``artifacts/shipped`` comes with the project where
     ``project`` has none."""
     here = project / path
     if here.exists() or path.is_absolute() or path.parts[: len(SHIPPED.parts)] != SHIPPED.parts:

@@ -1,6 +1,6 @@
 """Overlays: action tracks drawn over frames, of one view or of all views together, with a legend.
 
-Every picture of the project in which controls lie over a frame is drawn here: previews of `render_actions`, the report,
+Every picture of the project in which controls are drawn over a frame is drawn here: previews of `render_actions`, the report,
 `worldline inspect`, Rerun layers and the pictures of `worldline calibrate check`.
 
 What is drawn of an end-effector that is valid in a view (nothing is drawn of the others):
@@ -9,7 +9,7 @@ What is drawn of an end-effector that is valid in a view (nothing is drawn of th
 - the tool's axes, 6 cm long, x red, y green, z blue, in perspective;
 - a ring around the tool's centre, the wider the further the gripper is open.
 
-Frames and tracks may differ in resolution: both are brought to the size of the picture. Pixel centres lie at whole
+Frames and tracks may differ in resolution: both are brought to the size of the picture. Pixel centres are at whole
 numbers (`geometry.cameras`).
 """
 

@@ -190,7 +190,7 @@ def render_actions(
     write_account(output, account)
     check_account(output, len(episodes), {row["episode_id"] for row in rows}, {row.episode_id for row in rejected})
     if not rows:
-        shutil.rmtree(output / "run")  # what is missing may lie outside of the set, as a kinematic description does
+        shutil.rmtree(output / "run")  # what is missing may be outside of the set, as a kinematic description does
         next_step = "give what is missing; render_actions.source=state projects recorded tool poses without kinematics"
         raise nothing_kept("No episode got action tracks", output, rejected, next_step)
     write_index(output, rows, sigma_px_ref=config.sigma_px_ref)

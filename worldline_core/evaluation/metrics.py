@@ -42,7 +42,7 @@ def psnr(predicted: Float[Tensor, "n 3 h w"], true: Float[Tensor, "n 3 h w"]) ->
 def ssim(predicted: Float[Tensor, "n 3 h w"], true: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
     """Structural similarity of each frame (Wang et al. 2004): Gaussian window 11, sigma 1.5, mean over channels.
 
-    Intensities in [0, 1]. Only window positions that lie fully inside the frame count, as in scikit-image.
+    Intensities in [0, 1]. Only window positions fully inside the frame count, as in scikit-image.
 
     Raises: DataError when the shapes differ or a frame is smaller than the window.
     """

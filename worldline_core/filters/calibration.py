@@ -183,7 +183,7 @@ def detect_projection(gray: np.ndarray, uv: np.ndarray, inside: np.ndarray, conf
     they carry fill half of the picture it cannot be large, but the change near the tool still ranks high.
 
     Args:
-        gray: uint8 (n, h, w) of a view that stands still.
+        gray: uint8 (n, h, w) of a still camera.
         uv: (n, a, 2) projected tools. inside: bool (n, a).
     """
     width = gray.shape[2]

@@ -494,7 +494,7 @@ def detect_base_motion(area: np.ndarray, fps: float, config: BaseMotionConfig) -
     """Stretches in which the whole picture moves.
 
     Args:
-        area: (n,) from `changed_area` of a camera that stands still in the base frame.
+        area: (n,) from `changed_area` of a camera that is still in the base frame.
     """
     bad = long_runs(area > config.min_changed_area, config.min_run_s * fps, gap=0.25 * fps)
     passed = bad.mean() <= config.max_moving_share

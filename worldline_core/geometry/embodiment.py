@@ -282,7 +282,7 @@ def own_embodiment(name_or_path: str) -> Path | None:
 
 
 def carry_embodiments(paths: Iterable[Path]) -> list[str]:
-    """Let robots be found by their names, whose files lie anywhere; returns the names.
+    """Let robots be found by their names, whose files are anywhere; returns the names.
 
     Raises: ConfigError when a file is no embodiment, or another robot has its name already.
     """

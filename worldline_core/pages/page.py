@@ -1,6 +1,6 @@
-"""Static pages from templates: every text is escaped, styles and scripts are inside the page, media lie beside it.
+"""Static pages from templates: every text is escaped, styles and scripts are inside the page, media beside it.
 
-Templates lie beside the code that fills them and are named from the package's root: `report/data.html`.
+Templates are beside the code that fills them, named from the package's root: `report/data.html`.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class Table:
 
     Attributes:
         numeric: positions of the columns with numbers, aligned right.
-        dense: intervals stand below their values, for tables of many columns.
+        dense: intervals below their values, for tables of many columns.
     """
 
     headings: Sequence[str]

@@ -77,7 +77,7 @@ class CameraTrack:
     def resized(self, width: int, height: int) -> CameraTrack:
         """The same camera at another image size; K follows the resize.
 
-        Pixel centres lie at integer coordinates, so u' = (u + 1/2) s - 1/2.
+        Pixel centres are at integer coordinates, so u' = (u + 1/2) s - 1/2.
         """
         return self.transformed(ImageTransform.of((self.height, self.width)).resize((height, width)))
 

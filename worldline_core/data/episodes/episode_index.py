@@ -28,7 +28,7 @@ class EpisodeRow(EpisodeLabels):
     """One episode, or a kept segment of one: its labels, and its place.
 
     Attributes:
-        dataset: folder of the LeRobot dataset, relative to the set; may lie in another artifact.
+        dataset: folder of the LeRobot dataset, relative to the set; may be in another artifact.
         start, stop: frames of the stored episode that this row covers, stop exclusive.
         num_frames: stop - start. video_frames: how many of them, from the first on, have images.
         stage2_reason: why not stage2_ok.

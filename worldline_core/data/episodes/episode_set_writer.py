@@ -406,7 +406,7 @@ def _check_sizes(
 def copy_embodiments(names: Iterable[str], folder: Path) -> None:
     """Write files of robots that do not ship with the project, and their descriptions, into a folder.
 
-    Raises: ConfigError: a description does not lie beside or below its YAML file.
+    Raises: ConfigError: a description is not beside or below its YAML file.
     """
     for name in sorted(set(names)):
         if (path := own_embodiment(name)) is None:

@@ -247,7 +247,7 @@ class GripperRange(StrictModel):
     def opening(self, raw: np.ndarray) -> tuple[np.ndarray, int]:
         """Opening in 0 closed .. 1 open, clipped, and how many readings lay outside.
 
-        Raises: RejectedInputError (invalid_gripper) where a gripper (a column of (N, ...) readings) lies further outside
+        Raises: RejectedInputError (invalid_gripper) where a gripper (a column of (N, ...) readings) is further outside
             than a tenth of the range in most frames: the range, the unit or the column is not the gripper's.
         """
         raw = np.asarray(raw, dtype=np.float64)

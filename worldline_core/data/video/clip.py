@@ -361,7 +361,7 @@ class FrameDecoder:
         """uint8 (H, W, 3) RGB of the clip's frames ``indices`` (increasing), one after the other.
 
         Raises: RejectedInputError: missing_file; unreadable, truncated_video when a frame is not there. DataError when the
-            indices are not increasing, or lie outside of the clip.
+            indices are not increasing, or outside of the clip.
         """
         if not indices or any(b <= a for a, b in pairwise(indices)):
             raise DataError(
@@ -428,7 +428,7 @@ def decode_frames(clip: VideoClip, indices: Sequence[int] | None = None) -> np.n
     Args:
         indices: frame numbers inside the clip, in any order, also repeated; None for all.
 
-    Raises: DataError when an index lies outside of the clip; RejectedInputError when a frame cannot be decoded.
+    Raises: DataError when an index is outside of the clip; RejectedInputError when a frame cannot be decoded.
     """
     wanted = range(clip.num_frames) if indices is None else [int(index) for index in indices]
     ordered = sorted(set(wanted))

@@ -104,7 +104,7 @@ def shrunk(luma: np.ndarray) -> np.ndarray:
     while luma.shape[1] % 2 == 0 and luma.shape[0] % 2 == 0 and luma.shape[1] >= 2 * GRAY_WIDTH:
         luma = cv2.resize(luma, (luma.shape[1] // 2, luma.shape[0] // 2), interpolation=cv2.INTER_AREA)
     if luma.shape == (height, GRAY_WIDTH):
-        return luma.copy()  # the plane it lies in belongs to the decoder
+        return luma.copy()  # the plane belongs to the decoder
     # The exact variant gives the same bytes on every processor.
     gentle = luma.shape[1] < 2 * GRAY_WIDTH
     return cv2.resize(luma, (GRAY_WIDTH, height), interpolation=cv2.INTER_LINEAR_EXACT if gentle else cv2.INTER_AREA)

@@ -1,7 +1,7 @@
 """The step evaluate_planning: is the candidate chosen by its predicted video better than one taken blindly?
 
 Every method's videos of the same banks go through the same brackets. Labels stay sealed until all choices of all methods are on disk.
-The recorded videos are chosen from too (method ``true``): that is the selector's own ceiling. Beside the methods stand shortcuts,
+The recorded videos are chosen from too (method ``true``): that is the selector's own ceiling. Beside the methods are shortcuts,
 which see no video (`shortcuts`): what a model gains counts over the best of them.
 """
 

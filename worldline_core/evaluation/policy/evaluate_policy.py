@@ -96,7 +96,7 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
             part = part_file(output / "run" / "parts", method, row.episode_id, seed)
             verdict = kept_part(part, partial(judge_video, row, rollouts.get(method), seed))
             judged.append(_decision(row, method, seed, verdict))
-    # The outcome may lie after the end of a video that is shorter than its recording.
+    # The outcome may come after the end of a video that is shorter than its recording.
     too_short = Counter(verdict["method"] for verdict in judged if not verdict["whole"])
     if too_short:
         logger.warning("Predictions shorter than their recordings were not judged: %s", dict(too_short))
