@@ -23,7 +23,7 @@ from worldline_core.calibration.camera_errors import (
     projected,
 )
 from worldline_core.calibration.estimate.recordings import FEWEST_FRAMES, RecordedView
-from worldline_core.calibration.estimate.refine import FittedCamera, equations_at, inflation
+from worldline_core.calibration.estimate.refine import FOCAL, FittedCamera, equations_at, inflation
 from worldline_core.calibration.estimate.still_camera import (
     AGREEMENT_BLUR,
     StillCamera,
@@ -35,6 +35,8 @@ from worldline_core.calibration.estimate.wrist_camera import LEAST_WRIST_AGREEME
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import Resize, project_points
 
+ZOOM_ERROR = 0.15
+"""Standard deviation of the focal length, and of the distance with it, that flow of a close robot leaves; from known cameras."""
 LEAST_AGREEMENT, LEAST_EPISODE = 0.5, 0.25
 """Cosine of predicted and measured flow on episodes that are held out: the median, and of one that says nothing else."""
 RIVAL_DEVIATIONS = 3.0
@@ -118,7 +120,12 @@ def too_little(recorded: RecordedView) -> str | None:
 def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     """The estimate of a still view with its intervals and all reasons against it."""
     fitted, views = found.fitted, recorded.still_views(fine=True)
-    kinds = _intervals(recorded, fitted, shown_by(fitted, views), recorded.shared)
+    tools = np.concatenate([e.tools[:, :, :3, 3].reshape(-1, 3) for e in recorded.episodes])
+    depth = float(np.median(project_points(tools, fitted.camera.K, fitted.camera.T_base_camera)[1]))
+    # Seen from farther away through a longer lens, a robot looks nearly the same.
+    zoom = np.zeros(PARAMETERS)
+    zoom[5], zoom[FOCAL] = -ZOOM_ERROR * depth, ZOOM_ERROR
+    kinds = _intervals(recorded, fitted, shown_by(fitted, views), recorded.shared, zoom)
     reasons: list[str] = []
     typical = float(np.median(found.agreements))
     if typical < LEAST_AGREEMENT:
@@ -171,7 +178,7 @@ def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
     fitted = found.fitted
     _, _, ahead, slope = projected(np.zeros((1, 1, 3)), fitted.camera)
     shown = 100 / fitted.camera.width * np.c_[slope[:, :, 0, 0], np.zeros(2)]
-    kinds = _intervals(recorded, fitted, shown, SHARED_WRIST_CAMERA)
+    kinds = _intervals(recorded, fitted, shown, SHARED_WRIST_CAMERA, np.zeros(PARAMETERS))
     reasons: list[str] = []
     typical, known = found.agreement, int(np.isfinite(found.agreements).sum())
     if known < FEWEST_EPISODES:
@@ -243,13 +250,15 @@ def full_size(camera: CameraTrack, image_size: tuple[int, int]) -> CameraTrack:
 
 
 def _intervals(
-    recorded: RecordedView, fitted: FittedCamera, shown: np.ndarray, shared: float
+    recorded: RecordedView, fitted: FittedCamera, shown: np.ndarray, shared: float, systematic: np.ndarray
 ) -> tuple[KindOfError, ...]:
     """The errors of each kind that the estimate may have. The last is that of the robot's place in the picture, of which `shown`
-    (2, 8) [% of the width] is the displacement by each parameter.
+    (2, 8) [% of the width] is the displacement by each parameter. `systematic` (8,) is the standard deviation of the error that no
+    number of pictures reduces, in its own direction.
     """
     scale = np.append(SCALE[:-1], recorded.every)
     covariance = np.linalg.inv(fitted.information) * inflation(len(recorded.episodes), shared)
+    covariance += np.outer(systematic, systematic)
     return kinds_of_error(np.zeros(PARAMETERS), covariance * np.outer(scale, scale), shown / scale)
 
 
