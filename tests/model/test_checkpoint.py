@@ -147,6 +147,7 @@ def test_damaged_files_are_refused(folder):
         (json.dumps(content | {"version": 2}), "Not a checkpoint of this version"),
         (json.dumps(content | {"kind": "other"}), "kind: Input should be"),
         (json.dumps(content | {"config": content["config"] | {"hidden": 3}}), r"config\.mixture\.hidden: Extra inputs"),
+        (json.dumps(content | {"config": content["config"] | {"network": ["wan"]}}), "network must be mixture or wan"),
         (json.dumps(without), "metadata: Field required"),
         ("{", "not JSON"),
     ):

@@ -92,6 +92,25 @@ def test_diffusers_weights_give_the_same_velocity_and_gradients(seed, own_prompt
 
 
 @torch.no_grad()
+def test_views_in_slots_without_gaps_are_one_tall_picture(tmp_path):
+    theirs = random_transformer()
+    theirs.save_pretrained(tmp_path)
+    slots = {"view_offsets": (0.0, 64.0, 128.0), "text_length": LENGTH}  # pixels; a view has two rows of patches of 32
+    found, _ = read_wan(tmp_path, changes=slots)
+    fill(found.model, found.tensors, where=tmp_path, dtype=torch.float32)
+    latents, text = (
+        torch.randn(1, 3, 6, 4, 4, 6, generator=torch.Generator().manual_seed(1)),
+        torch.zeros(1, LENGTH, 10),
+    )
+    times = torch.cat((torch.zeros(1, 18), torch.full((1, 54), 700.0)), dim=1)
+    tall = theirs(latents.permute(0, 2, 3, 1, 4, 5).flatten(3, 4), times, text).sample
+    ours = found.model(latents, torch.tensor([0.7])).velocity
+    torch.testing.assert_close(
+        ours.permute(0, 2, 3, 1, 4, 5).flatten(3, 4)[:, :, 1:], tall[:, :, 1:], rtol=1e-5, atol=1e-5
+    )
+
+
+@torch.no_grad()
 def test_text_is_read_from_stored_embeddings_and_the_first_prompt_where_there_is_none(tmp_path, monkeypatch):
     random_transformer().save_pretrained(tmp_path / "wan" / "transformer")
     write_text_encoder(tmp_path / "wan")

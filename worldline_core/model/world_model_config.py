@@ -142,7 +142,7 @@ class WanConfig(WorldModelConfig):
     rope_theta: float = Field(default=10_000.0, gt=1)
     text_size: int = Field(default=4096, ge=1)
     """Values of the embedding of a token of text (umT5)."""
-    text_length: int = Field(default=512, ge=1)
+    text_length: int = Field(default=512, ge=1, le=4096)
     """Tokens that every text is filled up to."""
     prompt_length: int = Field(default=0, ge=0)
     """Tokens of the model's own prompt, which it reads where it is given no text; 0: padding alone."""
@@ -186,7 +186,8 @@ def _network(values: Any) -> str:
 
 
 NetworkConfig = Annotated[
-    Annotated[MixtureConfig, Tag("mixture")] | Annotated[WanConfig, Tag("wan")], Discriminator(_network)
+    Annotated[MixtureConfig, Tag("mixture")] | Annotated[WanConfig, Tag("wan")],
+    Discriminator(_network, custom_error_type="network", custom_error_message="network must be mixture or wan"),
 ]
 
 
