@@ -36,15 +36,6 @@ def kinematics_xml(scene: SceneModel) -> str:
     return kinematics_text(model, scene.robot.name, names)
 
 
-def T_ee_camera(scene: SceneModel, arm: int) -> np.ndarray:  # noqa: N802
-    """Pose (4, 4) of an arm's wrist camera in its ``ee`` body, OpenCV axes."""
-    position, rotation = wrist_camera_pose(scene, arm)
-    pose = np.eye(4)
-    pose[:3, :3] = rotation @ OPENCV_AXES
-    pose[:3, 3] = position
-    return pose
-
-
 def embodiment_yaml(scene: SceneModel) -> str:
     """YAML text of the embodiment's description."""
     model, robot = scene.model, scene.robot
@@ -54,6 +45,9 @@ def embodiment_yaml(scene: SceneModel) -> str:
     for number, (arm, indices) in enumerate(zip(robot.arms, scene.arms, strict=True)):
         site = indices.tool_site
         ee = f"{arm.name}/ee"
+        mount = np.eye(4)
+        mount[:3, 3], rotation = wrist_camera_pose(scene, number)
+        mount[:3, :3] = rotation @ OPENCV_AXES
         arms.append(
             {
                 "name": arm.name,
@@ -73,7 +67,7 @@ def embodiment_yaml(scene: SceneModel) -> str:
                 },
                 "wrist_camera": {
                     "link": ee,
-                    "T_link_camera": [[round(float(v), 9) + 0.0 for v in row] for row in T_ee_camera(scene, number)],
+                    "T_link_camera": [[round(float(v), 9) + 0.0 for v in row] for row in mount],
                 },
                 "link_radius": round(link_radius * robot.link_scale, 4),
                 "hand_radius": hand_radius,
