@@ -232,6 +232,10 @@ class SmallDecoding:
         self._before = latents[:, :, -1]
         return rearrange(torch.cat(groups, dim=1), "b t c h w -> b c t h w").to(latents.dtype)
 
+    def begin(self, first: Float[Tensor, "b c 1 h_l w_l"]) -> None:
+        """Take in the latents of frame 0 where its picture is known."""
+        self._first = self._before = first[:, :, 0]
+
     def copy(self) -> SmallDecoding:
         """A decoder in the same state that goes on separately."""
         return copy(self)

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from copy import copy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import cv2
 import numpy as np
@@ -64,28 +64,13 @@ class VideoDecoder(Protocol):
         """Frames of the next latents, the first of them those of frame 0."""
         ...
 
+    def begin(self, first: Float[Tensor, "b c 1 h w"]) -> None:
+        """Take in the latents of frame 0 where its picture is known."""
+        ...
+
     def copy(self) -> VideoDecoder:
         """A decoder in the same state that goes on separately."""
         ...
-
-
-class GroupDecoder:
-    """A `VideoDecoder` for tokenizers whose later latent frames are decoded each by itself, beside latent frame 0."""
-
-    def __init__(self, decode: Callable[[Tensor, Tensor | None], Tensor], reference: Tensor | None) -> None:
-        self._decode = decode
-        self._reference = reference
-        self._first: Tensor | None = None
-
-    def __call__(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
-        if self._first is None:
-            self._first = latents[:, :, :1]
-            return self._decode(latents, self._reference)
-        return self._decode(torch.cat((self._first, latents), dim=2), self._reference)[:, :, 1:]
-
-    def copy(self) -> GroupDecoder:
-        """A decoder in the same state that goes on separately."""
-        return copy(self)
 
 
 def check_video(tokenizer: VideoTokenizer, video: Tensor) -> None:
@@ -149,7 +134,7 @@ def frames_to_video(frames: np.ndarray, size: tuple[int, int] | None = None) -> 
 
 def video_to_frames(video: Float[Tensor, "3 t h w"]) -> np.ndarray:
     """[-1, 1] to ``uint8 (N, H, W, 3)`` RGB, clamped and rounded."""
-    levels = ((video.detach().float() + 1.0) * 127.5).round().clamp(0, 255).to(torch.uint8)
+    levels = (video.detach().float() + 1.0).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
     return rearrange(levels.cpu(), "c t h w -> t h w c").contiguous().numpy()
 
 
@@ -169,12 +154,17 @@ class Residual(nn.Module):
         return features + self.second(F.gelu(self.first(F.gelu(features))))
 
 
+def fold(frames: Float[Tensor, "*n g 3 h w"]) -> Float[Tensor, "*n h2 w2 d"]:
+    """Groups of frames at half their height and width: each place has the ``(g p q c)`` values of its 2 x 2 pixels."""
+    return rearrange(frames, "... g c (h p) (w q) -> ... h w (g p q c)", p=2, q=2)
+
+
 class Refinement(nn.Module):
     """A two-level U-Net at half and quarter resolution over one group of frames.
 
     It sees the coarse frames of the group, the coarse first frame, and the observed first frame; where the group's
     coarse pixels equal the first frame's, the observed pixels can be taken over unchanged. Each output frame is
-    ``mask * observed + (1 - mask) * (coarse + residual)``; the residual starts at zero.
+    ``mask * observed + (1 - mask) * (coarse + residual)``; the residual starts at zero. All frames are folded (`fold`).
     """
 
     def __init__(self, group: int, width: int, depth: int) -> None:
@@ -193,26 +183,43 @@ class Refinement(nn.Module):
         bias[:, 3] = -1.0
         self.leave.bias = nn.Parameter(bias.flatten())
 
+    def still(self, first: Float[Tensor, "b h w 12"], reference: Tensor, known: bool) -> Float[Tensor, "b width h w"]:
+        """What every group of a clip is given: features of its coarse first frame and of ``reference``.
+
+        Args:
+            known: ``reference`` is the observed frame, no substitute.
+        """
+        shown = F.pad(torch.cat((first, reference), dim=-1), (0, 1), value=float(known))
+        weight = self._entry()[:, 12 * self.group :]
+        return F.conv2d(rearrange(shown, "b h w c -> b c h w"), weight, self.enter.bias, padding=1)
+
     def forward(
-        self,
-        frames: Float[Tensor, "b g 3 h w"],
-        first: Float[Tensor, "b 3 h w"],
-        reference: Float[Tensor, "b 3 h w"],
-        known: Tensor,
-    ) -> Float[Tensor, "b g 3 h w"]:
-        """Refined frames; ``known``, ``(b)``, is 1 where ``reference`` is the observed frame, 0 where it is a substitute."""
-        stacked = torch.cat((rearrange(frames, "b g c h w -> b (g c) h w"), first, reference), dim=1)
-        folded = F.pixel_unshuffle(stacked, 2)
-        flag = rearrange(known, "b -> b 1 1 1").expand(-1, 1, *folded.shape[-2:]).to(folded.dtype)
-        features = self.fine_in(
-            self.enter(torch.cat((folded, flag), dim=1).contiguous(memory_format=torch.channels_last))
-        )
+        self, groups: Float[Tensor, "b n h w d"], still: Tensor, reference: Float[Tensor, "b h w 12"]
+    ) -> Float[Tensor, "b n h w d"]:
+        """Refined frames of each group; ``still`` is of their clip."""
+        count = groups.shape[1]
+        shown = rearrange(groups, "b n h w d -> (b n) d h w")
+        features = F.conv2d(shown, self._entry()[:, : 12 * self.group], padding=1)
+        features = self.fine_in((features.unflatten(0, (-1, count)) + still[:, None]).flatten(0, 1))
         deep = self.coarse(self.down(F.gelu(features)))
         features = features + F.pixel_shuffle(self.up(F.gelu(deep)), 2)
-        out = self.leave(F.gelu(self.fine_out(features))).float()
-        out = rearrange(out, "b (g k p q) h w -> b g k (h p) (w q)", g=self.group, p=2, q=2)
-        mask = torch.sigmoid(out[:, :, 3:])
-        return mask * rearrange(reference, "b c h w -> b 1 c h w") + (1 - mask) * (frames + out[:, :, :3])
+        out = F.conv2d(F.gelu(self.fine_out(features)), *self._exit(), padding=1)
+        parts = rearrange(out, "(b n) (k d) h w -> k b n h w d", n=count, k=2)
+        residual, mask = parts.to(torch.float32, memory_format=torch.contiguous_format)
+        observed = repeat(reference, "b h w c -> b 1 h w (g c)", g=self.group)
+        return torch.lerp(groups + residual, observed, torch.sigmoid(mask))
+
+    def _exit(self) -> tuple[Tensor, Tensor]:
+        """Weights and bias of the last convolution for outputs in the order of folded frames, the mask once for each colour."""
+        own = torch.cat((self.leave.weight.flatten(1), cast("Tensor", self.leave.bias)[:, None]), dim=1)
+        own = rearrange(own, "(g k p q) i -> k g p q i", k=4, p=2, q=2)
+        rows = rearrange(torch.stack((own[:3], own[3:].expand_as(own[:3]))), "m c g p q i -> (m g p q c) i")
+        return rows[:, :-1].unflatten(1, self.leave.weight.shape[1:]), rows[:, -1]
+
+    def _entry(self) -> Tensor:
+        """Weights of the first convolution for inputs in the order of folded frames, the flag last."""
+        frames, flag = self.enter.weight.split((self.enter.in_channels - 1, 1), dim=1)
+        return torch.cat((rearrange(frames, "o (g c p q) ... -> o (g p q c) ...", c=3, p=2, q=2), flag), dim=1)
 
 
 class PatchTokenizerConfig(StrictModel):
@@ -265,10 +272,6 @@ class PatchTokenizer(nn.Module):
         size = self.spatial_compression
         return rearrange(video, "b c t (h p) (w q) -> b t h w (c p q)", p=size, q=size) - self.mean
 
-    def _pixels(self, patches: Tensor) -> Tensor:
-        size = self.spatial_compression
-        return rearrange(patches + self.mean, "b t h w (c p q) -> b c t (h p) (w q)", p=size, q=size)
-
     def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]:
         """Codes of a clip of ``1 + 4 k`` frames in [-1, 1]. Raises: DataError when the video has another shape."""
         check_video(self, video)
@@ -283,58 +286,64 @@ class PatchTokenizer(nn.Module):
             codes = torch.cat((static, motion), dim=-1) / self.scale
         return rearrange(codes, "b t h w c -> b c t h w")
 
+    def decode_groups(
+        self, latents: Float[Tensor, "b c t_l h_l w_l"], *, begins: bool
+    ) -> Float[Tensor, "b t_l h2 w2 d"]:
+        """Folded frames of each latent frame from its codes alone; where the clip ``begins``, the first one's are all alike."""
+        check_latents(self, latents)
+        axes = {"c": 3, "i": self.spatial_compression // 2, "p": 2, "j": self.spatial_compression // 2, "q": 2}
+        with torch.autocast(device_type=latents.device.type, enabled=False):
+            static = repeat(self.static_basis, "k d -> k (g d)", g=self.temporal_compression)
+            basis = torch.cat((static, self.motion_basis)) * self.scale[:, None]
+            mean = repeat(self.mean, "d -> 1 (g d)", g=self.temporal_compression)
+            order = "k (g c i p j q) -> k (i j g p q c)"
+            basis, mean = (rearrange(part, order, g=self.temporal_compression, **axes) for part in (basis, mean))
+            codes = rearrange(latents.float(), "b k t h w -> b t h w k")
+            if begins:
+                codes = codes.clone()
+                codes[:, :1, ..., self.config.static_channels :] = 0.0
+            cells = torch.addmm(mean[0], codes.flatten(0, 3), basis)
+            sizes = {"b": len(latents), "h": latents.shape[3], "w": latents.shape[4], "i": axes["i"], "j": axes["j"]}
+            return rearrange(cells, "(b t h w) (i j d) -> b t (h i) (w j) d", **sizes)
+
     def decode_linear(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
         """Decode the codes alone (the orthogonal projection of the video)."""
-        check_latents(self, latents)
-        with torch.autocast(device_type=latents.device.type, enabled=False):
-            codes = rearrange(latents.float(), "b c t h w -> b t h w c") * self.scale
-            static, motion = codes.split((self.config.static_channels, self.config.motion_channels), dim=-1)
-            means = static @ self.static_basis
-            groups = repeat(means[:, 1:], "b n h w d -> b n g h w d", g=self.temporal_compression)
-            moving = motion[:, 1:] @ self.motion_basis
-            groups = groups + rearrange(moving, "b n h w (g d) -> b n g h w d", g=self.temporal_compression)
-            patches = torch.cat((means[:, :1], rearrange(groups, "b n g h w d -> b (n g) h w d")), dim=1)
-            return self._pixels(patches)
+        return self.unfold(self.decode_groups(latents, begins=True), begins=True)
+
+    def unfold(self, groups: Float[Tensor, "b n h2 w2 d"], *, begins: bool) -> Float[Tensor, "b 3 t h w"]:
+        """Video of folded groups, stored frame by frame and pixel by pixel; the first group of a clip is one frame."""
+        video = rearrange(groups, "b n h w (g p q c) -> b (n g) (h p) (w q) c", p=2, q=2, c=3)
+        if begins:
+            video = torch.cat((video[:, :1], video[:, self.temporal_compression :]), dim=1)
+        return rearrange(video, "b t h w c -> b c t h w")
 
     def decode(
         self, latents: Float[Tensor, "b c t_l h_l w_l"], reference: Float[Tensor, "b 3 h w"] | None = None
     ) -> Float[Tensor, "b 3 t h w"]:
-        """Latents to video in [-1, 1]; with the observed first frame, still background keeps its full detail.
+        """Latents to video in [-1, 1]; with the observed first frame, still background keeps its full detail."""
+        return self.decoder(reference)(latents)
 
-        Group ``j`` is decoded from latent frames 0 and ``j`` only, so blocks can be decoded as they arrive.
-        """
-        return self.refine(self.decode_linear(latents), reference)
-
-    def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> GroupDecoder:
-        """Decode block by block, with the frames of :meth:`decode`."""
-        return GroupDecoder(self.decode, reference)
+    def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> PatchDecoding:
+        """Decode as latents arrive, with the frames of :meth:`decode`."""
+        return PatchDecoding(self, reference)
 
     def refine(
         self, coarse: Float[Tensor, "b 3 t h w"], reference: Float[Tensor, "b 3 h w"] | None = None
     ) -> Float[Tensor, "b 3 t h w"]:
         """The convolutional decoder on a linear decode. Raises: DataError when the reference has another size."""
-        batch, time = coarse.shape[0], self.temporal_compression
-        if reference is not None and reference.shape != coarse[:, :, 0].shape:
-            raise DataError(
-                "The reference frame does not fit the latents",
-                expected=tuple(coarse[:, :, 0].shape),
-                got=tuple(reference.shape),
-            )
-        first = repeat(coarse[:, :, 0], "b c h w -> b g c h w", g=time)
-        groups = rearrange(coarse[:, :, 1:], "b c (n g) h w -> b n g c h w", g=time)
-        groups = torch.cat((first[:, None], groups), dim=1)
-        count = groups.shape[1]
-        known = torch.full((batch,), float(reference is not None), device=coarse.device)
-        reference = coarse[:, :, 0] if reference is None else reference.to(coarse.dtype)
-        refined = self.refinement(
-            rearrange(groups, "b n g c h w -> (b n) g c h w"),
-            repeat(coarse[:, :, 0], "b c h w -> (b n) c h w", n=count),
-            repeat(reference, "b c h w -> (b n) c h w", n=count),
-            repeat(known, "b -> (b n)", n=count),
-        )
-        refined = rearrange(refined, "(b n) g c h w -> b n g c h w", n=count)
-        rest = rearrange(refined[:, 1:], "b n g c h w -> b c (n g) h w")
-        return torch.cat((rearrange(refined[:, 0, :1], "b g c h w -> b c g h w"), rest), dim=2)
+        frames = rearrange(coarse, "b c t h w -> b t c h w")
+        frames = torch.cat((frames[:, :1].expand(-1, self.temporal_compression - 1, -1, -1, -1), frames), dim=1)
+        groups = fold(rearrange(frames, "b (n g) c h w -> b n g c h w", g=self.temporal_compression))
+        return self.unfold(self.refinement(groups, *self.still(groups[:, 0], reference)), begins=True)
+
+    def still(self, group: Float[Tensor, "b h w d"], reference: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Features and folded reference for all groups of a clip with this first group. Raises: DataError when the sizes differ."""
+        first = group[..., :12]
+        size = (len(group), 3, 2 * group.shape[1], 2 * group.shape[2])
+        if reference is not None and reference.shape != size:
+            raise DataError("The reference frame does not fit the latents", expected=size, got=tuple(reference.shape))
+        shown = first if reference is None else fold(reference[:, None].to(first.dtype))
+        return self.refinement.still(first, shown, reference is not None), shown
 
     def save(self, folder: Path, metadata: Mapping[str, Any] | None = None) -> None:
         """Write the bases in float32 and the decoder in float16. Equal weights give equal bytes."""
@@ -373,6 +382,31 @@ class PatchTokenizer(nn.Module):
         tokenizer, weights = cls.outline(folder), folder / WEIGHTS
         fill(tokenizer, read_weights(weights, tokenizer.weights_sha256), where=weights, dtype=torch.float32)
         return tokenizer
+
+
+class PatchDecoding:
+    """A `VideoDecoder` of a patch tokenizer: each latent frame is decoded beside the first one and the observed picture."""
+
+    def __init__(self, tokenizer: PatchTokenizer, reference: Tensor | None) -> None:
+        self._tokenizer, self._reference = tokenizer, reference
+        self._still: tuple[Tensor, Tensor] | None = None
+
+    def begin(self, first: Float[Tensor, "b c 1 h w"]) -> None:
+        """Take in the latents of frame 0 where its picture is known."""
+        group = self._tokenizer.decode_groups(first, begins=True)[:, 0]
+        self._still = self._tokenizer.still(group, self._reference)
+
+    def __call__(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
+        """Frames of the next latents."""
+        begins = self._still is None
+        groups = self._tokenizer.decode_groups(latents, begins=begins)
+        if self._still is None:
+            self._still = self._tokenizer.still(groups[:, 0], self._reference)
+        return self._tokenizer.unfold(self._tokenizer.refinement(groups, *self._still), begins=begins)
+
+    def copy(self) -> PatchDecoding:
+        """A decoder in the same state that goes on separately."""
+        return copy(self)
 
 
 def fit_patch_tokenizer(
@@ -572,6 +606,10 @@ class WanDecoder:
             if vae.config["patch_size"] is not None:
                 video = unpatchify(video, patch_size=vae.config["patch_size"])
             return video.clamp(-1.0, 1.0).to(latents.dtype)
+
+    def begin(self, first: Float[Tensor, "b c 1 h w"]) -> None:
+        """Take in the latents of frame 0, which costs as much as its picture."""
+        self(first)
 
     def copy(self) -> WanDecoder:
         """A decoder in the same state that goes on separately; tensors of the cache are replaced, never changed."""

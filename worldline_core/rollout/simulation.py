@@ -73,9 +73,9 @@ class Session:
         self._bfloat16 = bfloat16
         self._decoders: list[VideoDecoder]
         self._first: Tensor | None  # observed latents of a clip that no step has begun
-        self._units = 0  # predicted since the observed picture
+        self._units: int  # predicted since the observed picture
         self._last: Frames = []  # of the last unit, where a clip may begin
-        self.observed = self._observe(images)
+        self.observed = self._decode(rearrange(self._begin(images), "b v c h w -> b v c 1 h w"))
 
     @torch.no_grad()
     def step(self, maps: Float[Tensor, "b v a t h w"]) -> Frames:
@@ -124,9 +124,14 @@ class Session:
     def _clip_ended(self) -> bool:
         return self._sampler.units_per_clip is not None and self._units >= self._sampler.units_per_clip
 
+    @torch.no_grad()
     def _begin_anew(self) -> None:
+        """Begin a clip at the last pictures, which are not decoded again."""
         last = [[frames_to_video(clip[v][-1:])[:, 0] for v in self._sampler.views] for clip in self._last]
-        self._observe(torch.stack([torch.stack(pictures) for pictures in last]))
+        first = self._begin(torch.stack([torch.stack(pictures) for pictures in last]))
+        with self._precision():
+            for decoder, clip in zip(self._decoders, first, strict=True):
+                decoder.begin(rearrange(clip, "v c h w -> v c 1 h w"))
 
     @torch.no_grad()
     def _sample(self, maps: Tensor) -> Tensor:
@@ -150,22 +155,22 @@ class Session:
         return other
 
     @torch.no_grad()
-    def _observe(self, images: Tensor) -> Frames:
-        """Begin a clip at these images."""
+    def _begin(self, images: Tensor) -> Tensor:
+        """Begin a clip at these images, and return their latents."""
         images, self._units = images.to(self._device), 0
-        self._first = encode_images(self._tokenizer, images)
+        self._first = first = encode_images(self._tokenizer, images)
         self._decoders = [self._tokenizer.decoder(clip) for clip in images]
-        return self._decode(rearrange(self._first, "b v c h w -> b v c 1 h w"))
+        return first
+
+    def _precision(self) -> torch.autocast:
+        return torch.autocast(self._device.split(":")[0], torch.bfloat16, enabled=self._bfloat16)
 
     @torch.no_grad()
     def _decode(self, latents: Tensor, stream: torch.cuda.Stream | None = None) -> Frames:
         """Frames of latents; on a stream of its own where another thread decodes."""
         if stream is not None:
             latents.record_stream(stream)
-        with (
-            torch.cuda.stream(stream),
-            torch.autocast(self._device.split(":")[0], torch.bfloat16, enabled=self._bfloat16),
-        ):
+        with torch.cuda.stream(stream), self._precision():
             # One clip at a time: the decoder works on whole images, which take a hundred times the memory of latents.
             videos = (decode(clip) for decode, clip in zip(self._decoders, latents, strict=True))
             return [{view: video_to_frames(clip[v]) for v, view in enumerate(self._sampler.views)} for clip in videos]
