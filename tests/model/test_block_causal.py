@@ -71,16 +71,20 @@ def test_attention_of_alike_blocks_together_equals_one_block_at_a_time(window):
 
 
 def blockwise(model, spec, given, rates=None):
-    """The velocities as a rollout over the same clean history computes them, and its cache."""
+    """The velocities as a rollout over the same clean history computes them, and its cache; alike in joint passes."""
     noisy, clean, maps, sigma = given
-    cache, found = KVCache(spec.sink_blocks, spec.recent_blocks, rates), []
+    (cache, found), (other, joint) = ((KVCache(spec.sink_blocks, spec.recent_blocks, rates), []) for _ in range(2))
     for block, (start, stop) in enumerate(block_bounds(noisy.shape[3], BLOCK)):
         own = frames_of(maps, start, stop)
         if block:
-            found.append(
-                model.forward_block(frames_of(noisy, start, stop), sigma[:, block - 1], cache, action_maps=own)
-            )
-        model.write_block(frames_of(clean, start, stop), cache, action_maps=own)
+            step = (frames_of(noisy, start, stop), sigma[:, block - 1])
+            found.append(model.forward_block(*step, cache, action_maps=own))
+            joint.append(model.write_and_forward_block(written, *step, other, clean_maps=drawn, action_maps=own))
+        written, drawn = frames_of(clean, start, stop), own
+        model.write_block(written, cache, action_maps=drawn)
+    model.write_block(written, other, action_maps=drawn)
+    torch.testing.assert_close(torch.cat(joint, dim=3), torch.cat(found, dim=3), rtol=1e-5, atol=1e-5)
+    assert other.nbytes == cache.nbytes
     return torch.cat(found, dim=3), cache
 
 

@@ -96,13 +96,19 @@ def test_times_lie_beside_the_predictions_and_outside_their_digest(inputs, predi
 
 def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(inputs, tmp_path, monkeypatch):
     """Blocks of two latent frames, a window of one recent block, two Euler steps: as the checkpoint says."""
-    passes, forward = [], WorldModel.forward_block
+    passes, forward, joint = [], WorldModel.forward_block, WorldModel.write_and_forward_block
 
     def watch(model, noisy, sigma, cache, **rest):
         passes.append((noisy.shape[3], cache.frames, sigma))
         return forward(model, noisy, sigma, cache, **rest)
 
+    def watch_joint(model, clean, noisy, sigma, cache, **rest):
+        emitted = joint(model, clean, noisy, sigma, cache, **rest)
+        passes.append((noisy.shape[3], cache.frames, sigma))
+        return emitted
+
     monkeypatch.setattr(WorldModel, "forward_block", watch)
+    monkeypatch.setattr(WorldModel, "write_and_forward_block", watch_joint)
     timed = {"sampler": BlockCausalConfig(timed_blocks=3), "seeds": (42,), "embodiments": ("ur5e_pair",)}
     config, given = CONFIG.model_copy(update=timed | {"num_frames": 31}), model(inputs, "small_blocks")
     summary = rollout(config, given, tmp_path)

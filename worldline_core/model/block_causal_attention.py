@@ -200,9 +200,19 @@ class KVCache:
         """
         if self.reference is None:
             self.reference = clean[:, :, :, :1].detach()
-        blocks = (*self.window.blocks, block)
+        self.window = CacheWindow(self._visible((*self.window.blocks, block)))
+
+    def _visible[T](self, blocks: tuple[T, ...]) -> tuple[T, ...]:
         stop, start = window_bounds(len(blocks), self.sink_blocks, self.recent_blocks)
-        self.window = CacheWindow(blocks[:stop] + blocks[start:])
+        return blocks[:stop] + blocks[start:]
+
+    def window_beside_next(self) -> CacheWindow | None:
+        """What is visible beside the next finished block once it is taken in; None where that block itself is not."""
+        visible = self._visible((*self.window.blocks, None))
+        kept = [block for block in visible if block is not None]
+        if len(kept) == len(visible):
+            return None
+        return self.window if len(kept) == len(self.window.blocks) else CacheWindow(kept)
 
     def select(self, clips: Sequence[int]) -> KVCache:
         """The window of these clips, to go on separately. Tensors are never changed, so what can be shared is: what all clips share
@@ -228,7 +238,7 @@ class KVCache:
 
 @dataclass
 class CachedAttention:
-    """The current block sees itself and the window of a cache, which itself stays as it is.
+    """The current block, or the last part of it, sees the block and the window of a cache, which itself stays as it is.
 
     Attributes:
         by: rotation of the current block; ``window_by``: of the frames in the window.
@@ -245,8 +255,31 @@ class CachedAttention:
     ) -> Tensor:
         if self.written is not None:
             self.written[layer] = (keys, values)
-        queries, keys = rotate(queries, self.by), rotate(keys, self.by)
+        last = queries.shape[-2]
+        queries, keys = rotate(queries, (self.by[0][..., -last:, :], self.by[1][..., -last:, :])), rotate(keys, self.by)
         window = self.window.read(layer, self.window_by)
         if window is not None:
             keys, values = _joined((window[0], keys)), _joined((window[1], values))
         return grouped_attention(queries, keys, values)
+
+
+@dataclass
+class FollowedAttention:
+    """A finished block that is written to a cache, and after it in the same pass the next block, which sees it.
+
+    Attributes:
+        following: attention of the next block, the last part of both together.
+        tokens: of the finished block.
+    """
+
+    finished: CachedAttention
+    following: CachedAttention
+    tokens: int
+
+    def __call__(
+        self, layer: int, queries: Tensor, keys: Tensor, values: Tensor, text: tuple[Tensor, Tensor] | None
+    ) -> Tensor:
+        # Copies, so that a cache does not hold the next block too.
+        known_keys, known_values = (part[..., : self.tokens, :].clone() for part in (keys, values))
+        seen = self.finished(layer, queries[..., : self.tokens, :], known_keys, known_values, text)
+        return torch.cat((seen, self.following(layer, queries[..., self.tokens :, :], keys, values, text)), dim=1)

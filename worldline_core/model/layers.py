@@ -75,8 +75,12 @@ def video_positions(
 def rotate(values: Float[Tensor, "*batch heads n d"], by: Rotation) -> Float[Tensor, "*batch heads n d"]:
     """Rotate queries or keys; ``by`` broadcasts over batch and heads."""
     cosine, sine = (part.to(values.dtype) for part in by)
+    half = values.shape[-1] // 2
     first, second = values.chunk(2, dim=-1)
-    return values * cosine + torch.cat((-second, first), dim=-1) * sine
+    rotated = values * cosine
+    rotated[..., :half].addcmul_(second, sine[..., :half], value=-1)
+    rotated[..., half:].addcmul_(first, sine[..., half:])
+    return rotated
 
 
 class GenerationAttention(Protocol):
@@ -85,10 +89,6 @@ class GenerationAttention(Protocol):
     def __call__(
         self, layer: int, queries: Tensor, keys: Tensor, values: Tensor, text: tuple[Tensor, Tensor] | None
     ) -> Tensor: ...
-
-
-MAX_CPU_SCORES = 2**26
-"""Attention scores held at once by the explicit bf16 path on a CPU (128 MiB)."""
 
 
 def grouped_attention(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -104,15 +104,7 @@ def grouped_attention(queries: Tensor, keys: Tensor, values: Tensor, mask: Tenso
     rows = rearrange(queries, "b (k g) n d -> b k (n g) d", g=groups)
     if mask is not None and mask.shape[-2] != 1:
         mask = mask.repeat_interleave(groups, dim=-2)
-    scores = rows.shape[0] * rows.shape[1] * rows.shape[2] * keys.shape[2]
-    if mask is None and rows.device.type == "cpu" and rows.dtype == torch.bfloat16 and scores <= MAX_CPU_SCORES:
-        # On a CPU, plain bf16 matrix products beat the fused kernel almost twofold while the scores fit the memory.
-        # Autocast would send the softmax through float32 copies; inside, it sums in float32 anyway.
-        with torch.autocast("cpu", enabled=False):
-            weights = torch.softmax((rows * rows.shape[-1] ** -0.5) @ keys.transpose(-1, -2), dim=-1)
-            mixed = weights @ values.to(rows.dtype)
-    else:
-        mixed = F.scaled_dot_product_attention(rows, keys, values, attn_mask=mask)
+    mixed = F.scaled_dot_product_attention(rows, keys, values, attn_mask=mask)
     return rearrange(mixed, "b k (n g) d -> b n (k g d)", g=groups)
 
 

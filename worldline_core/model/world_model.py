@@ -10,6 +10,7 @@ d model width. Convention: ``z_sigma = (1 - sigma) z + sigma eps``, velocity ``e
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import (
     CachedAttention,
     CachedBlock,
+    CacheWindow,
+    FollowedAttention,
     FullAttention,
     KVCache,
     TeacherForcingAttention,
@@ -261,6 +264,47 @@ class WorldModel(nn.Module, ABC):
         cache.append(block, clean)
         return block
 
+    @torch.no_grad()
+    def write_and_forward_block(
+        self,
+        clean: Float[Tensor, "b v c t h w"],
+        noisy: Float[Tensor, "b v c t2 h w"],
+        sigma: Tensor | float,
+        cache: KVCache,
+        *,
+        clean_maps: Float[Tensor, "b v a t #h #w"] | None = None,
+        action_maps: Float[Tensor, "b v a t2 #h #w"] | None = None,
+        views: Sequence[str] = VIEWS,
+    ) -> Float[Tensor, "b v c t2 h w"]:
+        """:meth:`write_block`, then :meth:`forward_block`: in one pass where the second sees the first."""
+        window = cache.window_beside_next()
+        if window is None or (clean_maps is None) != (action_maps is None):
+            self.write_block(clean, cache, action_maps=clean_maps, views=views)
+            return self.forward_block(noisy, sigma, cache, action_maps=action_maps, views=views)
+        count, latents = clean.shape[3], torch.cat((clean, noisy), dim=3)
+        maps = None if clean_maps is None or action_maps is None else torch.cat((clean_maps, action_maps), dim=3)
+        check_shapes(self.config, latents, views, maps)
+        times = torch.arange(latents.shape[3], device=latents.device)
+        is_clean = (times < count).expand(len(latents), -1)
+        sigma = sigma if isinstance(sigma, Tensor) else torch.full((), sigma, device=latents.device)
+        levels = sigma.expand(len(latents))[:, None].expand_as(is_clean)
+        written: dict[int, tuple[Tensor, Tensor]] = {}
+
+        def attention(
+            frames: Tensor, seen: CacheWindow, keep: dict[int, tuple[Tensor, Tensor]] | None
+        ) -> CachedAttention:
+            before = torch.arange(seen.frames, device=latents.device)
+            own, window_by = (self._rotation(f, latents, views, cache.fps) for f in (frames + seen.frames, before))
+            return CachedAttention(own, seen, window_by, keep)
+
+        tokens = count * len(views) * math.prod(self._patch_grid(latents))
+        attend = FollowedAttention(
+            attention(times[:count], cache.window, written), attention(times, window, None), tokens
+        )
+        emitted = self._run(latents, levels, is_clean, attend, maps, views)[0]
+        cache.append(CachedBlock(count, written), clean)
+        return self._velocity(emitted[:, tokens:], noisy, levels[:, count:], is_clean[:, count:], cache.reference)
+
     def forward_teacher_forcing(
         self,
         noisy: Float[Tensor, "b v c t h w"],
@@ -315,7 +359,9 @@ class WorldModel(nn.Module, ABC):
     ) -> Rotation:
         """Rotary angles of the tokens of these latent frames, for all heads: ``(n d)``, or ``(b 1 n d)`` by clip."""
         positions = video_positions(self.config, frames, self._patch_grid(latents), views, offset, fps)
-        cosine, sine = self.rotation(positions)
+        kind = latents.device.type
+        dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else self.proj_in.weight.dtype
+        cosine, sine = (part.to(dtype) for part in self.rotation(positions))  # once, not in every layer
         return (cosine, sine) if positions.ndim == 2 else (cosine[:, None], sine[:, None])
 
     def _run_block(

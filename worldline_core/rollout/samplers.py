@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from copy import copy
 from functools import partial
+from typing import Any
 
 import torch
 from einops import rearrange, repeat
@@ -171,9 +172,8 @@ class FullClipSampler:
 class BlockCausalSimulator:
     """Start from observed frames, then step with new controls; the cost of a step does not grow.
 
-    Each block starts from fresh noise and is denoised in a few Euler steps against the cache; when done, its clean form
-    is written to the cache in one more pass (as conditioning: without time embedding). The write waits until the next
-    block is asked for, so the last block of a rollout costs no write pass.
+    Each block starts from fresh noise and is denoised in a few Euler steps against the cache. Its clean form is written to the
+    cache (as conditioning: without time embedding) in the pass that takes the first step of the next block.
 
     Args:
         spec: block size, window and nodes, as the model was trained with.
@@ -217,13 +217,21 @@ class BlockCausalSimulator:
                 expected=f"{self.spec.block_size} latent frames",
                 got=action_maps.shape[3],
             )
-        self._write()
-        reference = self.cache.reference
-        if reference is None:
+        known = self.cache.reference if self._unwritten is None else self._unwritten[0]
+        if known is None:
             raise DataError("The rollout has not been started", next_step="call start() with the observed latents")
-        views, channels, _, height, width = reference.shape[1:]
-        noise = self.noise.draw((views, channels, self.spec.block_size, height, width), reference.device)
-        velocity = partial(self.model.forward_block, cache=self.cache, action_maps=action_maps, views=self.views)
+        views, channels, _, height, width = known.shape[1:]
+        noise = self.noise.draw((views, channels, self.spec.block_size, height, width), known.device)
+        controls: dict[str, Any] = {"action_maps": action_maps, "views": self.views}
+
+        def velocity(state: Tensor, sigma: float) -> Tensor:
+            if self._unwritten is None:
+                return self.model.forward_block(state, sigma, self.cache, **controls)
+            clean, maps = self._unwritten
+            found = self.model.write_and_forward_block(clean, state, sigma, self.cache, clean_maps=maps, **controls)
+            self._unwritten = None
+            return found
+
         with torch.autocast(noise.device.type, torch.bfloat16, enabled=self.bfloat16):
             latents = integrate(velocity, noise, self.spec.sigmas)
         self._unwritten = (latents, action_maps)
