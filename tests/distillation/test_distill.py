@@ -249,8 +249,9 @@ def test_adapters_train_every_step_and_the_scores_share_their_weights(inputs, tm
         return DistributionMatchingObjective(*models)
 
     monkeypatch.setattr("worldline_core.distillation.distill.DistributionMatchingObjective", kept)
-    forms = {name: {**step, "trainer": step["trainer"] | {"precision": "bf16"}} for name, step in QUICK.items()}
-    forcing = {"trainer": trainer(1, precision="bf16")}
+    saving = {"precision": "bf16", "weights": "bf16", "average": "host"}
+    forms = {name: {**step, "trainer": step["trainer"] | saving} for name, step in QUICK.items()}
+    forcing = {"trainer": trainer(1, **saving)}
     distill(config(lora={"rank": 2}, teacher_forcing=forcing, **forms), inputs, tmp_path / "out")
     _, real, fake, *_ = scores
     trained = {name for name, value in fake.named_parameters() if value.requires_grad}
