@@ -192,7 +192,7 @@ def test_the_variants_of_one_card_train_what_they_say() -> None:
     trainings = [call.config for name, call in calls.items() if call.task.name == "train_stage2"]
     forms = [(c.lora and c.lora.rank, c.trainer.optimizer.moments, c.trainer.weights) for c in trainings]
     assert forms == [
-        (None, "fp32", "fp32"), (16, "fp32", "fp32"), (64, "fp32", "fp32"), (None, "8bit", "fp32"), (None, "8bit", "bf16")
+        (None, "fp32", "fp32"), (16, "fp32", "fp32"), (64, "fp32", "fp32"), (16, "fp32", "fp32"), (None, "8bit", "fp32"), (None, "8bit", "bf16")
     ]  # fmt: skip
 
 
