@@ -11,6 +11,7 @@ import difflib
 import math
 import os
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -49,7 +50,12 @@ class RigidOffset(StrictModel):
 
     def matrix(self) -> np.ndarray:
         """(4, 4) float64."""
-        return pose_from_quaternion_wxyz(np.array(self.translation), np.array(self.rotation_wxyz))
+        return _matrix(self.translation, self.rotation_wxyz).copy()
+
+
+@lru_cache(maxsize=256)
+def _matrix(translation: tuple[float, ...], rotation_wxyz: tuple[float, ...]) -> np.ndarray:
+    return pose_from_quaternion_wxyz(np.array(translation), np.array(rotation_wxyz))
 
 
 class Description(StrictModel):

@@ -68,14 +68,11 @@ class InverseKinematics:
         jacobians, tools = [], []
         for arm, joints in zip(self.kinematics.embodiment.arms, self._joints, strict=True):
             tool = links[arm.end_effector_link] @ arm.T_link_tool.matrix()
-            columns = []
-            for link, joint in joints:
-                axis = links[link][:3, :3] @ joint.axis
-                if joint.kind == "revolute":
-                    columns.append(np.concatenate([np.cross(axis, tool[:3, 3] - links[link][:3, 3]), axis]))
-                else:
-                    columns.append(np.concatenate([axis, np.zeros(3)]))
-            jacobians.append(np.stack(columns, axis=1))
+            axes = np.stack([links[link][:3, :3] @ joint.axis for link, joint in joints])
+            levers = tool[:3, 3] - np.stack([links[link][:3, 3] for link, _ in joints])
+            turns = np.array([joint.kind == "revolute" for _, joint in joints])[:, None]
+            columns = np.where(turns, np.cross(axes, levers), axes), np.where(turns, axes, 0.0)
+            jacobians.append(np.ascontiguousarray(np.concatenate(columns, axis=1).T))
             tools.append(tool)
         return np.stack(tools), jacobians
 

@@ -62,6 +62,7 @@ class Teleoperation:
     def __init__(self, start: RecordedStart, kinematics: ArmKinematics, fps: float) -> None:
         self._start, self._kinematics, self._fps = start, kinematics, fps
         self._solver = InverseKinematics(kinematics)
+        self._image_size = image_size(start.images, start.cameras)
         self._axes = self._level_axes()
         self.take_over(start.state)
 
@@ -82,7 +83,7 @@ class Teleoperation:
     def _tracks(self, rows: np.ndarray) -> EpisodeTracks:
         """Tracks of these commands, which follow the start."""
         tracks = project_controls(
-            self._start.cameras, image_size(self._start.images, self._start.cameras), self._kinematics,
+            self._start.cameras, self._image_size, self._kinematics,
             controls=np.concatenate((self._start.state[None], rows)), fps=self._fps,
         )  # fmt: skip
         return tracks.clip(range(1, tracks.num_frames))
@@ -120,7 +121,7 @@ class Teleoperation:
             low, high = sorted((gripper.closed, gripper.open))
             self.command[column] = np.clip(self.command[column] + step, low, high)
         lost = (found.position_error_m > LOST_M) | (found.rotation_error_rad > LOST_RAD)
-        self._wanted = np.where(lost[:, None, None], self._poses(), wanted)
+        self._wanted = np.where(lost[:, None, None], self._poses(), wanted) if lost.any() else wanted
         self._seen = self._tracks(self.command[None])
         return self.command.copy()
 
@@ -147,7 +148,7 @@ class Teleoperation:
         """Places of the commanded tools: `views` as of `frame_marks`, and `position` [m] by arm."""
         return {
             "views": frame_marks(self._seen, 0, list(self._start.images)),
-            "position": self._poses()[:, :3, 3].tolist(),
+            "position": self._seen.T_base_tool[0, :, :3, 3].tolist(),
         }
 
 
