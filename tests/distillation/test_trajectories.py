@@ -139,7 +139,21 @@ def test_the_teacher_is_in_the_memory_sheet(make_model, monkeypatch):
 
     alone, taught = planned(), planned(teacher_share=0.5)
     assert "frozen scores" not in alone.parts
-    assert taught.parts["frozen scores"] == 4 * taught.parameters
+    # Matrices in bfloat16, the rest in float32.
+    assert 2 * taught.parameters < taught.parts["frozen scores"] < 4 * taught.parameters
+
+
+def test_scores_that_share_their_weights_are_planned_once(make_model, monkeypatch):
+    monkeypatch.setattr(Training, "_held", lambda *_args, **_named: Held(100, 0))
+    source = Sources(None, None, (32, 32), (4, 4))
+
+    def planned(**adapters):
+        config = config_of(FRAMES, **ONE_STEP, **adapters)
+        return trainings(config, make_model(0).config, source)[2].estimate(1)
+
+    full, lora = planned(), planned(lora={"rank": 1})
+    assert lora.parts["weights"] < 0.6 * full.parts["weights"]  # the student's in bfloat16, and adapters
+    assert lora.parts["frozen scores"] == full.parts["frozen scores"]
 
 
 def test_a_rollout_begins_anew_no_later_than_the_longest_trained_clip_ends():

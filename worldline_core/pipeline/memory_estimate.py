@@ -8,13 +8,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch._subclasses.fake_tensor import FakeTensorMode
+from torch._subclasses.fake_tensor import FakeTensorMode, unset_fake_temporarily
 
 from worldline_core.config import StrictModel
 from worldline_core.distillation.auxiliary_losses import PerceptualLoss
@@ -27,21 +27,26 @@ from worldline_core.distillation.trajectory_regression import TrajectoryObjectiv
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import SINGLE_PRECISION, read_checkpoint_info
 from worldline_core.model.lpips import LPIPS
+from worldline_core.model.mixture import is_text_parameter
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import MixtureConfig, WanConfig, WorldModelConfig
 from worldline_core.pipeline.memory_trace import Held, extrapolated, traced
+from worldline_core.training.adapters import add_adapters, share_frozen
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_sampler import Clip, latent_frame_count
 from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.flow_matching import FlowMatchingObjective
+from worldline_core.training.optimizers import BLOCK, in_eight_bits
+from worldline_core.training.processes import hold_weights
 from worldline_core.training.relational import ClipSimilarities, RelationalTerm, SimilarityMatrices, common_shape
 from worldline_core.training.stage1 import is_trained
 from worldline_core.training.stage2 import stage2_model_config
 from worldline_core.training.trainer import autocast
 from worldline_core.training.training_config import (
+    LoRAConfig,
     RelationalConfig,
     ShardingConfig,
     Stage1Config,
@@ -62,14 +67,6 @@ def to_bfloat16(model: nn.Module) -> None:
         for key, value in list(module.named_parameters(recurse=False)):
             if not f"{name}.".startswith(SINGLE_PRECISION):
                 module.register_parameter(key, nn.Parameter(value.detach().bfloat16(), value.requires_grad))
-
-
-def parameter_counts(model: WorldModelConfig, trained: Callable[[str], bool] = lambda _: True) -> tuple[int, int]:
-    """Parameters that are trained, and all those of one transformer block."""
-    with torch.device("meta"):
-        network = build_world_model(model)
-    counted = sum(value.numel() for name, value in network.named_parameters() if trained(name))
-    return counted, sum(value.numel() for value in network.layers[0].parameters())
 
 
 def gigabytes(size: float) -> str:
@@ -202,6 +199,34 @@ def whole_bytes(models: Mapping[str, nn.Module]) -> dict[str, float]:
     return {name: sum(value.nbytes for value in one.state_dict().values()) for name, one in models.items()}
 
 
+def adapted(config: WorldModelConfig, lora: LoRAConfig) -> WorldModel:
+    """A model with adapters, made within a FakeTensorMode; peft, which moves them from device to device, does so outside of it."""
+    with unset_fake_temporarily(), torch.device("meta"):
+        model = build_world_model(config)
+        add_adapters(model, lora, 0)
+    for module in model.modules():
+        for name, value in list(module.named_parameters(recurse=False)):
+            empty = torch.empty(value.shape, dtype=value.dtype)
+            module.register_parameter(name, nn.Parameter(empty, value.requires_grad))
+        for name, value in list(module.named_buffers(recurse=False)):
+            module.register_buffer(name, torch.empty(value.shape, dtype=value.dtype))
+    return model
+
+
+def _new_bytes(model: nn.Module, seen: set[int]) -> float:
+    """Bytes of a model's weights whose storages no other model has named yet."""
+    found = {value.untyped_storage()._cdata: value.nbytes for value in model.parameters()}
+    new = {key: size for key, size in found.items() if key not in seen}
+    seen.update(new)
+    return sum(new.values())
+
+
+def _moment_bytes(parameter: Tensor, trainer: TrainerConfig) -> float:
+    if trainer.optimizer.moments == "8bit" and in_eight_bits(parameter):
+        return 2 * (1 + 4 / BLOCK) * parameter.numel()
+    return 2 * 4 * parameter.numel()
+
+
 @dataclass(frozen=True, eq=False)
 class Training:
     """One training, by its configuration alone.
@@ -218,6 +243,7 @@ class Training:
     model: WorldModelConfig
     work: Callable[[WorldModel], Work]
     trained: Callable[[str], bool] = lambda _: True
+    lora: LoRAConfig | None = None
     turns: Mapping[int, float] = field(default_factory=lambda: {0: 1.0})
     before: Sequence[tuple[int, Callable[[], Held]]] = ()
 
@@ -226,7 +252,19 @@ class Training:
         network = build_world_model(self.model.model_copy(update={"num_layers": layers}))
         for name, parameter in network.named_parameters():
             parameter.requires_grad_(self.trained(name))
-        return self.work(network)
+        return self.work(network if self.lora is None else adapted(network.config, self.lora))
+
+    def _placed(self, layers: int, sharded: bool) -> Work:
+        """The step's models with weights as a device computes with them."""
+        work, trainer = self.outline(layers), self.trainer
+        for one in (*work.models, *work.scores):
+            if not sharded:
+                hold_weights(one, trainer.precision, trainer.weights)
+            elif trainer.precision == "bf16":
+                to_bfloat16(one)
+        if self.lora is not None and len(work.models) > 1:
+            share_frozen(work.models[1], work.scores[0])
+        return work
 
     @cache  # noqa: B019 - a few trainings a process
     def _held(self, sharded: bool, block: bool) -> Held:
@@ -235,11 +273,9 @@ class Training:
 
         def trace(step: int, layers: int) -> Held:
             with FakeTensorMode():
-                work = self.outline(layers)
+                work = self._placed(layers, sharded)
                 for one in (*work.models, *work.scores):
                     one.checkpointing = "block" if block else "none"
-                    if sharded and trainer.precision == "bf16":
-                        to_bfloat16(one)
 
                 def loss() -> Tensor:
                     with autocast(trainer):
@@ -253,12 +289,33 @@ class Training:
         operations = sum(share * steps[step].operations for step, share in self.turns.items())
         return Held(most, 0, operations + sum(times * held.operations for times, held in before))
 
-    @cached_property
-    def _outside(self) -> tuple[int, int, Mapping[str, float]]:
-        """Numbers of trained models and of frozen scores, and bytes of other models."""
-        with FakeTensorMode():
-            work = self.outline(1)
-        return len(work.models), len(work.scores), whole_bytes(work.whole)
+    @cache  # noqa: B019 - a few trainings a process
+    def _parts(self, shards: int) -> tuple[dict[str, float], int, int]:
+        """Bytes of weights, and what comes with them, at all layers; bytes of gradients when they are whole; trained parameters."""
+        trainer, alone = self.trainer, shards == 1
+
+        def parts(layers: int) -> dict[str, float]:
+            with FakeTensorMode():
+                work = self._placed(layers, sharded=not alone) if alone else self.outline(layers)
+            seen: set[int] = set()
+            scores = sum(_new_bytes(score, seen) for score in work.scores)
+            trained = [[value for value in model.parameters() if value.requires_grad] for model in work.models]
+            return {
+                "weights": sum(_new_bytes(model, seen) for model in work.models) / shards,
+                "moments": sum(_moment_bytes(value, trainer) for values in trained for value in values) / shards,
+                "average": sum(4 * value.numel() for value in trained[0]) / shards
+                if trainer.average == "device"
+                else 0,
+                **whole_bytes(work.whole),
+                "frozen scores": scores / shards,
+                "gradients": max(sum(value.nbytes for value in values) for values in trained),
+                "trained": sum(value.numel() for values in trained for value in values),
+                "block": sum(value.numel() for value in work.models[0].layers[0].parameters()),
+            }
+
+        one, two = parts(1), parts(2)
+        line = {name: size + (two[name] - size) * (self.model.num_layers - 1) for name, size in one.items()}
+        return line, round(line.pop("trained")), round(line.pop("block"))
 
     def micro_steps(self, devices: int) -> int:
         """Micro-steps of a step on each of so many devices."""
@@ -270,24 +327,18 @@ class Training:
         trainer, sharding = self.trainer, sharding or self.trainer.sharding
         shards, micro_steps = min(sharding.shards or devices, devices), self.micro_steps(devices)
         held = self._held(sharded=shards > 1, block=sharding.checkpointing == "block")
-        models, scores, whole = self._outside
-        trained, block = parameter_counts(self.model, self.trained)
-        part = 4 * trained / shards
+        sizes, trained, block = self._parts(shards)
         summed = micro_steps == 1 or sharding.reduce_every_micro_step
         parts = {
-            "weights": models * part,
-            "moments": 2 * models * part,
-            "average": part,
-            **whole,
-            "frozen scores": scores * part,
+            **sizes,
             # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
             "gathered": 0 if shards == 1 else block * (2 * 2 + 2 + 4),
-            "gradients": part if summed else 4 * trained,
+            "gradients": sizes["gradients"] / (shards if summed else 1),
             "activations": held.forward,
         }
         operations = micro_steps * held.operations if trainer.precision == "bf16" else None
         parts = {name: size for name, size in parts.items() if size}
-        return Estimate(self.title, models * trained, parts, operations, trainer.steps, trainer.minutes)
+        return Estimate(self.title, trained, parts, operations, trainer.steps, trainer.minutes)
 
     def fitting_setting(self, devices: int, memory: float) -> str:
         """The nearest setting with which this training would fit devices of ``memory`` bytes; empty where it does."""
@@ -329,14 +380,16 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
         return [
             Training(
                 f"distill: {part.replace('_', ' ')}", getattr(config, part).trainer, model,
-                partial(_distillation, part, config, source),
+                partial(_distillation, part, config, source), lora=config.lora,
                 turns={0: 1 - 1 / CYCLE, CYCLE - 1: 1 / CYCLE} if part == "distribution_matching" else {0: 1.0},
                 before=[encoded(config.first_clips, config.views, first)] if part == "teacher_forcing" and frames else [],
             )
             for part in ("teacher_forcing", "trajectory_regression", "distribution_matching")
         ]  # fmt: skip
     relational = config.relational if isinstance(config, Stage2Config) else None
-    text = config.text.max_length if isinstance(config, Stage1Config) else 0
+    stage1 = config if isinstance(config, Stage1Config) else None
+    text, tower = (0, "") if stage1 is None else (stage1.text.max_length, stage1.text_tower)
+    whole_model, model = model, model.model_copy(update={"towers": "generation"}) if tower == "stored" else model
 
     def work(network: WorldModel) -> Work:
         batch, term = source.largest(model, config.trainer, config.clips, model.views, text), None
@@ -346,13 +399,19 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
             term = RelationalTerm(relational, _Similarities(relational), network.config.num_layers)
             term.layer = max(1, network.config.num_layers // 2)  # it makes no difference which: all are held
         objective = FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
+        if tower == "stored":
+            layers = network.config.num_layers
+            reader = hold_weights(
+                build_world_model(whole_model.model_copy(update={"num_layers": layers})), "bf16", "bf16"
+            )
+            objective.encode_text = torch.no_grad()(reader.encode_text)
 
         def run(step: int) -> Tensor:
             return objective.loss(batch, torch.Generator(), step)[0]
 
         return Work(run, (network,), whole=whole)
 
-    title = {"base": "base", "stage1": "stage I"}[config.kind] if isinstance(config, Stage1Config) else "stage II"
+    title = "stage II" if stage1 is None else {"base": "base", "stage1": "stage I"}[stage1.kind]
     longest, precision, before = (
         max(config.clips.lengths),
         config.trainer.precision,
@@ -362,7 +421,12 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
         before.append(encoded(config.clips, model.views, config.trainer))
     if relational is not None:
         before.append((config.trainer.batch_size, partial(source.teaching, longest, len(model.views), precision)))
-    return [Training(title, config.trainer, model, work, is_trained if text else lambda _: True, before=before)]
+    trained = partial(_stage1_trains, tower) if text else lambda _: True
+    return [Training(title, config.trainer, model, work, trained, config.lora, before=before)]
+
+
+def _stage1_trains(tower: str, name: str) -> bool:
+    return is_trained(name) and (tower == "trained" or not is_text_parameter(name))
 
 
 def _distillation(part: str, config: DistillConfig, source: Sources, network: WorldModel) -> Work:
@@ -377,7 +441,7 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
         whole["encoder"] = tokenizer_outline(source.tokenizer)
     models, scores, distance = [network], list[WorldModel](), None
     if part == "teacher_forcing":
-        scores = [build_world_model(model)] if first.teacher_share else []
+        scores = [build_world_model(model).requires_grad_(False)] if first.teacher_share else []
         objective: Any = TeacherForcingObjective(network, config, *scores)
     else:
         shown, views, channels, frames, *grid = batch.latents.shape
@@ -396,7 +460,8 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
         if part == "trajectory_regression":
             objective = TrajectoryObjective(network, config, distance)
         else:
-            fake, real = build_world_model(model), build_world_model(model)
+            fake = build_world_model(model) if config.lora is None else adapted(model, config.lora)
+            real = build_world_model(model).requires_grad_(False)
             models, scores = [network, fake], [real]
             objective = DistributionMatchingObjective(network, real, fake, config, distance)
 
@@ -415,9 +480,13 @@ def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sou
         batch = source.batch(model, clips, config.views, max(config.clips.lengths))
         encoder = {"encoder": tokenizer_outline(source.tokenizer)} if isinstance(config.input, FrameInput) else {}
 
+    def made(layers: int) -> WorldModel:
+        teacher = build_world_model(model.model_copy(update={"num_layers": layers})).requires_grad_(False)
+        return hold_weights(teacher, trainer.precision)
+
     def trace(layers: int) -> Held:
         with fake, torch.no_grad(), autocast(trainer):
-            teacher = build_world_model(model.model_copy(update={"num_layers": layers})).requires_grad_(False)
+            teacher = made(layers)
 
             def run() -> None:
                 teacher_trajectories(
@@ -427,7 +496,9 @@ def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sou
 
             return traced(run)
 
-    traced_once, count = extrapolated(trace, model.num_layers), parameter_counts(model)[0]
+    traced_once = extrapolated(trace, model.num_layers)
+    with torch.device("meta"):
+        weights = list(made(model.num_layers).parameters())
     held, steps = traced_once.forward, regression.trajectories
     # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
     passes = (1 + sum(steps.substeps)) / (1 + config.spec.steps)
@@ -435,9 +506,15 @@ def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sou
     if encoder:
         encoding = source.encoding(batch.clips[0].num_frames, trainer.precision)
         held, operations = max(held, encoding.forward), operations + clips * len(batch.views) * encoding.operations
-    parts = {"weights": 4 * count, **whole_bytes(encoder), "activations": held}
+    parts = {"weights": sum(value.nbytes for value in weights), **whole_bytes(encoder), "activations": held}
     title, shards = f"distill: trajectories (a shard of {clips} clips)", -(-steps.clips // clips)
-    return Estimate(title, count, parts, operations if trainer.precision == "bf16" else None, shards)
+    return Estimate(
+        title,
+        sum(value.numel() for value in weights),
+        parts,
+        operations if trainer.precision == "bf16" else None,
+        shards,
+    )
 
 
 def stage_rows(
