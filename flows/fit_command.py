@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tasks.execution.command_line import add_overrides
 from tasks.execution.temporary_server import prepare_prefect
@@ -20,7 +21,6 @@ SHARES = {
     "distill.distribution_matching": 0.075,
 }
 """Parts of the minutes that each training gets."""
-ON_A_GPU = ("encode_latents.device", *(f"{training}.trainer.device" for training in SHARES))
 ROLLOUTS = ("stage2", "stage2_shuffled", "causal")
 IGNORED_AFTER = 300
 """Steps of Stage II after which a small model that listens to its controls does so measurably."""
@@ -40,8 +40,16 @@ def add_fit_command(commands: argparse._SubParsersAction[argparse.ArgumentParser
         "--config", type=Path, default=Path("my.yaml"), metavar="FILE",
         help="written by the first call, and read when it is there (default: my.yaml)",
     )  # fmt: skip
-    fit.add_argument("--minutes", type=float, metavar="N", help="of training, all stages together (default: 20)")
-    fit.add_argument("--gpu", metavar="SIZE", help="train and predict on the GPU, which has so much memory: 24GB")
+    fit.add_argument(
+        "--minutes",
+        type=float,
+        metavar="N",
+        help="of training, all stages together (default: 20, on a card what its preset says)",
+    )
+    fit.add_argument(
+        "--gpu", metavar="CARD",
+        help="train and predict on the GPU: its memory or name (24GB, RTX 4090); the file extends the preset of this size",
+    )  # fmt: skip
     fit.add_argument(
         "--stop-when-ignored", type=int, nargs="?", const=IGNORED_AFTER, metavar="STEPS",
         help=f"end a training in which, from this step on, the controls make no difference (default: {IGNORED_AFTER})",
@@ -51,13 +59,18 @@ def add_fit_command(commands: argparse._SubParsersAction[argparse.ArgumentParser
     fit.set_defaults(run=fit_command)
 
 
-def overrides_of(minutes: float | None, gpu: str | None, ignored_after: int | None) -> tuple[str, ...]:
-    """The options as changes of the configuration."""
+def overrides_of(
+    minutes: float | None, gpu: str | None, ignored_after: int | None, config: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """The options as changes of a configuration, as it was read."""
     changes: list[str] = []
+    shares = {name: share for name, share in SHARES.items() if config.get(name.partition(".")[0]) is not None}
     if minutes is not None:
-        changes += [f"{name}.trainer.minutes={share * minutes:.4g}" for name, share in SHARES.items()]
+        whole = sum(shares.values())
+        changes += [f"{name}.trainer.steps=null" for name in shares]
+        changes += [f"{name}.trainer.minutes={share / whole * minutes:.4g}" for name, share in shares.items()]
     if gpu is not None:
-        changes += [f"{key}=cuda" for key in ON_A_GPU]
+        changes += [f"{key}=cuda" for key in ("encode_latents.device", *(f"{name}.trainer.device" for name in shares))]
         changes += [f"rollouts.{name}.config.device=cuda" for name in ROLLOUTS]
     if ignored_after is not None:
         changes.append(f"train_stage2.action_following.stop_when_ignored={ignored_after}")
@@ -84,14 +97,14 @@ def check_sources(config: PipelineConfig, recordings: Path, file: Path) -> None:
 
 def check_card(config: PipelineConfig, file: Path, memory: str) -> None:
     """Raises: UnavailableError: there is no GPU. ConfigError: a training does not fit so much memory."""
-    from worldline_core.config import validate
     from worldline_core.errors import ConfigError
     from worldline_core.model.tokenizers import require_device
+    from worldline_core.pipeline.cards import card_memory
     from worldline_core.pipeline.size_sheet import SizeSheet
 
     require_device("cuda")
-    card = {"config": config, "project": Path.cwd(), "devices": 1, "memory": memory}
-    rows = validate(SizeSheet, card, where="--gpu").rows()
+    card = {"config": config, "project": Path.cwd(), "memory": card_memory(memory)}
+    rows = SizeSheet.model_validate(card).rows()
     if too_large := [row.title for row, setting in rows if setting]:
         raise ConfigError(
             "A training does not fit this card", where="--gpu", expected=memory, got=", ".join(too_large),
@@ -108,11 +121,16 @@ def fit_command(arguments: argparse.Namespace) -> None:
         from worldline_core.discovery.configuration import write_config
         from worldline_core.discovery.findings import as_text
         from worldline_core.discovery.look import discover
+        from worldline_core.pipeline.cards import card_memory, preset_for
 
         found = discover(recordings)
-        write_config(found, arguments.config, arguments.recordings)
+        preset = preset_for(0 if arguments.gpu is None else card_memory(arguments.gpu))
+        write_config(found, arguments.config, arguments.recordings, preset)
         print(as_text(found, arguments.config, []))
-    changes = (*overrides_of(arguments.minutes, arguments.gpu, arguments.stop_when_ignored), *arguments.overrides)
+    from worldline_core.config import read_config
+
+    options = (arguments.minutes, arguments.gpu, arguments.stop_when_ignored, read_config(None, arguments.config))
+    changes = (*overrides_of(*options), *arguments.overrides)
     from worldline_core.pipeline.pipeline_config import PipelineConfig, check_recordings, check_weights
 
     config = PipelineConfig.load(None, arguments.config, changes)

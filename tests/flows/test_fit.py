@@ -16,6 +16,7 @@ from flows.command_line import main
 from flows.fit import with_cameras
 from flows.fit_command import overrides_of
 from worldline_core.calibration.estimate.estimate_config import EstimateConfig
+from worldline_core.config import read_config
 from worldline_core.data.sources.open import open_source
 from worldline_core.discovery.configuration import write_config
 from worldline_core.discovery.look import discover
@@ -43,8 +44,10 @@ def own(here: Path) -> Path:
     return here / "my.yaml"
 
 
-def test_minutes_are_shared_out_and_a_gpu_does_all_of_the_work(own: Path) -> None:
-    config = PipelineConfig.load(None, own, overrides_of(8.0, "24GB", 500))
+@pytest.mark.parametrize("preset", ["my_robot", "edge-24gb"])
+def test_minutes_are_shared_out_and_a_gpu_does_all_of_the_work(own: Path, preset: str) -> None:
+    own.write_text(own.read_text().replace("extends: my_robot", f"extends: {preset}"))
+    config = PipelineConfig.load(None, own, overrides_of(8.0, "24GB", 500, read_config(None, own)))
     steps = config.distill
     stages: tuple[Any, ...] = (
         config.train_stage1, config.train_stage2, steps.teacher_forcing, steps.trajectory_regression, steps.distribution_matching,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from worldline_core.config import read_config
 from worldline_core.errors import ConfigError
-from worldline_core.pipeline.cards import CARDS, UTILISATION, find_card
+from worldline_core.pipeline.cards import CARDS, PRESETS, UTILISATION, card_memory, find_card, preset_for
 from worldline_core.pipeline.memory_estimate import Estimate
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import SizeSheet
@@ -44,3 +45,28 @@ def test_seconds_and_hours_are_planned_from_operations():
         "In all 1.5 hours",
     ):
         assert row in text
+
+
+@pytest.mark.parametrize(
+    ("card", "preset"),
+    [
+        ("10GB", "my_robot"),
+        ("RTX 3090", "edge-24gb"),
+        ("32GB", "edge-24gb"),
+        ("l40s", "edge-48gb"),
+        ("B200", "edge-80gb"),
+    ],
+)
+def test_a_card_gets_the_largest_preset_made_for_it(card, preset):
+    assert preset_for(card_memory(card)) == preset
+    card = read_config(preset, None).get("card")
+    assert card is None if preset == "my_robot" else CARDS[card].memory == PRESETS[preset]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["edge-24gb", "edge-48gb", "edge-80gb", "nano-80gb-lora"])
+def test_every_stage_of_a_preset_fits_its_card(preset):
+    config = PipelineConfig.load(preset)
+    rows = SizeSheet.model_validate({"config": config, "project": ".", "card": config.card}).rows()
+    assert len(rows) == 5
+    assert not [(row.title, row.total, setting) for row, setting in rows if setting]

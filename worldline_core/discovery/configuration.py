@@ -1,4 +1,4 @@
-"""The configuration file for a folder of recordings: it extends `my_robot`, and its comments say why each value is there."""
+"""The configuration file for a folder of recordings: it extends a preset, and its comments say why each value is there."""
 
 from __future__ import annotations
 
@@ -14,27 +14,30 @@ from worldline_core.discovery.findings import Discovery, Place, Question
 from worldline_core.errors import ConfigError
 from worldline_core.untrusted_text import visible
 
-BASE_RATE = 8.0
-"""Rate of the shipped base model: episodes are thinned to the nearest one."""
+BASE_RATES = {"my_robot": 8.0}
+"""Frames a second that a preset's base model knows: episodes are thinned to the nearest rate."""
+OTHER_RATE = 15.0
+"""Of Cosmos3, which knows any rate: a clip of 33 frames is two seconds long."""
 _CLIP_FRAMES = 33
 _WIDTH = 120
 
 
-def kept_frame(fps: float, frames: int | None) -> int:
-    """Step between kept frames, so that the rate is near BASE_RATE and the usual episode as long as a clip."""
-    nearest = max(1, round(fps / BASE_RATE))
+def kept_frame(fps: float, frames: int | None, base_rate: float = BASE_RATES["my_robot"]) -> int:
+    """Step between kept frames, so that the rate is near the base model's and the usual episode as long as a clip."""
+    nearest = max(1, round(fps / base_rate))
     return nearest if frames is None else max(1, min(nearest, frames // _CLIP_FRAMES))
 
 
-def write_config(found: Discovery, path: Path, given: str) -> None:
+def write_config(found: Discovery, path: Path, given: str, preset: str = "my_robot") -> None:
     """Write the file, which must not be there.
 
     Args:
         given: folder or hub id as the user gave it.
+        preset: what the file extends.
 
     Raises: ConfigError where the file is there already, or its folder is not.
     """
-    text = config_text(found, given)
+    text = config_text(found, given, preset)
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
@@ -51,12 +54,12 @@ def write_config(found: Discovery, path: Path, given: str) -> None:
         ) from error
 
 
-def config_text(found: Discovery, given: str) -> str:
+def config_text(found: Discovery, given: str, preset: str = "my_robot") -> str:
     """The file's text."""
     lines = [*_comment(f"Written by `worldline init {given}`: {found.about}.", 0)]
     for note in found.notes:
         lines += _comment(note, 0)
-    lines += ["extends: my_robot", ""]
+    lines += [f"extends: {preset}", ""]
     if found.questions:
         lines += ["# To be filled in, behind the &name: no command takes this file before.", f"{QUESTIONS}:"]
         lines += [f"  {each.name}: &{each.name} {_flow(f'{TODO} {each.text}')}" for each in found.questions]
@@ -64,18 +67,21 @@ def config_text(found: Discovery, given: str) -> str:
     lines += ["curate:", "  sources:"]
     first, *others = _block(found.source, (), found, 6)
     lines += [*_comment(found.evidence.get(("kind",), ""), 4), f"    - {first.lstrip()}", *others]
-    lines += [*_rate(found), *_splits(found), *_stages(found)]
+    lines += [*_rate(found, BASE_RATES.get(preset, OTHER_RATE)), *_splits(found), *_stages(found)]
     return "\n".join(lines) + "\n"
 
 
-def _rate(found: Discovery) -> list[str]:
+def _rate(found: Discovery, base_rate: float) -> list[str]:
     if found.fps is None:
-        return ["  # Every recording keeps its rate; the shipped base model knows 8 frames a second.", "  fps: null"]
-    every = kept_frame(found.fps, found.frames)
+        return [
+            f"  # Every recording keeps its rate; the preset is made for {base_rate:g} frames a second.",
+            "  fps: null",
+        ]
+    every = kept_frame(found.fps, found.frames, base_rate)
     rate = f"{found.fps / every:.3g} frames a second"
     kept = f"{rate} of {found.fps:g}" if every > 1 else f"All {found.fps:g} frames a second"
     return [
-        *_comment(f"{kept}, where the shipped base model knows {BASE_RATE:g}.", 2),
+        *_comment(f"{kept}; the preset is made for {base_rate:g}.", 2),
         "  fps: null",
         f"  stride: {every}",
     ]

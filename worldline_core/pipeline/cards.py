@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, ByteSize, TypeAdapter, ValidationError
 
 from worldline_core.errors import ConfigError
 
@@ -36,6 +36,8 @@ CARDS = {
     "B200": Card(180e9, 2250e12, 8000e9),
 }
 """By name; of several forms (A100, H100) the one of 80 GB for servers (SXM)."""
+PRESETS = {"edge-80gb": 80e9, "edge-48gb": 48e9, "edge-24gb": 24e9, "my_robot": 0.0}
+"""Presets for a robot of one's own on one card, by the memory that each needs, the largest first."""
 UTILISATION = 0.35
 """Share of a card's operations that a plan counts on, in training and in rollouts."""
 
@@ -52,9 +54,22 @@ def find_card(name: str) -> str:
     if len(found) != 1:
         raise ConfigError(
             "Not a card that the plan knows", where="card", expected=", ".join(CARDS), got=name,
-            next_step="take one of them with about as much memory and speed, or give --memory alone",
+            next_step="take one with about as much memory and speed, or give its memory alone (24GB)",
         )  # fmt: skip
     return found[0]
+
+
+def card_memory(text: str) -> float:
+    """Bytes of "24GB", or of a card by its name."""
+    try:
+        return TypeAdapter(ByteSize).validate_python(text)
+    except ValidationError:
+        return CARDS[find_card(text)].memory
+
+
+def preset_for(memory: float) -> str:
+    """The largest of `PRESETS` that is made for so many bytes."""
+    return next(preset for preset, needed in PRESETS.items() if needed <= memory)
 
 
 def _letters(name: str) -> str:
