@@ -52,8 +52,8 @@ RIVAL_APART, RIVAL_TURNED = 0.05, 0.15
 """A rival shows the tool elsewhere [widths], or is turned against the best camera [rad]."""
 USUAL_WRIST_FOCAL, WRIST_FOCAL_PRIOR = 0.6, 0.4
 """Focal length of usual wrist cameras in widths of the picture (80 degrees), and standard deviation of its logarithm."""
-SHARED_WRIST_CAMERA = 1.5
-"""Variance that more episodes do not reduce, in variances of one episode."""
+SHARED_WRIST_CAMERA = 3.0
+"""Variance that more episodes do not reduce, in variances of one episode: held things hide fingers."""
 ROUNDS, BLURS = 8, (1.8, 1.0)
 
 
