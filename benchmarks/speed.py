@@ -39,7 +39,7 @@ class Tree:
         from worldline_core.serving.session_host import SessionHost
 
         self.world = WorldLine.from_pretrained(Path("artifacts/shipped/models/causal"))
-        self.host = SessionHost(self.world, ServeConfig())
+        self.host = SessionHost(self.world, ServeConfig.model_validate({}))
         self.block = self.world.frames_per_unit
         self.page, self.environment = PlaySession, WorldLineVectorEnv
         self.loop = asyncio.new_event_loop()
