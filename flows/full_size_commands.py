@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from tasks.execution.command_line import add_config_arguments, add_preset_arguments
@@ -23,6 +24,11 @@ def add_plan_command(commands: argparse._SubParsersAction[argparse.ArgumentParse
     plan.add_argument("--gpus", type=int, default=1, help="devices that share the trainings (default: 1)")
     plan.add_argument("--card", metavar="NAME", help="RTX 4090, H100, ... (default: the preset's own)")
     plan.add_argument("--memory", metavar="SIZE", help="memory of each (default: the card's)")
+    plan.add_argument(
+        "--fit",
+        action="store_true",
+        help="propose the largest setting that fits, not larger than the preset's (a minute or more)",
+    )
     plan.set_defaults(run=_plan)
 
 
@@ -35,9 +41,18 @@ def _plan(arguments: argparse.Namespace) -> None:
     from worldline_core.pipeline.pipeline_config import PipelineConfig
     from worldline_core.pipeline.size_sheet import SizeSheet
 
-    config = PipelineConfig.load(preset, arguments.config, arguments.overrides)
+    def load(changes: Sequence[str] = ()) -> PipelineConfig:
+        return PipelineConfig.load(preset, arguments.config, [*arguments.overrides, *changes])
+
+    config = load()
     machine = {"devices": arguments.gpus, "memory": arguments.memory, "card": arguments.card or config.card}
     sheet = validate(SizeSheet, {"config": config, "project": Path.cwd(), **machine}, where="worldline plan")
+    if arguments.fit:
+        from worldline_core.pipeline.smaller import largest_fitting
+
+        changes = largest_fitting(load, lambda smaller: sheet.model_copy(update={"config": smaller}).fits())
+        print("what changes of the preset:", *([f"--set '{one}'" for one in changes] or ["nothing"]), sep="\n  ")
+        sheet = sheet.model_copy(update={"config": load(changes)})
     rows = sheet.rows()
     print(sheet.as_text(rows))
     raise SystemExit(0 if not any(setting for _, setting in rows) else 1)

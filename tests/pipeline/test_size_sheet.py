@@ -10,6 +10,7 @@ from worldline_core.pipeline.cards import CARDS, PRESETS, UTILISATION, card_memo
 from worldline_core.pipeline.memory_estimate import Estimate
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import SizeSheet
+from worldline_core.pipeline.smaller import largest_fitting, smaller_settings
 
 
 @pytest.mark.parametrize(
@@ -61,6 +62,29 @@ def test_a_card_gets_the_largest_preset_made_for_it(card, preset):
     assert preset_for(card_memory(card)) == preset
     card = read_config(preset, None).get("card")
     assert card is None if preset == "my_robot" else CARDS[card].memory == PRESETS[preset]
+
+
+def test_precision_goes_before_clips_and_pictures_and_adapters_come_last():
+    def load(changes):
+        return PipelineConfig.load("edge-80gb", overrides=changes)
+
+    settings = smaller_settings(load(()))
+    orders = [next(n for n, made in enumerate(settings) if any(key in one for one in made))
+              for key in ("checkpointing", "moments", "weights=bf16", "lengths", "image_size", "lora")]  # fmt: skip
+    assert orders == sorted(orders)
+    tried = []
+
+    def fits(config):
+        tried.append(config)
+        return max(config.distill.clips.lengths) <= 65
+
+    found = load(largest_fitting(load, fits))
+    assert len(tried) <= 5
+    assert (found.distill.clips.lengths, found.encode_latents.clip_frames) == ((65,), 65)
+    assert (found.train_stage2.lora, found.encode_latents.image_size) == (None, (480, 640))
+    assert largest_fitting(load, lambda _: True) == []
+    with pytest.raises(ConfigError, match="No setting of this preset fits"):
+        largest_fitting(load, lambda _: False)
 
 
 @pytest.mark.slow
