@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from worldline_core.errors import ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
@@ -66,5 +67,12 @@ def largest_fitting(
             "No setting of this preset fits the card", where="worldline plan --fit",
             next_step="take a preset of a smaller model, or a card of more memory",
         )  # fmt: skip
-    last = {change.partition("=")[0]: change for change in settings[found]}
-    return list(last.values())
+    last = dict(change.split("=", 1) for change in settings[found])
+    before = load(()).model_dump(mode="json")
+    return [f"{key}={value}" for key, value in last.items() if str(_at(before, key)) != value]
+
+
+def _at(values: Any, key: str) -> Any:
+    for name in key.split("."):
+        values = None if values is None else values.get(name)
+    return values
