@@ -1,69 +1,24 @@
-"""Speed of forward kinematics against MuJoCo, and of action maps against drawing them with OpenCV.
+"""Speed of action maps against drawing them with OpenCV.
 
-    python benchmarks/action_geometry.py [--threads 1] [--device cpu] [--embodiment franka_panda]
+    python benchmarks/action_geometry.py [--threads 1] [--device cpu]
 
-Both sides get the same input; the largest difference of their results is printed. The ratios carry over to other machines, the
-figures do not. Maps: 3 views, 2 arms, 33 latent frames on 30 x 40 cells; OpenCV draws the Gaussian as circles of falling
+Both sides get the same input; the largest difference of their results is printed. The ratio carries over to other machines, the
+figures do not. 3 views, 2 arms, 33 latent frames on 30 x 40 cells; OpenCV draws the Gaussian as circles of falling
 intensity at the size of the video, and reduces them to the grid.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import cv2
-import mujoco
 import numpy as np
 import torch
 
 from benchmarks.harness import best_seconds, command_line, print_table
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
 from worldline_core.actions.episode_tracks import TrackBatch
-from worldline_core.geometry.embodiment import Embodiment, load_embodiment
-from worldline_core.geometry.embodiment_report import random_states
-from worldline_core.geometry.kinematics import ArmKinematics
 
 IMAGE, GRID, VIEWS, ARMS = (480, 640), (30, 40), 3, 2
 SIGMA_OF_WIDTH = 10 / 512
-
-
-def mujoco_poses(embodiment: Embodiment) -> Callable[[np.ndarray], np.ndarray]:
-    """`mj_kinematics` for each frame; it computes every body of the description."""
-    model = mujoco.MjModel.from_xml_path(str(embodiment.description_path))
-    data = mujoco.MjData(model)
-    address = [int(model.joint(j).qposadr[0]) for arm in embodiment.arms for j in arm.joints]
-    columns = np.concatenate([np.r_[embodiment.joint_columns(arm)] for arm in embodiment.arms])
-    links = [model.body(arm.end_effector_link).id for arm in embodiment.arms]
-    base = model.body(embodiment.base_link).id
-    tools = np.stack([arm.T_link_tool.matrix() for arm in embodiment.arms])
-
-    def poses(states: np.ndarray) -> np.ndarray:
-        flange = np.tile(np.eye(4), (len(states), len(links), 1, 1))
-        root = np.tile(np.eye(4), (len(states), 1, 1, 1))
-        for n, joints in enumerate(states[:, columns]):
-            data.qpos[address] = joints
-            mujoco.mj_kinematics(model, data)
-            flange[n, :, :3, :3] = data.xmat[links].reshape(-1, 3, 3)
-            flange[n, :, :3, 3] = data.xpos[links]
-            root[n, 0, :3, :3], root[n, 0, :3, 3] = data.xmat[base].reshape(3, 3), data.xpos[base]
-        return np.linalg.inv(root) @ flange @ tools
-
-    return poses
-
-
-def measure_kinematics(name: str) -> None:
-    embodiment = load_embodiment(name)
-    kinematics = ArmKinematics(embodiment)
-    states = random_states(embodiment, 4096)
-    by_mujoco = mujoco_poses(embodiment)
-    difference = np.abs(by_mujoco(states) - kinematics.tool_poses(states).numpy()).max()
-    print(f"\n{name}: largest difference {difference:.1e}")
-    seconds = {
-        "batched": best_seconds(lambda: kinematics.tool_poses(states)) / len(states),
-        "MuJoCo mj_kinematics frame by frame": best_seconds(lambda: by_mujoco(states)) / len(states),
-    }
-    rows = ((what, len(embodiment.arms) / each, each / seconds["batched"]) for what, each in seconds.items())
-    print_table(("method", "tool poses/s", "batched is faster by"), rows)
 
 
 def random_tracks(num_frames: int) -> TrackBatch:
@@ -114,12 +69,10 @@ def measure_maps(device: str) -> None:
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--device", default="cpu", help="of the action maps")
-    parser.add_argument("--embodiment", default="franka_panda", help="of the kinematics")
+    parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)
-    measure_kinematics(arguments.embodiment)
     measure_maps(arguments.device)
 
 
