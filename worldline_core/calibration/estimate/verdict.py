@@ -253,13 +253,14 @@ def _intervals(
     recorded: RecordedView, fitted: FittedCamera, shown: np.ndarray, shared: float, systematic: np.ndarray
 ) -> tuple[KindOfError, ...]:
     """The errors of each kind that the estimate may have. The last is that of the robot's place in the picture, of which `shown`
-    (2, 8) [% of the width] is the displacement by each parameter. `systematic` (8,) is the standard deviation of the error that no
-    number of pictures reduces, in its own direction.
+    (2, 8) [% of the width] is the displacement by each parameter. `systematic` (8,) is the standard deviation of an error, in its own
+    direction, that no number of pictures reduces and none shows.
     """
     scale = np.append(SCALE[:-1], recorded.every)
     covariance = np.linalg.inv(fitted.information) * inflation(len(recorded.episodes), shared)
-    covariance += np.outer(systematic, systematic)
-    return kinds_of_error(np.zeros(PARAMETERS), covariance * np.outer(scale, scale), shown / scale)
+    none, units = np.zeros(PARAMETERS), np.outer(scale, scale)
+    in_the_picture = kinds_of_error(none, covariance * units, shown / scale)[-1]
+    return (*kinds_of_error(none, (covariance + np.outer(systematic, systematic)) * units, None), in_the_picture)
 
 
 def _moved_at(recorded: RecordedView, found: StillCamera, views: Sequence[StillView]) -> str | None:
