@@ -25,6 +25,13 @@ from typing import Any
 
 import numpy as np
 
+AS_COMMANDS = {
+    "MALLOC_MMAP_MAX_": "0",
+    "MALLOC_TRIM_THRESHOLD_": str(2**31 - 1),
+    "MALLOC_ARENA_MAX": "1",
+    "OMP_WAIT_POLICY": "PASSIVE",
+}
+"""What the command `worldline` sets."""
 ROBOT, EPISODE, ENVIRONMENTS = "ur5e_silver", "ur5e_silver-test-s1-00000", 8
 
 
@@ -161,7 +168,7 @@ def main() -> None:
     trees = [*(tree.resolve() for tree in options.trees), Path(__file__).resolve().parents[1]]
     command = [sys.executable, __file__, "--work", "--threads", str(options.threads)]
     processes = [
-        subprocess.Popen(command, cwd=tree, env=os.environ | {"PYTHONPATH": str(tree)}, text=True,
+        subprocess.Popen(command, cwd=tree, env=os.environ | AS_COMMANDS | {"PYTHONPATH": str(tree)}, text=True,
                          stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         for tree in trees
     ]  # fmt: skip

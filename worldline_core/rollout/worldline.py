@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -37,19 +35,6 @@ from worldline_core.rollout.observation import (
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts
 from worldline_core.store.artifact_files import verify_artifact
-
-
-def keep_freed_memory() -> None:
-    """Let glibc keep up to 256 MiB that are freed: the kernel would clear the pages of every intermediate result anew, which takes
-    a fifth of the time of a small model.
-    """
-    allocator = ctypes.CDLL(None) if sys.platform == "linux" else None
-    if hasattr(allocator, "mallopt"):  # musl has none
-        allocator.mallopt(_MMAP_THRESHOLD, 32 << 20)
-        allocator.mallopt(_TRIM_THRESHOLD, 256 << 20)
-
-
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # malloc.h
 
 
 class WorldLine:
@@ -141,8 +126,6 @@ class WorldLine:
             ConfigError: fewer than one step.
         """
         require_device(device)
-        if device == "cpu":
-            keep_freed_memory()
         folder = pretrained_folder(folder)
         for name, place in (("Model", folder), ("Decoder", decoder)):
             if place is not None:
