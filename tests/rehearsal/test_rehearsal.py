@@ -110,9 +110,8 @@ def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project
     assert [manifest["metrics"]["lpips"] for manifest in manifests["distill"]] == ["on"]
     (ablations,) = (folder / "artifacts" / "ablation_table").glob("*/table.parquet")
     rows = {cell["variant"] for cell in pq.read_table(ablations).to_pylist() if cell["mean"] is not None}
-    # LPIPS of one view does not compare, and a segmenter of random weights measures no robot.
     variants = load_variants().keys()
-    assert rows == variants - {"head_only"}
+    assert rows == variants
     assert len(manifests["train_stage2"]) == len(variants)
     whole = [rollout for rollout in manifests["rollout"] if rollout["config"]["num_frames"] == 129]
     assert {rollout["config"]["method"] for rollout in whole} == load_config(
