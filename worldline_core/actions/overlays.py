@@ -131,8 +131,9 @@ def draw_overlay(
         picture = np.rint(picture * (1 - heat) + np.asarray(arm_colour(tracks.arms, arm)) * heat).astype(np.uint8)
     if style.outline:
         _draw_outline(picture, arm_mask(tracks, n, view, size))
+    tips = axis_tips(tracks, n)[v]
     for arm in shown:
-        _draw_axes(picture, centres[arm], axis_tips(tracks, n, v, arm), tracks.image_size)
+        _draw_axes(picture, centres[arm], tips[arm], tracks.image_size)
         _draw_ring(picture, centres[arm], float(tracks.gripper[n, v, arm]), arm_colour(tracks.arms, arm))
     return picture
 
@@ -154,15 +155,19 @@ def picture_pixel(uv: NDArray[np.floating], image_size: tuple[int, int], size: t
     return np.asarray(uv, dtype=np.float64) * np.diagonal(affine)[:2] + affine[:2, 2]
 
 
-def axis_tips(tracks: EpisodeTracks, n: int, v: int, arm: int) -> list[NDArray[np.float64] | None]:
-    """Pixels (of the tracks' image size) of the ends of the tool's axes; None for one that is behind the camera."""
-    K = tracks.K[v].astype(np.float64)
-    ray = np.linalg.solve(K, np.append(tracks.uv[n, v, arm].astype(np.float64), 1.0))
-    origin = ray * float(tracks.depth[n, v, arm])
-    tips: list[NDArray[np.float64] | None] = []
-    for axis in rotation_from_rot6d(tracks.rot6d[n, v, arm]).T:
-        tip = origin + AXIS_LENGTH_M * axis
-        tips.append((K @ (tip / tip[2]))[:2] if tip[2] > 1e-3 else None)
+def axis_tips(tracks: EpisodeTracks, n: int) -> NDArray[np.float64]:
+    """Pixels (v, a, 3, 2) (of the tracks' image size) of the ends of all tools' axes; NaN for one that is behind the camera, and for
+    tools that are not valid.
+    """
+    tips = np.full((*tracks.valid.shape[1:], 3, 2), np.nan)
+    v, arm = np.nonzero(tracks.valid[n])
+    K, uv = tracks.K[v].astype(np.float64), tracks.uv[n, v, arm].astype(np.float64)
+    rays = np.linalg.solve(K, np.append(uv, np.ones((len(uv), 1)), axis=1)[..., None])[..., 0]
+    origins = rays * tracks.depth[n, v, arm].astype(np.float64)[:, None]
+    ends = origins[:, None] + AXIS_LENGTH_M * np.swapaxes(rotation_from_rot6d(tracks.rot6d[n, v, arm]), -1, -2)
+    ahead = ends[..., 2:] > 1e-3
+    pixels = (ends / np.where(ahead, ends[..., 2:], 1.0)) @ np.swapaxes(K, -1, -2)
+    tips[v, arm] = np.where(ahead, pixels[..., :2], np.nan)
     return tips
 
 
@@ -182,13 +187,13 @@ def _line_widths(height: int) -> tuple[int, int]:
 def _draw_axes(
     picture: Picture,
     centre: NDArray[np.float64],
-    tips: Sequence[NDArray[np.float64] | None],
+    tips: NDArray[np.float64],
     image_size: tuple[int, int],
 ) -> None:
     size = (picture.shape[0], picture.shape[1])
     width, shade = _line_widths(size[0])
     start = _fixed_point(centre)
-    ends = [None if tip is None else _fixed_point(picture_pixel(tip, image_size, size)) for tip in tips]
+    ends = [None if np.isnan(tip).any() else _fixed_point(picture_pixel(tip, image_size, size)) for tip in tips]
     for colours, thickness in (((SHADE,) * 3, shade), (AXIS_COLOURS, width)):
         for end, colour in zip(ends, colours, strict=True):
             if end is not None:

@@ -14,11 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.overlays import AXIS_LENGTH_M
+from worldline_core.actions.overlays import axis_tips
 from worldline_core.errors import DataError
 from worldline_core.geometry.inverse_kinematics import InverseKinematics
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.transforms import rotation_from_rot6d
 from worldline_core.rollout.observation import image_size, project_controls
 from worldline_core.rollout.recorded_starts import RecordedStart
 
@@ -157,19 +156,13 @@ def frame_marks(tracks: EpisodeTracks, frame: int, views: Sequence[str]) -> dict
     """By view and arm: the tool's place and the end of its axis out of the gripper, as shares of the picture, and its
     opening; None where the view does not show it."""
     size = np.array(tracks.image_size[::-1])
-    v, arm = np.nonzero(tracks.valid[frame])
-    K, uv = tracks.K[v].astype(np.float64), tracks.uv[frame, v, arm].astype(np.float64)
-    rays = np.linalg.solve(K, np.append(uv, np.ones((len(uv), 1)), axis=1)[..., None])[..., 0]
-    ends = rays * tracks.depth[frame, v, arm][:, None].astype(np.float64)
-    ends = ends + AXIS_LENGTH_M * rotation_from_rot6d(tracks.rot6d[frame, v, arm])[..., 2]
-    tips = (K @ (ends / np.maximum(ends[:, 2:], 1e-3))[..., None])[:, :2, 0]
-    places = zip(v.tolist(), arm.tolist(), (uv + 0.5) / size, (tips + 0.5) / size, ends[:, 2] > 1e-3, strict=True)
-    marks = {
-        (view, tool): {
-            "at": at.tolist(),
-            "tip": tip.tolist() if before else None,
-            "open": float(tracks.gripper[frame, view, tool]),
-        }
-        for view, tool, at, tip, before in places
-    }
-    return {view: [marks.get((tracks.views.index(view), tool)) for tool in range(len(tracks.arms))] for view in views}
+    places = (tracks.uv[frame].astype(np.float64) + 0.5) / size
+    tips = (axis_tips(tracks, frame)[..., 2, :] + 0.5) / size
+
+    def mark(v: int, arm: int) -> dict[str, Any] | None:
+        if not tracks.valid[frame, v, arm]:
+            return None
+        tip = None if np.isnan(tips[v, arm]).any() else tips[v, arm].tolist()
+        return {"at": places[v, arm].tolist(), "tip": tip, "open": float(tracks.gripper[frame, v, arm])}
+
+    return {view: [mark(tracks.views.index(view), arm) for arm in range(len(tracks.arms))] for view in views}
