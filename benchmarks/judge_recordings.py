@@ -46,7 +46,7 @@ from worldline_core.rollout.worldline import WorldLine
 
 IMAGE = (64, 96)
 SHIFT = 5.0
-"""Of the model's noise levels towards noise."""
+"""Shift of the model's noise levels towards noise."""
 
 
 def area(scores: np.ndarray, success: np.ndarray) -> float:

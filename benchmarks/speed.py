@@ -31,7 +31,7 @@ AS_COMMANDS = {
     "MALLOC_ARENA_MAX": "1",
     "OMP_WAIT_POLICY": "PASSIVE",
 }
-"""What the command `worldline` sets."""
+"""Environment that the command `worldline` sets up."""
 ROBOT, EPISODE, ENVIRONMENTS = "ur5e_silver", "ur5e_silver-test-s1-00000", 8
 
 

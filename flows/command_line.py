@@ -378,8 +378,6 @@ def _embodiment_check(arguments: argparse.Namespace) -> None:
 
 def _serve(arguments: argparse.Namespace) -> None:
     """Load the model and serve until interrupted."""
-    # Read when torch is loaded. Threads that spin while they wait for each other make a block ten times slower on busy cores.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from worldline_core.config import apply_overrides, load_config, validate
     from worldline_core.errors import UnavailableError, installing
     from worldline_core.serving.serve_config import ServeConfig
@@ -442,7 +440,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     # Early: threads that have allocated keep the arena that they have.
     keep_freed_memory()
-    # Threads that spin at barriers take the cores from the video decoders beside them. Read when torch is imported.
+    # Threads that spin at barriers take the cores from video decoders, browsers and servers beside them. Read when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = build_parser().parse_args(argv)
     if argv is None:

@@ -105,8 +105,7 @@ def test_what_moves_outside_of_the_robot_s_masks_does_not_count(bank: Loaded, ki
     assert np.abs(plain.fine.flow[:, :, left]).max() > 1
     assert not np.abs(masked.fine.flow[:, :, left]).any() and not masked.fine.change[:, :, left].any()
     # The tools are where the camera shows them: inside of the picture most of the time.
-    assert plain.colour is not None
-    height, width = plain.colour.shape[1:3]
+    height, width = bank[0][1]["head"].shape[1:3]
     assert np.mean((seen[0] > 0) & (seen[0] < [width, height])) > 0.8
 
 

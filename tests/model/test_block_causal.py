@@ -139,7 +139,7 @@ def test_future_frames_and_actions_leave_past_blocks_unchanged(model):
 
 
 def test_the_write_pass_is_the_conditioned_form_and_not_sigma_zero(make_model):
-    """What a block leaves in the cache has no time embedding, which a noisy pass at sigma 0 has (Wan's clean frames are at time 0)."""
+    """The write pass adds no time embedding; a noisy pass at sigma 0 does. Wan's clean frames have time 0."""
     (_, clean, _, _), model = clip(), make_model()
     observed, block = frames_of(clean, 0, 1), frames_of(clean, 1, 3)
     cache = KVCache(1, 3)

@@ -27,7 +27,7 @@ def adapted(**changes):
 
 @pytest.fixture(scope="module")
 def inputs(world, tmp_path_factory):
-    """What Stage II needs, with a base checkpoint of random weights."""
+    """Inputs of Stage II, with a base checkpoint of random weights."""
     model, folder = build_world_model(stage1(trainer=trainer(1)).model), tmp_path_factory.mktemp("base")
     model.initialise(torch.Generator().manual_seed(0))
     torch.nn.init.normal_(model.proj_out.weight, std=0.2)  # a head of zeros, which is not adapted, would teach no layer

@@ -17,7 +17,7 @@ from worldline_core.untrusted_text import visible
 BASE_RATES = {"my_robot": 8.0}
 """Frames a second that a preset's base model knows: episodes are thinned to the nearest rate."""
 OTHER_RATE = 15.0
-"""Of Cosmos3, which knows any rate: a clip of 33 frames is two seconds long."""
+"""Frames a second for Cosmos3, which knows any rate: a clip of 33 frames lasts two seconds."""
 _CLIP_FRAMES = 33
 _WIDTH = 120
 

@@ -207,7 +207,7 @@ class KVCache:
         return blocks[:stop] + blocks[start:]
 
     def window_beside_next(self) -> CacheWindow | None:
-        """What is visible beside the next finished block once it is taken in; None where that block itself is not."""
+        """The blocks that the next finished block will share the window with; None if that block leaves the window at once."""
         visible = self._visible((*self.window.blocks, None))
         kept = [block for block in visible if block is not None]
         if len(kept) == len(visible):
