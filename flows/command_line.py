@@ -333,9 +333,14 @@ def _calibrate_estimate(arguments: argparse.Namespace) -> None:
 
         mask_robot = None
         if arguments.segmenter is not None:
+            from worldline_core.errors import ConfigError
             from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 
             weights = arguments.weights
+            if weights is None and arguments.segmenter != "colour":
+                raise ConfigError(
+                    "This segmenter needs its weights", got=arguments.segmenter, next_step="give --weights FOLDER"
+                )
             mask_robot = open_segmenter(arguments.segmenter, learned=weights, sam3=weights).segment
         found = estimate_command(
             arguments.config,

@@ -109,6 +109,12 @@ def test_what_moves_outside_of_the_robot_s_masks_does_not_count(bank: Loaded, ki
     assert np.mean((seen[0] > 0) & (seen[0] < [width, height])) > 0.8
 
 
+def test_a_segmenter_needs_its_weights(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["calibrate", "estimate", "my.yaml", "--segmenter", "sam3"])
+    assert ended.value.code == 2 and "--weights" in capsys.readouterr().err
+
+
 def test_what_cannot_be_estimated_is_named(bank: Loaded, kinematics: ArmKinematics) -> None:
     pictures = [(episode, {"head": frames["head"][:4]}) for episode, frames in bank]
     spoiled = (bank[:2], "2 episodes"), (benchmark.SPOILED["still"](bank), "not enough motion"), (pictures, "pictures")
