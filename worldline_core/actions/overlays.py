@@ -275,7 +275,7 @@ def legend_strip(
     items = [(f"{arm} tool", arm_colour(arms, index), "dot") for index, arm in enumerate(arms)]
     items += [(name, colour, "line") for name, colour in zip(AXIS_NAMES, AXIS_COLOURS, strict=True)]
     items += [("wide ring: gripper open", ink, "ring")]
-    items += [("where the arms should lie", OUTLINE_COLOUR, "outline")] if outline else []
+    items += [("where the arms should be", OUTLINE_COLOUR, "outline")] if outline else []
     for text, colour, mark in items:
         needed = 20 + text_width_px(text, LEGEND_TEXT_PX) + 14
         if x + needed > end:
