@@ -46,10 +46,21 @@ def test_a_crash_is_named_and_costs_its_reader_only() -> None:
     assert read_limited(LIMITS, os.getpid) != before
 
 
-def test_a_crash_by_what_was_read_before_is_tried_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("failure", ["os.abort()", "bytearray(5 << 30)", "hdf5.require_h5py()"])
+def test_a_failure_by_what_was_read_before_is_tried_again(tmp_path: Path, failure: str) -> None:
     """The second reader finds the mark of the first one."""
     read_limited(LIMITS, os.getpid)
-    code = f"import os, pathlib; m = pathlib.Path({str(tmp_path / 'mark')!r}); m.exists() or (m.touch(), os.abort())"
+    code = f"""
+import importlib, os, pathlib
+from worldline_core.data.sources import hdf5
+def import_without_memory(name):
+    raise ImportError("h5py/_errors.so: failed to map segment from shared object")
+mark = pathlib.Path({str(tmp_path / "mark")!r})
+if not mark.exists():
+    mark.touch()
+    importlib.import_module = import_without_memory
+    {failure}
+"""
     read_limited(LIMITS, exec, code)
     assert (tmp_path / "mark").exists()
 

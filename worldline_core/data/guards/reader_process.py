@@ -209,16 +209,25 @@ def _answer(limits: ReaderLimits, function: Callable[..., Any], arguments: tuple
     resource.setrlimit(resource.RLIMIT_DATA, (int(limits.memory_gb * 2**30), resource.RLIM_INFINITY))
     try:
         return None, function(*arguments)
-    except MemoryError as error:
-        rejected = RejectedInputError(
-            "out_of_memory",
-            "Reading needs too much memory",
-            expected=f"at most {limits.memory_gb:g} GB",
-            got=str(error) or None,
-            next_step="the file is damaged or hostile; if it is neither, raise curate.reader.memory_gb",
-            evidence={"limit_gb": limits.memory_gb},
-        )
-        return rejected, None
     except Exception as error:  # noqa: BLE001 - raised again by the process that waits
+        if lack := _lack_of_memory(error):
+            rejected = RejectedInputError(
+                "out_of_memory",
+                "Reading needs too much memory",
+                expected=f"at most {limits.memory_gb:g} GB",
+                got=str(lack) or None,
+                next_step="the file is damaged or hostile; if it is neither, raise curate.reader.memory_gb",
+                evidence={"limit_gb": limits.memory_gb},
+            )
+            return rejected, None
         error.add_note("".join(traceback.format_tb(error.__traceback__)))  # which pickling loses
         return error, None
+
+
+def _lack_of_memory(error: BaseException | None) -> BaseException | None:
+    """The cause of an error that is a lack of memory: also of a library that finds none to be loaded into."""
+    while error is not None and not isinstance(error, MemoryError):
+        if isinstance(error, ImportError) and "failed to map segment" in str(error):
+            return error
+        error = error.__cause__
+    return error
