@@ -28,9 +28,9 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     export.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet, a RolloutSet or a checkpoint")
     export.add_argument(
         "--format", action="append", required=True, dest="formats",
-        choices=("lerobot", "mcap", "mcap-ros2", "rrd", "mp4", "worldarena", "model"),
+        choices=("lerobot", "mcap", "mcap-ros2", "rrd", "mp4", "worldarena", "model", "diffusers"),
         help="repeatable; lerobot: EpisodeSets only, mp4 and worldarena: RolloutSets only; mcap: Foxglove's schemas;"
-        " model: a checkpoint with its tokenizer",
+        " model: a checkpoint with its tokenizer; diffusers: Cosmos3 as diffusers and vLLM-Omni run it, without controls",
     )  # fmt: skip
     export.add_argument("--output", type=Path, required=True, help="where the files go")
     export.add_argument(
@@ -39,6 +39,9 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     export.add_argument("--outcome", help="only recordings that ended so: success, failure, ..; EpisodeSets only")
     export.add_argument(
         "--episodes", type=Path, metavar="FOLDER", dest="episode_set", help="the EpisodeSet of predictions"
+    )
+    export.add_argument(
+        "--pretrained", type=Path, metavar="FOLDER", help="diffusers only: the published folder that was imported"
     )
     export.set_defaults(run=_export)
     compare = commands.add_parser(
@@ -119,6 +122,7 @@ def _export(arguments: argparse.Namespace) -> None:
         episode_ids=arguments.episodes,
         outcome=arguments.outcome,
         episodes=arguments.episode_set,
+        pretrained=arguments.pretrained,
     ):
         print(f"wrote {path}")
 

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,10 +12,10 @@ from diffusers.pipelines.cosmos.pipeline_cosmos3_omni import get_3d_mrope_ids_te
 from torch.profiler import ProfilerActivity, profile
 
 from tests.model.test_checkpoint import most_bytes
-from worldline_core.errors import CheckpointError, UnavailableError
+from worldline_core.errors import ArtifactError, CheckpointError, UnavailableError
 from worldline_core.model.backbone import import_backbone
-from worldline_core.model.checkpoint import fill, load_checkpoint
-from worldline_core.model.cosmos3 import config_from_diffusers, read_cosmos3
+from worldline_core.model.checkpoint import fill, load_checkpoint, save_checkpoint
+from worldline_core.model.cosmos3 import config_from_diffusers, read_cosmos3, write_cosmos3
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import ImportBackboneConfig, cosmos3_config
 
@@ -128,6 +129,39 @@ def test_the_import_holds_one_file_of_the_result(tmp_path):
     same = {name for name, weight in ours.named_parameters() if name in theirs}
     assert len(same) > 80
     assert all(torch.equal(ours.get_parameter(name), theirs[name].to(ours.get_parameter(name))) for name in same)
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("towers", ["both", "generation"])
+@torch.no_grad()
+def test_a_trained_checkpoint_goes_back_to_diffusers(kind, towers, tmp_path):
+    pretrained = random_transformer(kind)
+    pretrained.save_pretrained(tmp_path / "published" / "transformer", max_shard_size="40KB")
+    (tmp_path / "published" / "model_index.json").write_text("{}")
+    model, _ = load_cosmos3(tmp_path / "published", fps=16.0, changes={"towers": towers})
+    for name, weight in model.named_parameters():
+        if not name.startswith("time_embedder."):
+            weight.mul_(1.5)
+    save = partial(save_checkpoint, model=model, action_contract=None, dtype=torch.float32)
+    save(tmp_path / "trained", kind="stage1")
+    output = write_cosmos3(tmp_path / "trained", tmp_path / "published", tmp_path / "back")
+    theirs = Cosmos3OmniTransformer.from_pretrained(output / "transformer").eval()
+    untouched = ["lm_head.weight", *(["embed_tokens.weight"] if towers == "generation" else [])]
+    assert all(torch.equal(theirs.get_parameter(name), pretrained.get_parameter(name)) for name in untouched)
+    moved = "layers.1.mlp_moe_gen.up_proj.weight"
+    assert torch.equal(theirs.get_parameter(moved), 1.5 * pretrained.get_parameter(moved))
+    if towers == "both":
+        latents, text = torch.randn(1, 6, 4, 4, 6, generator=torch.Generator().manual_seed(1)), [3, 1, 4]
+        given = {"text": model.encode_text(torch.tensor([text])), "views": ("head",), "fps": torch.tensor([16.0])}
+        ours = model(latents[:, None], torch.tensor([0.9]), **given).velocity[:, 0]
+        torch.testing.assert_close(ours, reference_velocity(theirs, latents, 0.9, text, fps=16.0), rtol=1e-5, atol=1e-5)
+    sealed = json.loads((output / "worldline" / "checkpoint.json").read_text())
+    assert sealed["weights_sha256"] and {"model_index.json", "worldline/model.safetensors"} <= set(sealed["files"])
+    with pytest.raises(ArtifactError, match="exists"):
+        write_cosmos3(tmp_path / "trained", tmp_path / "published", output)
+    random_transformer("edge" if kind == "nano" else "nano").save_pretrained(tmp_path / "other")
+    with pytest.raises(CheckpointError, match="feed_forward"):
+        write_cosmos3(tmp_path / "trained", tmp_path / "other", tmp_path / "no")
 
 
 @torch.no_grad()

@@ -30,6 +30,7 @@ from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLi
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.model.cosmos3 import write_cosmos3
 from worldline_core.model.pretrained import write_pretrained
 from worldline_core.pictures import png_bytes, write_side_by_side
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -45,7 +46,7 @@ MCAP_FORMATS: dict[str, tuple[Encoding, str]] = {"mcap": ("protobuf", ".mcap"), 
 FORMATS = {
     "EpisodeSet": ("lerobot", *MCAP_FORMATS, "rrd"),
     "RolloutSet": ("mp4", "rrd", *MCAP_FORMATS, "worldarena"),
-    "Checkpoint": ("model",),
+    "Checkpoint": ("model", "diffusers"),
 }
 _CRF, _PRESET = 10, "veryfast"
 """For rows that are encoded again because they do not begin at a key frame; others are copied."""
@@ -59,6 +60,7 @@ def export(
     episode_ids: Sequence[str] = (),
     outcome: str | None = None,
     episodes: Path | None = None,
+    pretrained: Path | None = None,
 ) -> list[Path]:
     """Write episodes of an EpisodeSet, predictions of a RolloutSet, or a checkpoint with its tokenizer, below a folder.
 
@@ -68,10 +70,11 @@ def export(
         formats: for an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
             artifact refers to another one's), `mcap`, `mcap-ros2` and `rrd` (one file per episode); for a RolloutSet
             these without `lerobot`, `mp4` (truth beside prediction) and `worldarena` (`export_worldarena`); for a
-            checkpoint `model` (a folder with its tokenizer and card, to be published).
+            checkpoint `model` (a folder with its tokenizer and card, to be published) and `diffusers` (`write_cosmos3`).
         episode_ids: the chosen episodes; default: all.
         outcome: only recordings of an EpisodeSet with this outcome (``success``: demonstrations to train a policy on).
         episodes: the EpisodeSet of predictions; default: the one that their manifest names.
+        pretrained: for `diffusers`: the folder of the published weights that the checkpoint came from.
 
     Returns: the files, or the folder of the new set.
 
@@ -93,7 +96,14 @@ def export(
     with folder_lock(output):
         verify_artifact(artifact)
         if kind == "Checkpoint":
-            return [write_pretrained(artifact, output / "model")]
+            if "diffusers" in formats and pretrained is None:
+                raise ConfigError(
+                    "The format diffusers needs the published folder", next_step="give it as --pretrained"
+                )
+            folders = [write_pretrained(artifact, output / "model")] if "model" in formats else []
+            if pretrained is not None and "diffusers" in formats:
+                folders.append(write_cosmos3(artifact, pretrained, output / "diffusers"))
+            return folders
         if kind == "EpisodeSet":
             return _export_episodes(EpisodeSet.open(artifact), output, formats, episode_ids, outcome)
         return _export_rollouts(artifact, output, formats, episode_ids, episodes)
