@@ -135,7 +135,7 @@ def write_video_scores(folder: Path) -> None:
     }  # fmt: skip
     summary = summarise([s for s in scores if s.method != "true"], **options) | {
         "methods": sorted(quality), "unavailable": {"lpips": "no weights in the configured folder"},
-        "segmenters": [segmenter, {"name": "colour", "suffix": "[colour]", "description": "colour model of the arms"}],
+        "segmenters": [segmenter, {**segmenter, "name": "colour", "suffix": "[colour]", "description": "colour model"}],
     }  # fmt: skip
     write_json_atomic(folder / "summary.json", summary)
 

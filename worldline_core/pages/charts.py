@@ -103,21 +103,20 @@ def line_chart(
     y_label: str,
     log_y: bool = False,
     log_x: bool = False,
-    y_range: tuple[float, float] | None = None,
     x_ticks: Sequence[float] | None = None,
-    in_percent: bool = False,
+    shares: bool = False,
 ) -> Markup:
     """Lines with optional interval bands and a legend below the title.
 
     Args:
         log_y, log_x: logarithmic axes; values that are not positive are left out.
         x_ticks: where the x axis is labelled (default: round numbers).
-        in_percent: y values are shares and are labelled in per cent.
+        shares: y is from 0 to 1 and labelled in per cent.
     """
     xs = [float(v) for s in series for v in s.x if math.isfinite(v) and (not log_x or v > 0)]
     x_axis = Axis(min(xs, default=0.0), max(xs, default=1.0), LEFT, WIDTH - RIGHT, log_x)
-    y_axis = Axis(*(y_range or _value_range(series, log_y)), HEIGHT - BOTTOM, TOP, log_y)
-    rows = [(y_axis.at(v), percent(v) if in_percent else tick_label(v)) for v in y_axis.ticks()]
+    y_axis = Axis(*((0.0, 1.02) if shares else _value_range(series, log_y)), HEIGHT - BOTTOM, TOP, log_y)
+    rows = [(y_axis.at(v), percent(v) if shares else tick_label(v)) for v in y_axis.ticks()]
     columns = [(x_axis.at(v), tick_label(v)) for v in (x_axis.ticks(6) if x_ticks is None else x_ticks)]
     return render_macro(
         "pages/charts.html", "lines", title=title, x_label=x_label, y_label=y_label, rows=rows, columns=columns,

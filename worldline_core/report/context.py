@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from markupsafe import Markup
 from pydantic import Field
@@ -17,7 +16,8 @@ from pydantic import Field
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.evaluation.metric_registry import METRICS, Metric
-from worldline_core.evaluation.scores import TRUE_METHOD
+from worldline_core.evaluation.paired import Series, collect_metrics, read_scores
+from worldline_core.evaluation.scores import SUMMARY_FILE, TRUE_METHOD, Interval
 from worldline_core.pages.page import render, render_macro
 from worldline_core.pictures import Picture, jpeg_bytes
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -108,85 +108,72 @@ def predicting(names: Iterable[str]) -> list[Method]:
     return [m for m in in_order(names) if m.name != TRUE_METHOD]
 
 
-def share_interval(measured: JsonObject | None) -> JsonObject | None:
+def share_interval(measured: JsonObject) -> JsonObject:
     """A mean share with its interval; where all cases agree, a bootstrap sees no spread: the exact bound of n equal cases."""
-    if measured is None or measured["low"] < measured["high"] or measured["mean"] not in (0, 1):
+    if measured["low"] < measured["high"] or measured["mean"] not in (0, 1):
         return measured
-    unseen = 1 - 0.025 ** (1 / max(int(measured.get("count", 1)), 1))
+    unseen = 1 - 0.025 ** (1 / measured["count"])
     return {**measured, "low": max(0.0, measured["low"] - unseen), "high": min(1.0, measured["high"] + unseen)}
+
+
+def headline_metrics(step: str, folder: Path) -> Iterator[tuple[str, str, str, str, Interval]]:
+    """(what, group, method, metric, value) of a finished evaluation: of whole splits, and of the most candidates."""
+    metrics = collect_metrics({step: folder})
+    most = max((int(name.split("/")[1][2:]) for name in metrics if name.startswith("planning/")), default=0)
+    for name, value in metrics.items():
+        what, group, method, metric = name.split("/", 3)
+        if group in (*SPLIT_LABELS, "all", f"N={most}"):
+            yield what, group, method, metric, value
 
 
 @dataclass(frozen=True)
 class VideoScores:
-    """Summaries and tidy rows of `evaluate_video` artifacts, merged. Rows of the method `true` rate the segmenter."""
+    """Scores of an `evaluate_video` artifact; empty without one."""
 
-    summaries: Sequence[JsonObject]
-    rows: Sequence[JsonObject]
-    by_frame: Sequence[JsonObject]
-
-    @classmethod
-    def read(cls, folders: Iterable[Path]) -> VideoScores:
-        paths = list(folders)
-        return cls(
-            [summary for path in paths if (summary := read_json(path / "summary.json"))],
-            [row for path in paths for row in read_rows(path / "scores.parquet")],
-            [row for path in paths for row in read_rows(path / "by_frame.parquet")],
-        )
+    folder: Path | None
 
     @cached_property
+    def summary(self) -> JsonObject:
+        return {} if self.folder is None else read_json(self.folder / SUMMARY_FILE)
+
+    @cached_property
+    def metrics(self) -> JsonObject:
+        """Means with intervals by group, method and metric (``psnr``, ``psnr@head``, ``robot_iou[colour]@head``)."""
+        return self.summary.get("metrics", {})
+
+    @cached_property
+    def series(self) -> Series:
+        """Values by recording."""
+        return {} if self.folder is None else read_scores(self.folder)
+
+    @cached_property
+    def by_frame(self) -> Sequence[JsonObject]:
+        return [] if self.folder is None else read_rows(self.folder / "by_frame.parquet")
+
+    @property
     def groups(self) -> list[str]:
         """Splits that have scores, the held-out ones first."""
-        order = [*SPLIT_LABELS]
-        return sorted({g for s in self.summaries for g in s["metrics"] if "/" not in g}, key=order.index)
+        return [group for group in SPLIT_LABELS if group in self.metrics]
 
     def methods(self, group: str) -> list[Method]:
-        return in_order({m for s in self.summaries for m in s["metrics"].get(group, {})})
-
-    def names(self, group: str) -> set[str]:
-        """Measured metrics of any method of a group: ``psnr``, ``psnr@head``, ``robot_iou[colour]@head``, ..."""
-        return {n for s in self.summaries for found in s["metrics"].get(group, {}).values() for n in found}
+        return in_order(self.metrics.get(group, ()))
 
     def value(self, group: str, method: str, metric: str) -> JsonObject | None:
         """`{"mean", "low", "high", "count"}` of a metric, or None."""
-        found = (s["metrics"].get(group, {}).get(method, {}).get(metric) for s in self.summaries)
-        return next(filter(None, found), None)
+        return self.metrics.get(group, {}).get(method, {}).get(metric)
 
     def difference(self, group: str, first: str, second: str, metric: str) -> JsonObject | None:
         """Paired difference `first - second` over the trajectories that both have, or None."""
-        for row in (row for s in self.summaries for row in s.get("differences", {}).get(group, ())):
+        for row in self.summary.get("differences", {}).get(group, ()):
             if row["metric"] == metric and (row["first"], row["second"]) == (first, second):
                 return row
             if row["metric"] == metric and (row["first"], row["second"]) == (second, first):
                 return {**row, "mean": -row["mean"], "low": -row["high"], "high": -row["low"]}
         return None
 
-    @cached_property
-    def unavailable(self) -> dict[str, str]:
-        """Reasons why metrics could not be measured."""
-        return {name: reason for summary in self.summaries for name, reason in summary.get("unavailable", {}).items()}
-
-    @cached_property
-    def segmenters(self) -> list[dict[str, Any]]:
-        """The segmenters used, each with its own accuracy on true frames."""
-        return list({found["name"]: found for s in self.summaries for found in s.get("segmenters", [])}.values())
-
     def headline(self, group: str, method: str) -> Metric | None:
         """The first of HEADLINES that was measured of a method in the head view."""
         return next((METRICS[name] for name in HEADLINES if self.value(group, method, f"{name}@head")), None)
-
-    def per_episode(self, method: str, metric: str, view: str, split: str) -> dict[str, float]:
-        """Mean of a metric over seeds, by episode."""
-        values: dict[str, list[float]] = defaultdict(list)
-        for row in self.rows:
-            if (row["method"], row["metric"], row["view"], row["split"]) == (method, metric, view, split):
-                values[row["episode_id"]].append(row["value"])
-        return {name: sum(items) / len(items) for name, items in sorted(values.items())}
-
-    def along_time(self, group: str, method: str, metric: str) -> list[tuple[float, float]]:
-        """(frame, mean) of a metric of the head view, frame by frame."""
-        key = method, group, "head", metric
-        rows = [row for row in self.by_frame if (row["method"], row["split"], row["view"], row["metric"]) == key]
-        return sorted((float(row["frame"]), float(row["mean"])) for row in rows)
 
     def primary(self, group: str) -> Method | None:
         """The method that heads the page: the first Stage II, long-trained weights before this run's."""
@@ -231,12 +218,12 @@ class ReportContext:
 
     @cached_property
     def video_scores(self) -> VideoScores:
-        return VideoScores.read(self.variants("evaluate_video").values())
+        return VideoScores(self.inputs.get("evaluate_video"))
 
-    def summaries(self, step: str) -> list[JsonObject]:
-        """Summaries of every evaluation of a step that has a method in it."""
-        found = [read_json(folder / "summary.json") for folder in self.variants(step).values()]
-        return [summary for summary in found if summary.get("methods")]
+    def summary(self, step: str) -> JsonObject | None:
+        """The summary of an evaluation that has a method in it."""
+        found = read_json(self.inputs[step] / SUMMARY_FILE) if step in self.inputs else {}
+        return found if found.get("methods") else None
 
     @cached_property
     def rollouts(self) -> dict[str, RolloutSet]:

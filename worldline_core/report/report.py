@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -131,9 +131,9 @@ class HeadView(NamedTuple):
     primary: Method
     metric: Metric
 
-    def method(self, kind: str, *groups: str) -> Method | None:
-        """The first method of a kind with weights of one of some groups."""
-        return next((m for m in self.scores.methods(self.group) if m.kind == kind and m.group in groups), None)
+    def method(self, kind: str, group: str) -> Method | None:
+        """The first method of a kind with weights of this origin."""
+        return next((m for m in self.scores.methods(self.group) if (m.kind, m.group) == (kind, group)), None)
 
     def difference(self, second: Method | None, first: Method | None = None) -> tuple[float, float] | None:
         """Interval of how much better a method (default: the main one) is than `second`, in paired recordings."""
@@ -143,14 +143,13 @@ class HeadView(NamedTuple):
             return None
         return (-found["high"], -found["low"]) if self.metric.lower_is_better else (found["low"], found["high"])
 
-    def figure(self, method: Method | None, what: str) -> Figure | None:
+    def figure(self, method: Method, what: str) -> Figure | None:
         """A method's value beside that of copying the first frame."""
         copy = self.method("copy", "baseline")
         mean, reference = (
-            None if m is None else self.scores.value(self.group, m.name, f"{self.metric.name}@head")
-            for m in (method, copy)
+            m and self.scores.value(self.group, m.name, f"{self.metric.name}@head") for m in (method, copy)
         )
-        if method is None or mean is None or reference is None:
+        if mean is None or reference is None:
             return None
         where = f"{method.long_label}; {SPLIT_LABELS[self.group]}, head view"
         return Figure(
@@ -173,8 +172,6 @@ def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
     view = head_view(context)
     controls, own = (None, None) if view is None else video_figures(view)
     planning = planning_figure(context)
-    figures = [controls, planning, policy_figure(context), own]
-    entries = zip(sections, PAGES.values(), strict=False)
     return render(
         "report/overview.html",
         title="WorldLine: from robot recordings to an action-driven simulator",
@@ -182,74 +179,60 @@ def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
         sections=sections,
         next=None,
         headline=headline(context, view, controls, planning),
-        figures=[figure for figure in figures if figure is not None],
+        figures=list(filter(None, (controls, planning, policy_figure(context), own))),
         video=overview_video(context),
-        entries=[(section, f"Missing: {section.missing}" if section.missing else what) for section, what in entries],
+        entries=list(zip(sections, PAGES.values(), strict=False)),
     )
 
 
 def video_figures(view: HeadView) -> tuple[Figure | None, Figure | None]:
     """The main method, and this run's own method of the same kind, beside a copy of the first frame."""
-    iou, tools = (
-        "overlap of the predicted robot with the recorded one (IoU)",
-        "distance of the predicted tools from the recorded ones",
-    )
-    main = view.figure(view.primary, tools if view.metric.name == "end_effector_error_px" else iou)
+    tools = view.metric.name == "end_effector_error_px"
+    what = f"{'distance' if tools else 'overlap'} of the predicted {'tools' if tools else 'robot'}"
+    what += " from the recorded ones" if tools else " with the recorded one (IoU)"
     own = view.method(view.primary.kind, "run")
-    if own is None or own.name == view.primary.name:
-        return main, None
-    return main, view.figure(own, f"the same for the {own.label} that this run trained itself")
+    same = own and view.figure(own, f"the same for the {own.label} that this run trained itself")
+    return view.figure(view.primary, what), None if own == view.primary else same
 
 
 def planning_figure(context: ReportContext) -> Figure | None:
     """Success of the choice among the most candidates beside the best shortcut, which sees no video."""
-    summary = next(iter(context.summaries("evaluate_planning")), None)
+    summary = context.summary("evaluate_planning")
     order = predicting(summary["methods"]) if summary else []
     if summary is None or not order:
         return None
     values = summary["methods"][order[0].name]
     found, most = most_candidates(values), max(values["budgets"], key=int)
     success = {"count": len(summary["banks"]), **found["success"]}
-    measured = share_interval(success) or success
+    measured = share_interval(success)
     over = found["over_shortcut"]
     reference = float(summary["shortcuts"][over["shortcut"]][most]["mean"])
     # The bootstrap of the gain sees as little of a choice that never failed as that of the success.
     bounds = over["gain"] if measured is success else {key: measured[key] - reference for key in ("low", "high")}
     what = f"of plans succeed, chosen among {most} by their predicted videos"
-    where = order[0].long_label + by_recorded_videos(
-        summary["methods"].get(TRUE_METHOD), lambda v: most_candidates(v)["success"]
-    )
-    return Figure(
-        what,
-        measured,
-        "banks",
-        f"the best rule without video ({words(over['shortcut'])})",
-        reference,
-        (float(bounds["low"]), float(bounds["high"])),
-        where,
-        shares=True,
-    )
+    beside = f"the best rule without video ({words(over['shortcut'])})"
+    ceiling = summary["methods"].get(TRUE_METHOD)
+    where = order[0].long_label + by_recorded_videos(ceiling and most_candidates(ceiling)["success"])
+    return Figure(what, measured, "banks", beside, reference, (bounds["low"], bounds["high"]), where, shares=True)
 
 
 def policy_figure(context: ReportContext) -> Figure | None:
     """Outcomes judged from predicted videos beside guessing, which is right in half of the cases."""
-    summary = next(iter(context.summaries("evaluate_policy")), None)
-    methods = summary["methods"] if summary else {}
+    methods = (context.summary("evaluate_policy") or {}).get("methods", {})
+    accuracy = {name: share_interval(values["all"]["accuracy"]) for name, values in methods.items()}
     order = predicting(methods)
     first = next((m for m in order if m.kind == "stage2"), order[0] if order else None)
-    found = share_interval(methods[first.name].get("all", {}).get("accuracy")) if first else None
-    if first is None or found is None:
+    if first is None:
         return None
-    what = "of outcomes judged from predicted videos are right"
-    bounds = float(found["low"]) - 0.5, float(found["high"]) - 0.5
-    where = first.long_label + by_recorded_videos(methods.get(TRUE_METHOD), lambda v: v.get("all", {}).get("accuracy"))
+    found, what = accuracy[first.name], "of outcomes judged from predicted videos are right"
+    bounds = found["low"] - 0.5, found["high"] - 0.5
+    where = first.long_label + by_recorded_videos(accuracy.get(TRUE_METHOD))
     return Figure(what, found, "recordings", "guessing", 0.5, bounds, where, shares=True)
 
 
-def by_recorded_videos(values: JsonObject | None, measured: Callable[[JsonObject], JsonObject | None]) -> str:
+def by_recorded_videos(measured: JsonObject | None) -> str:
     """The same from the recorded videos, the ceiling of what predicted ones can reach; nothing where it was not measured."""
-    found = None if values is None else measured(values)
-    return "" if found is None else f"; from recorded videos {percent(found['mean'])}"
+    return "" if measured is None else f"; from recorded videos {percent(measured['mean'])}"
 
 
 def headline(context: ReportContext, view: HeadView | None, controls: Figure | None, planning: Figure | None) -> str:
@@ -263,10 +246,11 @@ def headline(context: ReportContext, view: HeadView | None, controls: Figure | N
         else:
             clauses.append((follows, "follows the controls" if follows else "does not yet follow the controls"))
     if planning is not None:
-        rule = "a rule that sees no video"
-        results = {"better": "plans better than any rule that sees no video", "worse": f"plans worse than {rule}"}
-        unclear = f"does not clearly plan better than {rule} on {planning.measured['count']} {planning.cases}"
-        clause = results.get(planning.verdict, unclear)
+        clause = {
+            "better": "plans better than any rule that sees no video",
+            "worse": "plans worse than a rule that sees no video",
+            "unclear": f"does not clearly plan better than a rule that sees no video on {planning.measured['count']} banks",
+        }[planning.verdict]
         clauses.append((planning.verdict == "better", clause))
     if not clauses:
         facts = dataset_facts(context)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 
 from markupsafe import Markup
 
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, metric_of
-from worldline_core.evaluation.paired import EVALUATIONS, collect_metrics
+from worldline_core.evaluation.paired import EVALUATIONS
 from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.model.model_card import Measurement
 from worldline_core.pages.charts import Dot, Series, interval_chart, line_chart
@@ -19,6 +21,7 @@ from worldline_core.report.context import (
     ReportContext,
     Section,
     VideoScores,
+    headline_metrics,
     in_order,
     method,
     predicting,
@@ -49,20 +52,19 @@ def quality_section(context: ReportContext) -> Section:
     scores = context.video_scores
     if not scores.groups:
         return Section("quality", "Video quality", missing="no video evaluation was given (input evaluate_video).")
-    names = {metric.name for group in scores.groups for name in scores.names(group) if (metric := metric_of(name))}
+    names = {name for group in scores.groups for found in scores.metrics[group].values() for name in found}
+    measured = {metric.name for metric in map(metric_of, names) if metric}
     return context.section(
         "quality",
         "Video quality",
         QUALITY,
-        instruments=[(s.get("description", s["name"]), instrument_accuracy(scores, s)) for s in scores.segmenters],
-        unavailable=sorted(scores.unavailable.items()),
-        asked=[METRICS[name] for name in ON_REQUEST if name in names],
+        instruments=[(s["description"], instrument_accuracy(scores, s)) for s in scores.summary["segmenters"]],
+        unavailable=sorted(scores.summary["unavailable"].items()),
+        asked=[METRICS[name] for name in ON_REQUEST if name in measured],
         groups=[
             {
-                "title": SPLIT_LABELS.get(group, group).capitalize(),
-                "tables": [
-                    t for view in ("head", "left_wrist", "right_wrist") for t in metric_tables(scores, group, view)
-                ],
+                "title": SPLIT_LABELS[group].capitalize(),
+                "tables": [table for view in VIEWS for table in metric_tables(scores, group, view)],
                 "charts": quality_charts(scores, group),
             }
             for group in scores.groups
@@ -73,16 +75,17 @@ def quality_section(context: ReportContext) -> Section:
 
 def instrument_accuracy(scores: VideoScores, segmenter: JsonObject) -> list[tuple[str, Markup | None]]:
     """IoU of a segmenter's masks of true frames with the exact ones, by group."""
-    known, metric = segmenter.get("accuracy_on_true_frames", {}), f"robot_iou_exact{segmenter.get('suffix', '')}@head"
+    known, metric = segmenter["accuracy_on_true_frames"], f"robot_iou_exact{segmenter['suffix']}@head"
     measured = [(group, known.get(group, {}).get(metric)) for group in scores.groups]
-    return [(SPLIT_LABELS.get(group, group), interval(value, 3)) for group, value in measured if value is not None]
+    return [(SPLIT_LABELS[group], interval(value, 3)) for group, value in measured if value is not None]
 
 
 def metric_tables(scores: VideoScores, group: str, view: str) -> list[Table]:
     """Methods in rows, metrics of one view in columns, up to eight; the best of each column in bold."""
-    measured = {name.removesuffix(f"@{view}") for name in scores.names(group) if name.endswith(f"@{view}")}
+    names = {name.partition("@") for found in scores.metrics[group].values() for name in found if metric_of(name)}
     order = [*METRICS]
-    shown = sorted((n for n in measured if metric_of(n)), key=lambda n: ("[" in n, order.index(n.partition("[")[0]), n))
+    measured = [name for name, _, of_view in names if of_view == view]
+    shown = sorted(measured, key=lambda n: ("[" in n, order.index(n.partition("[")[0]), n))
     methods, tables = scores.methods(group), list[Table]()
     for metrics in (shown[i : i + 8] for i in range(0, len(shown), 8)):
         rows: list[list[object]] = [[m.long_label] for m in methods]
@@ -113,8 +116,12 @@ def quality_charts(scores: VideoScores, group: str) -> list[Markup]:
         for m in scores.methods(group):
             if found := scores.difference(group, primary.name, m.name, f"{metric.name}@head"):
                 dots.append(Dot(m.long_label, found["mean"], found["low"], found["high"], m.colour))
-            if rows := scores.along_time(group, m.name, metric.name):
-                series.append(Series(m.long_label, *zip(*rows, strict=True), colour=m.colour, dashed=m.group == "run"))
+            key = m.name, group, "head", metric.name
+            rows = [row for row in scores.by_frame if (row["method"], row["split"], row["view"], row["metric"]) == key]
+            if points := sorted((row["frame"], row["mean"]) for row in rows):
+                series.append(
+                    Series(m.long_label, *zip(*points, strict=True), colour=m.colour, dashed=m.group == "run")
+                )
         if dots:
             title = f"{primary.long_label} minus each other: {metric.title}"
             side = "left" if metric.lower_is_better else "right"
@@ -152,17 +159,17 @@ def cost(context: ReportContext) -> Markup | None:
 
 
 def decisions_section(context: ReportContext) -> Section:
-    """Policy evaluations, then planning evaluations."""
-    judged = [policy_evaluation(summary) for summary in context.summaries("evaluate_policy")]
-    planned = [planning_evaluation(summary) for summary in context.summaries("evaluate_planning")]
+    """The policy evaluation, then the planning evaluation."""
+    judged, planned = context.summary("evaluate_policy"), context.summary("evaluate_planning")
     title = "Policy and planning"
-    if not judged and not planned:
+    if judged is None and planned is None:
         return Section("decisions", title, missing="inputs evaluate_policy and evaluate_planning.")
-    return context.section("decisions", title, judged=judged, planned=planned)
+    policy, planning = judged and policy_evaluation(judged), planned and planning_evaluation(planned)
+    return context.section("decisions", title, policy=policy, planning=planning)
 
 
 def policy_evaluation(summary: JsonObject) -> dict[str, object]:
-    """Values of one policy evaluation for the template."""
+    """Values of a policy evaluation for the template."""
     results, methods = summary["methods"], in_order(summary["methods"])
     accuracy = {
         m.name: {
@@ -170,91 +177,60 @@ def policy_evaluation(summary: JsonObject) -> dict[str, object]:
         }
         for m in methods
     }
-    found_groups = {group for own in accuracy.values() for group in own}
-    groups = sorted(found_groups, key=lambda g: (g != ALL, g not in SPLIT_LABELS, g))
-    dots = [
-        Dot(m.long_label, found["mean"], found["low"], found["high"], m.colour)
-        for m in methods if (found := accuracy[m.name].get(ALL))
-    ]  # fmt: skip
-    title = f"Accuracy over {summary.get('trajectories', '?')} trajectories (judge: {summary.get('judge', 'unknown')})"
+    groups = {group for own in accuracy.values() for group in own}
+    means = [(m, accuracy[m.name][ALL]) for m in methods]
+    dots = [Dot(m.long_label, found["mean"], found["low"], found["high"], m.colour) for m, found in means]
+    title = f"Accuracy over {summary['trajectories']} trajectories (judge: {summary['judge']})"
     value_label = "agreement with the recorded outcome, 95 % interval"
-    trust = summary.get("trust")
     return {
+        "summary": summary,
         "methods": methods,
-        "results": results,
         "accuracy": accuracy,
-        "groups": groups,
-        "labels": [words(SPLIT_LABELS.get(group, group)).capitalize() for group in groups],
-        "chart": interval_chart(dots, digits=2, value_label=value_label, title=title) if dots else None,
-        "short": sorted((summary.get("shorter_than_recording") or {}).items()),
-        "ranking": policy_ranking(summary["policies"]) if summary.get("policies") else None,
-        "trust": trust
-        and {**trust, "known": [m for m in predicting(trust["methods"]) if trust["methods"][m.name]["available"]]},
-        "unjudged": [m for m in predicting(trust["methods"]) if not trust["methods"][m.name]["available"]]
-        if trust
-        else [],
-    }
-
-
-def policy_ranking(policies: JsonObject) -> JsonObject:
-    """Agreement of recorded and predicted success rates of policies, and every policy's rates."""
-    methods = in_order(policies)
-    rates = {m.name: policies[m.name][ALL]["policies"] for m in methods}
-    names = sorted(rates[methods[0].name], key=lambda name: -rates[methods[0].name][name]["recorded"])
-    return {
-        "methods": methods,
-        "rates": rates,
-        "names": names,
-        "agreement": {m.name: policies[m.name][ALL] for m in methods},
+        "groups": {
+            group: words(SPLIT_LABELS.get(group, group)).capitalize()
+            for group in sorted(groups, key=lambda g: (g != ALL, g not in SPLIT_LABELS, g))
+        },
+        "chart": interval_chart(dots, digits=2, value_label=value_label, title=title),
+        "ranked": in_order(summary.get("policies", ())),
+        "trusted": predicting(summary.get("trust", {}).get("methods", ())),
     }
 
 
 def planning_evaluation(summary: JsonObject) -> dict[str, object]:
-    """Values of one planning evaluation for the template."""
+    """Values of a planning evaluation for the template."""
     methods, order = summary["methods"], in_order(summary["methods"])
     budgets = sorted({int(n) for values in methods.values() for n in values["budgets"]})
     cases, x = {"count": len(summary["banks"])}, [float(n) for n in budgets]
     success = {
         m.name: {
-            n: share_interval({**cases, **methods[m.name]["budgets"][str(n)]["success"]})
-            for n in budgets if str(n) in methods[m.name]["budgets"]
+            int(n): share_interval({**cases, **found["success"]}) for n, found in methods[m.name]["budgets"].items()
         }
         for m in order
-    }  # fmt: skip
+    }
     series = [Series("direct execution", x, [summary["direct_execution"]["mean"]] * len(x), colour="c5", dashed=True)]
     for m in order:
-        mean, low, high = (
-            [float((value or {})[key]) for value in success[m.name].values()] for key in ("mean", "low", "high")
-        )
+        points = [(n, found["mean"], found["low"], found["high"]) for n, found in sorted(success[m.name].items())]
+        own, mean, low, high = zip(*points, strict=True)
         bounds = (low, high) if m.kind in MODELS else (None, None)
-        series.append(
-            Series(m.long_label, [*success[m.name]], mean, *bounds, m.colour, dashed=m.group == "run", markers=True)
-        )
+        series.append(Series(m.long_label, own, mean, *bounds, m.colour, dashed=m.group == "run", markers=True))
     chart = line_chart(
         series, title="Success of the chosen candidate, 95 % interval over banks", x_label="candidates N", y_label="success",
-        log_x=True, x_ticks=x, in_percent=True, y_range=(0.0, 1.02),
+        log_x=True, x_ticks=x, shares=True,
     )  # fmt: skip
     families = sorted({bank["task_family"] for bank in summary["banks"].values()})
     most = f"N = {budgets[-1]}"
-    headings = (
-        [f"N = {n}" for n in budgets]
-        + [f"Gain at {most}", "over the best shortcut"]
-        + [f"{words(family)}, {most}" for family in families]
-    )
     return {
         "summary": summary,
         "methods": order,
         "success": success,
-        "gain": {m.name: most_candidates(methods[m.name])["gain"] for m in order},
-        "over_shortcut": {m.name: most_candidates(methods[m.name])["over_shortcut"]["gain"] for m in order},
-        "families": families,
-        "by_family": {
-            m.name: {f: v[max(v, key=int)] for f, v in methods[m.name]["by_family"].items() if v} for m in order
-        },
         "budgets": budgets,
-        "headings": headings,
+        "families": families,
+        "headings": [
+            *(f"N = {n}" for n in budgets), f"Gain at {most}", "over the best shortcut",
+            *(f"{words(family)}, {most}" for family in families),
+        ],
         "chart": chart,
-    }
+    }  # fmt: skip
 
 
 def most_candidates(values: JsonObject) -> JsonObject:
@@ -284,28 +260,21 @@ def measurements(model: Path, evaluations: Iterable[Path]) -> Sequence[Measureme
     for folder in evaluations:
         verify_artifact(folder)
         manifest = read_manifest(folder)
-        key = f"{manifest.get('step')}/{manifest.get('key')}"
-        values = collect_metrics({str(manifest.get("step")): folder})
-        most = max((int(name.split("/")[1][2:]) for name in values if name.startswith("planning/")), default=0)
-        for name, value in values.items():
-            what, group, videos, metric = name.split("/", 3)
+        for what, group, videos, metric, value in headline_metrics(manifest.get("step", ""), folder):
+            rollout, shown = linked_folder(folder, f"rollouts.{videos}"), method(videos)
+            made_by = {} if rollout is None else read_manifest(rollout).get("inputs", {}).get("checkpoint", {})
+            if digest is None or made_by.get("digest") != digest or shown.kind.endswith(("_zero", "_shuffled")):
+                continue
             metric, _, view = metric.partition("@")
             if what == "video" and (metric not in VIDEO_METRICS or view != "head"):
                 continue
-            if group not in SPLIT_LABELS and group not in ("all", f"N={most}"):
-                continue
-            rollout = linked_folder(folder, f"rollouts.{videos}")
-            made_by = {} if rollout is None else read_manifest(rollout).get("inputs", {}).get("checkpoint", {})
-            shown = method(videos)
-            if made_by.get("digest") != digest or digest is None or shown.kind.endswith(("_zero", "_shuffled")):
-                continue
-            label = {"accuracy": "outcomes judged rightly", "success": f"plans that succeed, best of {most}"}.get(
-                metric
-            )
-            label = label or f"{METRICS[metric].title}, head view"
+            labels = {"policy": "outcomes judged rightly", "planning": f"plans that succeed, best of {group[2:]}"}
+            label = labels.get(what) or f"{METRICS[metric].title}, head view"
             label += f", {shown.label}" if "steps" in videos else ""
-            recordings = {"all": "all splits", f"N={most}": "candidate banks"}.get(group) or SPLIT_LABELS[group]
-            bounds = {"mean": value.mean, "low": value.low, "high": value.high, "count": value.count}
-            bounds = bounds if what == "video" else share_interval(bounds) or bounds
-            found[label, recordings] = Measurement(label, recordings, **bounds, source=key)
+            recordings = {"policy": "all splits", **SPLIT_LABELS}.get(
+                what if group == ALL else group, "candidate banks"
+            )
+            bounds = asdict(value) if what == "video" else share_interval(asdict(value))
+            source = f"{manifest.get('step')}/{manifest.get('key')}"
+            found[label, recordings] = Measurement(label, recordings, **bounds, source=source)
     return [found[name] for name in sorted(found)]

@@ -71,15 +71,11 @@ def choose_episodes(scores: VideoScores, available: Sequence[str]) -> list[Chose
         metric = first and scores.headline(group, first.name)
         if first is None or metric is None or group == "train":
             continue
-        values = scores.per_episode(first.name, metric.name, "head", group)
-        ranked = best_median_worst(
-            {name: value for name, value in values.items() if name in available}, lower_is_better=metric.lower_is_better
-        )
-        where = f"of {len(values)} on {SPLIT_LABELS.get(group, group)}"
-        chosen += [
-            ChosenEpisode(episode, f"{label} {where}", value)
-            for label, episode, value in (ranked[:1] if chosen else ranked)
-        ]
+        values = scores.series.get(f"video/{group}/{first.name}/{metric.name}@head", {})
+        shown = {name: value for name, value in values.items() if name in available}
+        ranked = best_median_worst(shown, lower_is_better=metric.lower_is_better)[: 1 if chosen else 3]
+        where = f"of {len(values)} on {SPLIT_LABELS[group]}"
+        chosen += [ChosenEpisode(episode, f"{label} {where}", value) for label, episode, value in ranked]
     ordered = sorted(available)
     return chosen or [
         ChosenEpisode(ordered[i], f"number {i + 1} of {len(ordered)} by name (no scores)")
@@ -154,19 +150,17 @@ def video(
 
 def overview_video(context: ReportContext) -> dict[str, Any] | None:
     """Truth beside the first model's prediction, one row per view, of the first chosen episode; None without one."""
-    episodes, chosen = context.episodes, chosen_episodes(context)
-    if episodes is None or not chosen:
+    episodes = context.episodes
+    chosen = chosen_episodes(context) if episodes else []
+    methods = [
+        m for item in chosen[:1] for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)
+    ]
+    if episodes is None or not methods:
         return None
-    item = chosen[0]
-    methods = [m for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)]
-    if not methods:
-        return None
-    method = methods[0]
-    index = episodes.position(item.episode_id)
-    row = episodes.rows[index]
-    rows: list[Iterator[Picture]] = []
+    item, method = chosen[0], methods[0]
+    index, rollout = episodes.position(item.episode_id), context.rollouts[method.name]
+    row, rows = episodes.rows[index], list[Iterator[Picture]]()
     count = row.video_frames
-    rollout = context.rollouts[method.name]
     for view in [v for v in VIEWS if v in row.views and v in rollout.views(item.episode_id)]:
         predicted = VideoFrames(rollout.clip(item.episode_id, view))
         columns = {"recorded": VideoFrames(episodes.clip(index, view)), f"predicted, {method.label}": predicted}
