@@ -159,7 +159,9 @@ class Hdf5File:
         for arm in places:
             joints = self.columns(arm.joints, length, "length_mismatch", track)
             length = len(joints)
-            fill = self._dataset(arm.joints.dataset.format(track=track)).fillvalue
+            key = arm.joints.dataset.format(track=track)
+            with self._reading(key):
+                fill = self._dataset(key).fillvalue
             own = np.array([bool((row != fill).any()) for row in joints])
             written = written | own if blocks else own
             blocks.append(joints)
