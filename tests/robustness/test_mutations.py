@@ -28,7 +28,7 @@ from worldline_core.filters.filter_config import FilterConfig
 @pytest.mark.slow
 def test_every_damaged_recording_is_accounted_for_by_its_true_reason(tmp_path: Path) -> None:
     labels, config = write_corpus(tmp_path, healthy=2, each=1, seed=3)
-    assert len({label.kind for label in labels}) >= 40
+    assert len({label.kind for label in labels}) >= 39
 
     counts = curate(config, {}, tmp_path / "curated")
     assert counts["found"] == len(labels) == counts["kept"] + counts["quarantined"]
@@ -67,7 +67,7 @@ def test_the_command_runs_all_damage_and_the_mutations(capsys: pytest.CaptureFix
         command.main(["damage", "mutations", "--each", "1", "--cases", "2", "--seed", "5"])
     printed = capsys.readouterr().out
     assert ended.value.code == 0, printed
-    assert printed.count("100%") >= 45
+    assert printed.count("100%") >= 41
     assert printed.count("2 cases, 0 unexpected errors") >= 10
 
 

@@ -22,7 +22,6 @@ import pyarrow.parquet as pq
 from PIL import Image
 from pydantic import TypeAdapter
 
-from tools.corrupted import defects, mcap
 from tools.corrupted.mutations import read_everything
 from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
 from worldline_core.data.sources.hdf5 import require_h5py
@@ -42,7 +41,7 @@ class Attack:
     layout: str
     pattern: str
     name: str
-    change: Callable[[Path], None]
+    change: Callable[[Path], object]
     endings: tuple[str, ...]
 
 
@@ -59,8 +58,8 @@ def _bytes_at(*edits: tuple[bytes, int, bytes]) -> Callable[[Path], None]:
     return change
 
 
-def _content(make: Callable[[], bytes]) -> Callable[[Path], None]:
-    return lambda path: path.write_bytes(make()) and None
+def _content(make: Callable[[], bytes]) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(make())
 
 
 # --- HDF5 (version 1 of RoboMIND: encoded images of variable length)
@@ -132,6 +131,15 @@ def _repeated(value: pa.Array, rows: int) -> pa.Array:
 # --- MCAP
 
 
+def _claim_chunk(path: Path) -> None:
+    """The first chunk (record 6) claims to unpack to a terabyte."""
+    content, position = bytearray(path.read_bytes()), 8
+    while content[position] != 0x06:
+        position += 9 + struct.unpack_from("<Q", content, position + 1)[0]
+    struct.pack_into("<Q", content, position + 9 + 16, 10**12)
+    path.write_bytes(bytes(content))
+
+
 def _packed_chunk(path: Path) -> None:
     """A file of one chunk, a lz4 frame of two gigabytes of zeros that says that it is small."""
     with lz4.frame.LZ4FrameCompressor() as frame:
@@ -177,10 +185,6 @@ def _tracks(path: Path) -> None:
     path.write_bytes(head + content[start : start + length] * 3000 + content[start + length :])
 
 
-def _random(defect: defects.FileDefect) -> Callable[[Path], None]:
-    return lambda path: defect(path, np.random.default_rng(0))
-
-
 _MP4, _PNG = ("video_folder", "*.mp4"), ("agibot_gesim", "head_color/0.png")
 _H5, _TABLE, _NPY = ("robomind", "*.hdf5"), ("lerobot_v21", "data/*/*.parquet"), ("agibot_gesim", "actions.npy")
 _VIDEO = (READ, "truncated_video", "unreadable", "too_large", "wrong_fps", "out_of_memory")
@@ -194,7 +198,7 @@ ATTACKS = (
     Attack(*_TABLE, "a megabyte of fixed length, 6,400 times",
            _rows(_repeated(pa.array([b"\0" * 1_000_000], pa.binary(1_000_000)), 64), 100), _ROWS),
     Attack(*_TABLE, "3 * 10^8 equal rows", _rows(pa.array(np.zeros(10**7)), 30), _ROWS),
-    Attack("mcap", "*.mcap", "a chunk of a terabyte", _random(mcap.claim_chunk), ("out_of_memory", "unreadable")),
+    Attack("mcap", "*.mcap", "a chunk of a terabyte", _claim_chunk, ("out_of_memory", "unreadable")),
     Attack("mcap", "*.mcap", "a chunk of 2 GB in a frame of 8 MB", _packed_chunk, ("out_of_memory", "unreadable")),
     Attack(*_NPY, "10^12 rows", _bytes_at((b"'shape': (", 0, b"1000000000000, 16), }")), _LARGE),
     Attack(*_NPY, "an array of objects", lambda path: np.save(path, np.array([print]), allow_pickle=True), ("unreadable",)),
@@ -203,8 +207,8 @@ ATTACKS = (
     Attack(*_PNG, "a text of 200 MB", _content(lambda: png_with((b"zTXt", b"a\0\0" + _zeros(200)))), (READ, "unreadable")),
     Attack(*_PNG, "data of 200 MB", _content(lambda: png_with(data=_zeros(200))), (READ, "unreadable")),
     Attack(*_PNG, "5,000 scans", _content(lambda: jpeg_of_scans(5000)), ("too_large",)),
-    Attack(*_MP4, "30,000 x 30,000 pixels", _random(defects.claim_pixels), _VIDEO),
-    Attack(*_MP4, "10^9 frames", _random(defects.claim_frames), _VIDEO[1:]),
+    Attack(*_MP4, "30,000 x 30,000 pixels", _bytes_at((b"stsd", 40, struct.pack(">HH", 30_000, 30_000))), _VIDEO),
+    Attack(*_MP4, "10^9 frames", _bytes_at((b"stsz", 8, struct.pack(">I", 10**9))), _VIDEO[1:]),
     Attack(*_MP4, "10^9 frames of one size", _bytes_at((b"stsz", 4, struct.pack(">II", 1, 10**9))), _VIDEO),
     Attack(*_MP4, "frames of 4 GB", _bytes_at((b"stsz", 4, b"\xff" * 4)), _VIDEO),
     Attack(*_MP4, "3,000 tracks", _tracks, _VIDEO),

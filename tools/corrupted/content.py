@@ -23,6 +23,16 @@ def gripper_motion(random: np.random.Generator, num_frames: int = NUM_FRAMES) ->
     return 0.9 / (1 + np.exp((np.arange(num_frames) - middle) / 1.5)) + 0.05
 
 
+PAIR_NAMES = tuple(f"{arm}/{n}" for arm in ("left", "right") for n in (*(f"joint_{j}" for j in range(6)), "gripper"))
+"""State columns of two arms of six joints."""
+
+
+def pair_motion(random: np.random.Generator, num_frames: int = NUM_FRAMES) -> np.ndarray:
+    """float32 (n, 14) joints and openings of PAIR_NAMES."""
+    arms = [(joint_motion(random, 6, num_frames), gripper_motion(random, num_frames)[:, None]) for _ in range(2)]
+    return np.concatenate([part for arm in arms for part in arm], axis=1).astype(np.float32)
+
+
 def pictures(random: np.random.Generator, num_frames: int = NUM_FRAMES) -> np.ndarray:
     """uint8 (n, HEIGHT, WIDTH, 3): patches that move smoothly before a background of edges and soft shades."""
     shades = random.uniform(60, 180, (5, 6, 3)).astype(np.float32)

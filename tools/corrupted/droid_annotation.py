@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from worldline_core.geometry.transforms import euler_fixed_xyz_from_rotation
 
 _BENT = np.array([0.0, 0.0, 0.0, -1.6, 0.0, 1.6, 0.0])
 """A Panda's elbow and wrist cannot be straight."""
-_BASES = 4
 
 Record = dict[str, Any]
 RecordDefect = Callable[[Record, np.random.Generator], None]
@@ -67,33 +65,27 @@ def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> t
             Label(f"{root.name}-val-{number}", "droid_annotation", kind, "curate" if reasons else "kept", reasons)
         )
 
-    for number in range(healthy):
-        place("clean", json.dumps(_record(root, f"clean{number}", random)).encode())
-    bases = [_record(root, f"base{number}", random) for number in range(_BASES)]
-    for kind in KINDS:
-        for number in range(each):
-            record = json.loads(json.dumps(bases[number % _BASES]))
-            kind.spoil(record, random)
-            place(kind.name, json.dumps(record).encode(), kind.reasons)
-    for name, change in _TEXTS:
-        for number in range(each):
-            place(name, change(json.dumps(bases[number % _BASES]), random), ("unreadable",))
-    source = {
-        "kind": "droid_annotation",
-        "path": str(root),
-        "name": root.name,
-        "views": ["head", None, None],
-        "split": "test",
-    }
-    return labels, source
+    def record() -> Record:
+        return _record(root, str(len(labels)), random)
+
+    for _ in range(healthy):
+        place("clean", json.dumps(record()).encode())
+    for _ in range(each):
+        for kind in KINDS:
+            spoiled = record()
+            kind.spoil(spoiled, random)
+            place(kind.name, json.dumps(spoiled).encode(), kind.reasons)
+        for name, change in _TEXTS:
+            place(name, change(json.dumps(record()), random), ("unreadable",))
+    views = ["head", None, None]
+    return labels, {"kind": "droid_annotation", "path": str(root), "name": root.name, "views": views, "split": "test"}
 
 
 def _record(root: Path, name: str, random: np.random.Generator) -> Record:
     opening = gripper_motion(random)[:, None]
     motion = joint_motion(random, 7)
     path = root / f"videos/{name}/0.mp4"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(path, ignore_errors=True)
+    path.parent.mkdir(parents=True)
     encode_video(path, pictures(random), FPS, preset="ultrafast")
     joints = _BENT + 0.3 * motion
     robot = load_embodiment("droid_franka")

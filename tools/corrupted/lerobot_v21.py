@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +13,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tools.corrupted import defects
-from tools.corrupted.content import FPS, NUM_FRAMES, gripper_motion, joint_motion, pictures
-from tools.corrupted.defects import SECOND, Kind, Label, Stage
+from tools.corrupted.content import FPS, NUM_FRAMES, PAIR_NAMES, pair_motion, pictures
+from tools.corrupted.defects import Kind, Label, Stage
 from worldline_core.data.video.encoder import encode_video
 
 EMBODIMENT = "ur5e_pair"
 _JOINTS = 6
-_NAMES = [f"{arm}/{name}" for arm in ("left", "right") for name in (*(f"joint_{j}" for j in range(6)), "gripper")]
 _VIEWS = {"observation.images.top": "head", "observation.images.wrist": "right_wrist"}
-_BASES = 4
 _TASK = "lift the block"
 PictureDefect = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
 @dataclass(frozen=True)
 class _Episode:
-    """Files of one episode, and its rows in the lists."""
+    """Files of one episode."""
 
     root: Path
     index: int
@@ -46,24 +43,25 @@ class _Episode:
         return self.videos[int(random.integers(len(_VIEWS)))]
 
 
-def _on_video(defect: defects.FileDefect) -> Callable[[_Episode, np.random.Generator], None]:
+EpisodeDefect = Callable[[_Episode, np.random.Generator], None]
+
+
+def _on_video(defect: defects.FileDefect) -> EpisodeDefect:
     return lambda episode, random: defect(episode.video(random), random)
 
 
-def _on_table(defect: defects.FileDefect) -> Callable[[_Episode, np.random.Generator], None]:
+def _on_table(defect: defects.FileDefect) -> EpisodeDefect:
     return lambda episode, random: defect(episode.table, random)
 
 
-def _on_state(
-    change: Callable[[np.ndarray, np.random.Generator], np.ndarray], column: str = "observation.state"
-) -> Callable[[_Episode, np.random.Generator], None]:
+def _on_column(
+    change: Callable[[np.ndarray, np.random.Generator], Any], column: str = "observation.state"
+) -> EpisodeDefect:
     def spoil(episode: _Episode, random: np.random.Generator) -> None:
         table = pq.read_table(episode.table)
-        values = np.array(table[column].to_pylist(), dtype=np.float32)
-        changed = change(values, random)
-        kind = pa.array(changed.tolist()) if changed.ndim > 1 else pa.array(changed)
-        table = table.set_column(table.column_names.index(column), column, kind)
-        pq.write_table(table, episode.table)
+        changed = list(change(np.array(table[column].to_pylist(), dtype=np.float32), random))
+        place, kind = table.column_names.index(column), table.schema.field(column).type
+        pq.write_table(table.set_column(place, column, pa.array(changed, kind)), episode.table)
 
     return spoil
 
@@ -90,19 +88,14 @@ def _lost_frames(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
     return values
 
 
+def _uneven(values: np.ndarray, random: np.random.Generator) -> list[np.ndarray]:
+    """The number of values is still right."""
+    return [*values[:3], values[3, :-2], np.append(values[4], [0, 0]).astype(np.float32), *values[5:]]
+
+
 def _without_column(episode: _Episode, random: np.random.Generator) -> None:
     name = str(random.choice(["observation.state", "action", "timestamp", "task_index"]))
     pq.write_table(pq.read_table(episode.table).drop_columns([name]), episode.table)
-
-
-def _uneven_rows(episode: _Episode, random: np.random.Generator) -> None:
-    table = pq.read_table(episode.table)
-    rows = table["observation.state"].to_pylist()
-    rows[3], rows[4] = rows[3][:-2], [*rows[4], 0.0, 0.0]  # the number of values is still right
-    table = table.set_column(
-        table.column_names.index("observation.state"), "observation.state", pa.array(rows, pa.list_(pa.float32()))
-    )
-    pq.write_table(table, episode.table)
 
 
 def _video_of_other_length(episode: _Episode, random: np.random.Generator) -> None:
@@ -115,16 +108,15 @@ KINDS = (
     Kind("video_missing", _on_video(defects.missing), ("missing_file",)),
     Kind("video_pipe", _on_video(defects.pipe), ("special_file", "missing_file")),
     Kind("video_linked_out", _on_video(defects.link_out), ("path_traversal",)),
-    Kind("video_claims_frames", _on_video(defects.claim_frames), ("too_large", "truncated_video", "out_of_memory")),
     Kind("video_too_long", _video_of_other_length, ("length_mismatch",)),
     Kind("table_truncated", _on_table(defects.truncate), ("unreadable",)),
     Kind("table_missing", _on_table(defects.missing), ("missing_file",)),
     Kind("column_missing", _without_column, ("missing_column",)),
-    Kind("rows_uneven", _uneven_rows, ("length_mismatch",)),
-    Kind("state_not_finite", _on_state(_not_finite), ("nan_state",)),
-    Kind("joints_in_degrees", _on_state(_degrees), ("joint_out_of_range",)),
-    Kind("gripper_raw", _on_state(_raw_gripper), ("invalid_gripper",)),
-    Kind("clock_jumps", _on_state(_lost_frames, "timestamp"), ("wrong_fps",)),
+    Kind("rows_uneven", _on_column(_uneven), ("length_mismatch",)),
+    Kind("state_not_finite", _on_column(_not_finite), ("nan_state",)),
+    Kind("joints_in_degrees", _on_column(_degrees), ("joint_out_of_range",)),
+    Kind("gripper_raw", _on_column(_raw_gripper), ("invalid_gripper",)),
+    Kind("clock_jumps", _on_column(_lost_frames, "timestamp"), ("wrong_fps",)),
 )
 
 
@@ -156,85 +148,48 @@ _PICTURES: tuple[tuple[str, PictureDefect, tuple[str, ...]], ...] = (
 )
 
 
-@dataclass
-class _Dataset:
-    """Episodes so far: their truth, and their rows in the list."""
-
-    root: Path
-    labels: list[Label] = field(default_factory=list)
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    count: int = 0
-
-    def add(
-        self, kind: str, stage: Stage = "curate", reasons: tuple[str, ...] = (), num_frames: int = NUM_FRAMES
-    ) -> _Episode:
-        episode = _Episode(self.root, self.count)
-        self.rows.append({"episode_index": self.count, "tasks": [_TASK], "length": num_frames})
-        self.labels.append(Label(f"{self.root.name}-{self.count:06d}", "lerobot_v21", kind, stage, reasons))
-        self.count += 1
-        return episode
-
-    def list_again(self) -> None:
-        """The last episode a second time; its second id names its source, whose number is not known yet."""
-        last = self.labels[-1]
-        self.labels.append(replace(last, episode_id=f"{last.episode_id}{SECOND}"))
-        self.rows.append(self.rows[-1])
-
-
 def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:
     """One dataset: labels, and the `curate.sources[]` entry that reads it."""
-    dataset = _Dataset(root)
+    labels: list[Label] = []
+    seeds: list[int] = []
+    lengths: list[int] = []
+
+    def add(
+        kind: str = "clean", stage: Stage = "kept", reasons: tuple[str, ...] = (), *,
+        seed: int | None = None, num_frames: int = NUM_FRAMES, change: PictureDefect | None = None, still: bool = False,
+    ) -> _Episode:  # fmt: skip
+        """The next episode; equal seeds make equal ones."""
+        episode = _Episode(root, len(labels))
+        labels.append(Label(f"{root.name}-{episode.index:06d}", "lerobot_v21", kind, stage, reasons))
+        seeds.append(int(random.integers(2**32)) if seed is None else seed)
+        lengths.append(num_frames)
+        _write_episode(episode, np.random.default_rng(seeds[-1]), num_frames, change, still=still)
+        return episode
+
     for _ in range(healthy):
-        _write_episode(dataset.add("clean", "kept"), random, NUM_FRAMES)
-    bases = [_Episode(root.parent / f"{root.name}_bases", number) for number in range(_BASES)]
-    for base in bases:
-        _write_episode(base, random, NUM_FRAMES)
-    for kind in KINDS:
-        for number in range(each):
-            episode = dataset.add(kind.name, kind.stage, kind.reasons)
-            _copy(bases[number % _BASES], episode)
-            kind.spoil(episode, random)
+        add()
     for number in range(each):
-        _write_episode(dataset.add("too_short", "filter", ("too_short",), num_frames=4), random, 4)
+        for kind in KINDS:
+            kind.spoil(add(kind.name, "curate", kind.reasons), random)
+        add("too_short", "filter", ("too_short",), num_frames=4)
         if number < healthy:
-            _copy(_Episode(root, number), dataset.add("duplicate", "curate", ("duplicate", "near_duplicate")))
-        if number % 2:
-            _copy(bases[number % _BASES], dataset.add("listed_twice", "curate", ("duplicate_id",)))
-            dataset.list_again()
-        sound = dataset.add("video_claims_pixels", "kept")  # the stream itself says how large its pictures are
-        _write_episode(sound, random, NUM_FRAMES)
-        defects.claim_pixels(sound.video(random), random)
+            add("duplicate", "curate", ("duplicate", "near_duplicate"), seed=seeds[number])
         for name, change, reasons in _PICTURES:
-            _write_episode(dataset.add(name, "filter", reasons), random, NUM_FRAMES, change)
-        _write_episode(dataset.add("still", "filter", ("static",)), random, NUM_FRAMES, _frozen, still=True)
-    shutil.rmtree(bases[0].root)
-    _write_meta(root, dataset.rows)
+            add(name, "filter", reasons, change=change)
+        add("still", "filter", ("static",), change=_frozen, still=True)
+    _write_meta(root, lengths)
     source = {
-        "kind": "lerobot_v21",
-        "path": str(root),
-        "name": root.name,
-        "embodiment": EMBODIMENT,
-        "angle_unit": "rad",
-        "views": _VIEWS,
-        "split": "train",
-    }
-    return dataset.labels, source
+        "kind": "lerobot_v21", "path": str(root), "name": root.name, "embodiment": EMBODIMENT, "angle_unit": "rad",
+        "views": _VIEWS, "split": "train",
+    }  # fmt: skip
+    return labels, source
 
 
 def _write_episode(
-    episode: _Episode,
-    random: np.random.Generator,
-    num_frames: int,
-    change: PictureDefect | None = None,
-    *,
-    still: bool = False,
+    episode: _Episode, random: np.random.Generator, num_frames: int, change: PictureDefect | None, *, still: bool
 ) -> None:
-    """Files of one episode; `change` spoils the pictures of the head camera."""
-    arms = [
-        np.concatenate([joint_motion(random, _JOINTS, num_frames), gripper_motion(random, num_frames)[:, None]], axis=1)
-        for _ in range(2)
-    ]
-    state = np.concatenate(arms, axis=1).astype(np.float32)
+    """Files of one episode; `change` spoils the pictures of the head camera, of a still one those of both."""
+    state = pair_motion(random, num_frames)
     if still:
         state = np.repeat(state[:1], num_frames, axis=0)
     index = np.arange(num_frames)
@@ -259,24 +214,14 @@ def _write_episode(
         encode_video(path, frames, FPS, preset="ultrafast")
 
 
-def _copy(base: _Episode, episode: _Episode) -> None:
-    for source, target in zip((base.table, *base.videos), (episode.table, *episode.videos), strict=True):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source, target)
-    table = pq.read_table(episode.table)
-    numbers = pa.array(np.full(len(table), episode.index))
-    place = table.schema.get_field_index("episode_index")
-    pq.write_table(table.set_column(place, "episode_index", numbers), episode.table)
-
-
-def _write_meta(root: Path, listed: list[dict[str, Any]]) -> None:
+def _write_meta(root: Path, lengths: list[int]) -> None:
     image = {"dtype": "video", "shape": [72, 96, 3], "names": ["height", "width", "channels"]}
-    vector = {"dtype": "float32", "shape": [len(_NAMES)], "names": _NAMES}
+    vector = {"dtype": "float32", "shape": [len(PAIR_NAMES)], "names": PAIR_NAMES}
     info = {
         "codebase_version": "v2.1",
         "robot_type": EMBODIMENT,
-        "total_episodes": len(listed),
-        "total_frames": sum(row["length"] for row in listed),
+        "total_episodes": len(lengths),
+        "total_frames": sum(lengths),
         "fps": FPS,
         "chunks_size": 100_000,
         "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
@@ -286,5 +231,6 @@ def _write_meta(root: Path, listed: list[dict[str, Any]]) -> None:
     meta = root / "meta"
     meta.mkdir(parents=True, exist_ok=True)
     (meta / "info.json").write_text(json.dumps(info))
-    (meta / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in listed))
+    rows = [{"episode_index": n, "tasks": [_TASK], "length": length} for n, length in enumerate(lengths)]
+    (meta / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (meta / "tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": _TASK}) + "\n")

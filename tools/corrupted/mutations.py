@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,23 +37,13 @@ class Unexpected:
 
 
 def flip_bytes(content: bytes, random: np.random.Generator) -> bytes:
-    """One to eight bytes get other values."""
+    """One to eight bytes get other values: anywhere, or in the first or last kilobyte, where headers and footers are."""
     changed = bytearray(content)
-    for place in random.integers(0, len(changed), int(random.integers(1, 9))):
+    start = int(random.choice([0, max(len(content) - 1024, 0)]))
+    stop = int(random.choice([len(content), min(start + 1024, len(content))]))
+    for place in random.integers(start, stop, int(random.integers(1, 9))):
         changed[place] = int(random.integers(256))
     return bytes(changed)
-
-
-def flip_head(content: bytes, random: np.random.Generator) -> bytes:
-    """The same in the first kilobyte, where headers are."""
-    head = content[:1024]
-    return flip_bytes(head, random) + content[len(head) :]
-
-
-def flip_tail(content: bytes, random: np.random.Generator) -> bytes:
-    """The same in the last kilobyte, where footers are."""
-    tail = content[-1024:]
-    return content[: len(content) - len(tail)] + flip_bytes(tail, random)
 
 
 def cut(content: bytes, random: np.random.Generator) -> bytes:
@@ -74,53 +65,37 @@ def repeat(content: bytes, random: np.random.Generator) -> bytes:
     return content[:stop] + content[start:]
 
 
-def change_json(content: bytes, random: np.random.Generator) -> bytes:
-    """One value somewhere is replaced by an odd one, left out, or given another name."""
-    value = json.loads(content)
-    place, key = _somewhere(value, random)
-    if place is None:
-        return json.dumps(_odd(random)).encode()
-    action = int(random.integers(4))
-    if action == 0:
-        del place[key]
-    elif action == 1 and isinstance(place, dict):
-        place[f"{key}x"] = place.pop(key)
-    else:
-        place[key] = _odd(random)
-    return json.dumps(value).encode()
-
-
-def change_json_line(content: bytes, random: np.random.Generator) -> bytes:
-    """The same in one line of a JSON lines file."""
-    lines = content.splitlines()
+def change_json(content: bytes, random: np.random.Generator, *, jsonl: bool = False) -> bytes:
+    """A value is replaced by an odd one, left out, or given another name; of JSON lines in one of them."""
+    lines = content.splitlines() if jsonl else [content]
     number = int(random.integers(len(lines)))
-    lines[number] = change_json(lines[number], random)
-    return b"\n".join(lines)
-
-
-def _odd(random: np.random.Generator) -> Any:
-    return _ODD_VALUES[int(random.integers(len(_ODD_VALUES)))]
-
-
-def _somewhere(value: Any, random: np.random.Generator) -> tuple[Any, Any]:
-    """A container and a key in it, at a drawn depth."""
+    value = root = json.loads(lines[number])
+    odd = _ODD_VALUES[int(random.integers(len(_ODD_VALUES)))]
     place: Any = None
     key: Any = None
     while isinstance(value, dict | list) and value and (place is None or random.random() < 0.85):
         keys = list(value) if isinstance(value, dict) else range(len(value))
         place, key = value, keys[int(random.integers(len(keys)))]
         value = value[key]
-    return place, key
+    action = int(random.integers(4))
+    if place is None:
+        root = odd
+    elif action == 0:
+        del place[key]
+    elif action == 1 and isinstance(place, dict):
+        place[f"{key}x"] = place.pop(key)
+    else:
+        place[key] = odd
+    lines[number] = json.dumps(root).encode()
+    return b"\n".join(lines)
 
 
 def mutations_of(path: Path) -> tuple[Mutation, ...]:
     """Mutations of a file of this kind."""
-    blind = (flip_bytes, flip_head, flip_tail, cut, overwrite, repeat)
-    if path.suffix == ".json":
-        return (change_json, change_json, change_json, flip_bytes, cut)
-    if path.suffix == ".jsonl":
-        return (change_json_line, change_json_line, change_json_line, flip_bytes, cut)
-    return blind
+    if path.suffix in (".json", ".jsonl"):
+        change = partial(change_json, jsonl=path.suffix == ".jsonl")
+        return (change, change, change, flip_bytes, cut)
+    return (flip_bytes, flip_bytes, flip_bytes, cut, overwrite, repeat)
 
 
 def read_everything(config: SourceConfig, root: Path) -> None:
