@@ -141,9 +141,9 @@ def test_the_table_shows_numbers_counts_intervals_and_reasons(tmp_path: Path) ->
         "evaluate_video.head_only.0": evaluation(tmp_path / "head", {k: v - 0.1 for k, v in good.items()}),
         "evaluate_video.success_only.0": evaluation(tmp_path / "success", {"a": 0.5}),
     }
-    planning = {"mean": 0.75, "low": 0.5, "high": 1.0, "count": 4}
-    budgets = {"8": {}, "32": {"success": planning, "gain": planning | {"mean": 0.25}, "banks": {"x": 1.0, "y": 0.5}}}
-    write_json_atomic(tmp_path / "plan/summary.json", {"methods": {"banks_stage2": {"budgets": budgets}}})
+    planned = {"banks_stage2": {"budgets": {"8": {}, "32": {"banks": {"x": 1.0, "y": 0.5}}}}}
+    banks = {"x": {"direct_success": 0.8}, "y": {"direct_success": 0.2}}
+    write_json_atomic(tmp_path / "plan/summary.json", {"methods": planned, "banks": banks})
     counts = ablation_table(config, inputs | {"evaluate_planning.full.0": tmp_path / "plan"}, tmp_path / "out")
     assert (counts["cells"], counts["measured"]) == (24, 5)
     rows = table_rows(tmp_path / "out/table.parquet")
@@ -154,6 +154,7 @@ def test_the_table_shows_numbers_counts_intervals_and_reasons(tmp_path: Path) ->
     assert rows["success_only", "held_out_robot_iou"]["difference"] == pytest.approx(-0.1)  # of the one in common
     assert {cell: rows[cell]["reason"] for cell in REASONS} == REASONS
     assert (rows["full", "success"]["mean"], rows["full", "success"]["paper"]) == (75.0, "78 / 62.4")
+    assert rows["full", "gain"]["mean"] == pytest.approx(25.0)
     text = (tmp_path / "out/table.md").read_text()
     for part in ("| not measured (0.1804) | 0.700 [", "n=3 (0.5622)", "0.4348", "less the full model -0.100"):
         assert part in text

@@ -6,10 +6,10 @@ paired difference to the full model. ``table.md`` shows it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -17,8 +17,9 @@ from pydantic import Field
 
 from worldline_core.config import StrictModel, read_yaml, validate
 from worldline_core.errors import ArtifactError, ConfigError
-from worldline_core.evaluation.paired import collect_metrics, read_scores
-from worldline_core.evaluation.scores import SUMMARY_FILE, Interval, crossed_bootstrap
+from worldline_core.evaluation.paired import read_scores
+from worldline_core.evaluation.scores import SUMMARY_FILE, crossed_bootstrap
+from worldline_core.pages.page import render
 from worldline_core.store.artifact_files import read_json, row_schema
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic
 
@@ -44,10 +45,6 @@ VIDEO_COLUMNS = {
 }
 """Splits that stand for the paper's AgiBotWorld (held out) and DROID (out of domain), and their metrics."""
 POLICIES = {"pi05": "π0.5", "lingbot": "LingBot-VLA"}
-NOTE = (
-    "Mean [95 % interval over seeds and trajectories] of n trajectories (planning: banks); in brackets the paper's number on its own data"
-    " (AgiBotWorld, DROID; planning on RoboTwin with the policies " + " / ".join(POLICIES.values()) + ")."
-)
 
 
 class Variant(StrictModel):
@@ -112,12 +109,8 @@ class Cell:
     reason: str = ""
 
 
-class _Measured(NamedTuple):
-    """Interval and values by recording of each column, and reasons for what is missing."""
-
-    intervals: dict[str, Interval]
-    values: dict[str, dict[str, float]]
-    reasons: dict[str, str]
+type _Measured = tuple[dict[str, dict[str, float]], dict[str, str]]
+"""Values by recording (bank) of each column, and reasons for what is missing."""
 
 
 def ablation_table(config: AblationTableConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -138,79 +131,55 @@ def ablation_table(config: AblationTableConfig, inputs: Mapping[str, Path], outp
     measured = {
         name: [_read(f"{name}.{seed}", config.method, inputs) for seed in config.seeds] for name in config.variants
     }
-    full = measured.get(FULL, [])
-    cells = {
-        name: [_cell(config, name, column, measured[name], [] if name == FULL else full) for column in COLUMNS]
-        for name in config.variants
-    }
-    rows = [asdict(cell) for row in cells.values() for cell in row]
+    cells = [[_cell(config, name, column, measured) for column in COLUMNS] for name in config.variants]
+    rows = [cell for row in cells for cell in row]
     with atomic_path(output / "table.parquet") as temporary:
-        pq.write_table(pa.Table.from_pylist(rows, schema=row_schema(Cell)), temporary)
-    reasons = sorted({f"{COLUMNS[c.column]}: {c.reason}" for row in cells.values() for c in row if c.reason})
-    write_bytes_atomic(output / "table.md", _markdown(cells.values(), reasons).encode())
-    return {"variants": list(cells), "cells": len(rows), "measured": sum(row["mean"] is not None for row in rows)}
+        pq.write_table(pa.Table.from_pylist([asdict(cell) for cell in rows], schema=row_schema(Cell)), temporary)
+    reasons = sorted({f"{COLUMNS[cell.column]}: {cell.reason}" for cell in rows if cell.reason})
+    policies = " / ".join(POLICIES.values())
+    text = render("report/ablation_table.md", columns=COLUMNS, cells=cells, reasons=reasons, policies=policies)
+    write_bytes_atomic(output / "table.md", text.encode())
+    return {"variants": [*config.variants], "cells": len(rows), "measured": sum(cell.mean is not None for cell in rows)}
 
 
 def _read(name: str, method: str, inputs: Mapping[str, Path]) -> _Measured:
     folder, planning = inputs[f"evaluate_video.{name}"], inputs.get(f"evaluate_planning.{name}")
-    summary = read_json(folder / SUMMARY_FILE)
+    summary, series = read_json(folder / SUMMARY_FILE), read_scores(folder)
+    values, reasons = dict[str, dict[str, float]](), dict[str, str]()
     if method not in summary.get("methods", ()):
         raise ArtifactError(
             "The evaluation has no such method", where=folder, expected=method, got=summary.get("methods")
         )
-    known, series = collect_metrics({"evaluate_video": folder}), read_scores(folder)
-    found = _Measured({}, {}, {})
     for column, (split, metric) in VIDEO_COLUMNS.items():
-        key = f"video/{split}/{method}/{metric}"
-        if key in known:
-            found.intervals[column], found.values[column] = known[key], series[key]
+        if (found := series.get(f"video/{split}/{method}/{metric}")) is not None:
+            values[column] = found
         else:
             none = f"no recordings of the split {split}" if split not in summary["metrics"] else "not measured"
-            found.reasons[column] = summary["unavailable"].get(metric, none)
+            reasons[column] = summary["unavailable"].get(metric, none)
     if planning is None:
-        found.reasons.update(dict.fromkeys(("success", "gain"), "this run plans over no banks"))
-        return found
-    budgets = read_json(planning / SUMMARY_FILE)["methods"][f"banks_{method}"]["budgets"]
-    most = budgets[max(budgets, key=int)]
-    for column in ("success", "gain"):
-        mean, low, high = (100 * most[column][key] for key in ("mean", "low", "high"))
-        found.intervals[column] = Interval(mean, low, high, most[column]["count"])
-        found.values[column] = {bank: 100 * value for bank, value in most["banks"].items()}
-    return found
+        return values, reasons | dict.fromkeys(("success", "gain"), "this run plans over no banks")
+    planned = read_json(planning / SUMMARY_FILE)
+    budgets = planned["methods"][f"banks_{method}"]["budgets"]
+    success = budgets[max(budgets, key=int)]["banks"]
+    values["success"] = {bank: 100 * value for bank, value in success.items()}
+    values["gain"] = {b: 100 * (value - planned["banks"][b]["direct_success"]) for b, value in success.items()}
+    return values, reasons
 
 
-def _cell(
-    config: AblationTableConfig, name: str, column: str, own: Sequence[_Measured], full: Sequence[_Measured]
-) -> Cell:
+def _cell(config: AblationTableConfig, name: str, column: str, measured: Mapping[str, Sequence[_Measured]]) -> Cell:
     variant = config.variants[name]
     numbers = [variant.paper.get(column), *(variant.paper.get(f"{column}_{policy}") for policy in POLICIES)]
     paper = " / ".join(f"{value:g}" for value in numbers if value is not None)
     if any(column.endswith(metric) for metric in variant.without):
         return Cell(name, variant.label, column, paper=paper, reason="does not compare with the other rows")
-    if any(column not in one.intervals for one in own):
-        return Cell(name, variant.label, column, paper=paper, reason=own[0].reasons[column])
-    options = {"resamples": config.resamples, "seed": config.seed}
-    values, of_full = ([one.values[column] for one in side if column in one.values] for side in (own, full))
-    found = own[0].intervals[column] if len(own) == 1 else crossed_bootstrap(values, **options)
-    pairs = [(first, second) for first, second in zip(values, of_full, strict=False) if first.keys() & second.keys()]
+    if reason := next((reasons[column] for _, reasons in measured[name] if column in reasons), ""):
+        return Cell(name, variant.label, column, paper=paper, reason=reason)
+    own, full = ([values.get(column, {}) for values, _ in measured.get(side, ())] for side in (name, FULL))
+    pairs = [(first, second) for first, second in zip(own, full, strict=False) if first.keys() & second.keys()]
     differences = [{key: first[key] - second[key] for key in first.keys() & second.keys()} for first, second in pairs]
-    apart = crossed_bootstrap(differences, **options) if differences else None
-    bounds = (None, None, None) if apart is None else (apart.mean, apart.low, apart.high)
+    found = crossed_bootstrap(own, resamples=config.resamples, seed=config.seed)
+    bounds = None, None, None
+    if differences and name != FULL:
+        apart = crossed_bootstrap(differences, resamples=config.resamples, seed=config.seed)
+        bounds = apart.mean, apart.low, apart.high
     return Cell(name, variant.label, column, found.mean, found.low, found.high, found.count, paper, *bounds)
-
-
-def _markdown(rows: Iterable[Sequence[Cell]], reasons: Sequence[str]) -> str:
-    def text(cell: Cell) -> str:
-        digits = 1 if cell.column in ("success", "gain") else 3
-        if cell.mean is None:
-            return f"not measured ({cell.paper or 'none'})"
-        own = f"{cell.mean:.{digits}f} [{cell.low:.{digits}f}, {cell.high:.{digits}f}], n={cell.count}"
-        if cell.difference is not None:
-            bounds = f"[{cell.difference_low:+.{digits}f}, {cell.difference_high:+.{digits}f}]"
-            own += f"; less the full model {cell.difference:+.{digits}f} {bounds}"
-        return f"{own} ({cell.paper or 'none'})"
-
-    lines = [("variant", *COLUMNS.values()), ("---",) * (1 + len(COLUMNS))]
-    lines += [(row[0].label, *map(text, row)) for row in rows]
-    table = ["| " + " | ".join(line) + " |" for line in lines]
-    return "\n".join([*table, "", NOTE, *(f"- not measured, {reason}" for reason in reasons), ""])
