@@ -19,10 +19,11 @@ from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.evaluation.policy.evaluate_policy import summarise_decisions
 from worldline_core.evaluation.scores import Score, summarise, write_scores
 from worldline_core.evaluation.video.evaluate_video import write_by_frame
+from worldline_core.pictures import png_bytes
 from worldline_core.report.report import ReportConfig, report
 from worldline_core.rollout.rollout_set import RolloutSetWriter
 from worldline_core.store.artifact_files import write_manifest
-from worldline_core.store.atomic import write_json_atomic
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 HOSTILE = "<script>alert('x')</script> & \"lift\" the <b>red</b> cube"
 NUM_FRAMES, HEIGHT, WIDTH, FPS = 9, 64, 96, 8.0
@@ -85,6 +86,7 @@ def write_tracks(folder: Path) -> None:
             )
         )  # fmt: skip
     write_index(folder, write_shard(folder, 0, tracks), sigma_px_ref=36.0)
+    write_bytes_atomic(folder / "previews" / "0.png", png_bytes(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)))
     numbers = {"episodes": 2, "valid": 50, "outside_image": 4}
     write_json_atomic(folder / "summary.json", {"by_embodiment": {"aloha_viperx": numbers, "ur5e_pair": numbers}})
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import re
-from bisect import bisect_right
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from huggingface_hub import DatasetCard, DatasetCardData
-from markupsafe import Markup
+from PIL import Image
 
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
-from worldline_core.actions.overlays import OverlayStyle, overlay_sheet
 from worldline_core.data.curation.rules import CURATION_FILE
 from worldline_core.data.curation.source_table import WEIGHTS_FILE, SourceFacts, read_source_table
 from worldline_core.data.episodes.episode_index import (
@@ -30,7 +26,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.instructions import mentions_outcome
 from worldline_core.errors import DataError
 from worldline_core.pages.page import Table, duration, render, words
-from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
+from worldline_core.pictures import SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.store.artifact_files import JsonObject, linked_folder, read_json, read_rows, verify_artifact
 from worldline_core.store.atomic import write_bytes_atomic
@@ -49,8 +45,6 @@ HUB_LICENSES = re.compile(
     r"apache-2\.0|mit|bsd-[23]-clause|cc0-1\.0|cc-by(-nc)?(-sa|-nd)?-[234]\.[05]|odc-by|odbl|unknown"
 )
 """Licences that the hub knows by name; every other one is "other" with its name beside it."""
-_SIZES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "10M<n<100M", "100M<n<1B", "1B<n<10B")
-"""The hub's classes of size, a factor of ten each."""
 
 
 @dataclass(frozen=True)
@@ -113,16 +107,6 @@ class DatasetFacts:
         )
 
     @property
-    def split_note(self) -> str:
-        """Scenes that training and test share, counted."""
-        learnt = {row.scene for row in self.rows if row.split in ("train", "validation")}
-        tested = {row.scene for row in self.rows if row.split in ("test", "ood_test")}
-        shared = sorted(learnt & tested)
-        if shared:
-            return f"Warning: {len(shared)} scenes are in training and in test ({', '.join(shared[:4])})."
-        return f"None of the {len(tested)} test scenes is among the {len(learnt)} scenes of training and validation."
-
-    @property
     def num_found(self) -> int:
         """Episodes that the sources held."""
         return len(self.curated) + len(self.refused_by_curation)
@@ -143,89 +127,78 @@ class DatasetFacts:
     @property
     def reason_table(self) -> Table:
         """Step, reason, count and an example of everything that was refused, the most frequent first."""
-        rows: list[list[object]] = []
-        for step, refused in {
-            "curation": [(row.reason, f"{row.episode_id}: {row.detail}") for row in self.refused_by_curation],
-            "filters": [(row.reason, f"{row.episode_id}: {row.detail}") for row in self.refused_by_filters],
-            "filters, frames cut": [
-                (f["detector"], f"{f['episode_id']}: {f['cut_frames']} frames")
-                for f in self.findings
-                if f["cut_frames"]
-            ],
-            "kept for Stage I only": [(row.stage2_reason, row.episode_id) for row in self.rows if row.stage2_reason],
-        }.items():
-            first = dict(reversed(refused))
-            for reason, count in most_frequent(reason for reason, _ in refused):
-                rows.append([step, reason, count, first[reason].partition("\n")[0]])
-        return Table(("Step", "Reason", "Number", "For example"), rows, [2])
+        refused = [("curation", row.reason, f"{row.episode_id}: {row.detail}") for row in self.refused_by_curation]
+        refused += [("filters", row.reason, f"{row.episode_id}: {row.detail}") for row in self.refused_by_filters]
+        cut_rows = [row for row in self.findings if row["cut_frames"]]
+        refused += [
+            ("filters, frames cut", row["detector"], f"{row['episode_id']}: {row['cut_frames']} frames")
+            for row in cut_rows
+        ]
+        barred = [row for row in self.rows if row.stage2_reason]
+        refused += [("kept for Stage I only", row.stage2_reason, row.episode_id) for row in barred]
+        example = {(step, reason): text.partition("\n")[0] for step, reason, text in reversed(refused)}
+        counts = Counter((step, reason) for step, reason, _ in refused)
+        order = sorted(counts, key=lambda key: (key[0], -counts[key], key[1]))
+        return Table(("Step", "Reason", "Number", "For example"), [[*k, counts[k], example[k]] for k in order], [2])
+
+    @cached_property
+    def by_source(self) -> dict[str, SourceFacts | None]:
+        """The configured source of every name, those without a kept episode included; None where it is not noted."""
+        noted = {name: facts for facts in self.sources for name in (*facts.names, facts.label)}
+        unseen = {facts.label for facts in self.sources if not facts.names}
+        return {name: noted.get(name) for name in sorted({row.source for row in self.rows} | unseen)}
 
     @property
-    def names(self) -> list[str]:
-        """Sources by name, those without a kept episode included."""
-        unseen = [facts.label for facts in self.sources if not facts.names]
-        return sorted({row.source for row in self.rows} | set(unseen))
-
-    def source_facts(self, name: str) -> SourceFacts | None:
-        """The configured source of this name; None where it is not noted."""
-        return next((facts for facts in self.sources if name in facts.names or name == facts.label), None)
-
     def licenses(self) -> dict[str, list[str]]:
         """Sources by licence, "unknown" among them."""
-        found: dict[str, list[str]] = {}
-        for name in self.names:
-            facts = self.source_facts(name)
-            found.setdefault(UNKNOWN if facts is None else facts.license, []).append(name)
+        found: dict[str, list[str]] = defaultdict(list)
+        for name, facts in self.by_source.items():
+            found[UNKNOWN if facts is None else facts.license].append(name)
         return dict(sorted(found.items()))
 
     @property
     def source_table(self) -> Table:
         """Origin of the episodes, their numbers, and what their licences allow."""
         rows = []
-        for name in self.names:
-            own, noted = [row for row in self.rows if row.source == name], self.source_facts(name)
-            weight = self.weights.get(name)
-            share = f"{100 * float(weight['share']):.1f} %" if isinstance(weight, dict) else None
-            found, rights = (
-                (None, (UNKNOWN, UNKNOWN)) if noted is None else (noted.found, (noted.license, noted.redistribution))
-            )
+        for name, noted in self.by_source.items():
+            own, weight = [row for row in self.rows if row.source == name], self.weights.get(name)
+            share = f"{100 * float(weight['share']):.1f} %" if weight else None
+            rights = (UNKNOWN, UNKNOWN) if noted is None else (noted.license, noted.redistribution)
             kept = len({(row.dataset, row.episode_index) for row in own})
             rates = ", ".join(sorted({f"{row.fps:g}" for row in own})) or None
-            rows.append([name, found, kept, recorded_time(own), rates, share, *rights])
+            rows.append([name, noted and noted.found, kept, recorded_time(own), rates, share, *rights])
         headings = "Source", "Found", "Kept", "Recorded", "fps", "Share in training", "Licence", "Redistribution"
         return Table(headings, rows, range(1, 6))
 
-    def count_table(self, heading: str, value_of: Callable[[EpisodeRow], str]) -> Table:
-        """Scenes, episodes, recorded time and outcomes by a property of the rows."""
-        groups: dict[str, list[EpisodeRow]] = defaultdict(list)
-        for row in self.rows:
-            groups[value_of(row)].append(row)
-        rows: list[list[object]] = []
-        for value, own in sorted(groups.items()):
-            outcomes = Counter(row.outcome for row in own)
-            counts = [outcomes[name] for name in ("success", "failure", "unknown")]
-            rows.append([value, len({row.scene for row in own}), len(own), recorded_time(own), *counts])
-        headings = (heading, "Scenes", "Episodes", "Recorded", "Success", "Failure", "Unknown")
-        return Table(headings, rows, range(1, 7))
-
     @property
     def contents(self) -> list[tuple[str, Table]]:
-        """Counts by embodiment, task and split, each with a heading."""
-        return [
-            ("Embodiments", self.count_table("Embodiment", lambda row: row.embodiment)),
-            ("Tasks", self.count_table("Task family", lambda row: words(row.task_family))),
-            ("Splits", self.count_table("Split", lambda row: words(row.split))),
-        ]
+        """Scenes, episodes, recorded time and outcomes by embodiment, task and split, each with a heading."""
+        tables = []
+        for title, name in (("Embodiments", "embodiment"), ("Tasks", "task_family"), ("Splits", "split")):
+            rows: list[list[object]] = []
+            for value in sorted({getattr(row, name) for row in self.rows}):
+                own = [row for row in self.rows if getattr(row, name) == value]
+                outcomes = Counter(row.outcome for row in own)
+                counts = [outcomes[outcome] for outcome in ("success", "failure", "unknown")]
+                rows.append([value, len({row.scene for row in own}), len(own), recorded_time(own), *counts])
+            headings = (words(name).capitalize(), "Scenes", "Episodes", "Recorded", "Success", "Failure", "Unknown")
+            tables.append((title, Table(headings, rows, range(1, 7))))
+        return tables
 
     @property
     def instructions(self) -> Table:
         """The most frequent instructions."""
-        found = most_frequent(row.instruction for row in self.rows)[:MOST_INSTRUCTIONS]
+        found = Counter(sorted(row.instruction for row in self.rows)).most_common(MOST_INSTRUCTIONS)
         return Table(("Instruction", "Episodes"), [(text or "(none)", count) for text, count in found], [1])
 
     @property
     def leakage(self) -> str:
         """Scenes that both sides of the split share, or that look alike on them."""
-        notes = [self.split_note]
+        learnt = {row.scene for row in self.rows if row.split in ("train", "validation")}
+        tested = {row.scene for row in self.rows if row.split in ("test", "ood_test")}
+        notes = [f"None of the {len(tested)} test scenes is among the {len(learnt)} scenes of training and validation."]
+        if shared := sorted(learnt & tested):
+            notes = [f"Warning: {len(shared)} scenes are in training and in test ({', '.join(shared[:MOST_LEAKS])})."]
         if revealing := sum(mentions_outcome(row.instruction) for row in self.rows):
             notes.append(f"Warning: {revealing} instructions reveal the outcome, which models must not see.")
         leaks = self.curation.get("scene_leaks", [])
@@ -247,11 +220,6 @@ def _origin(folder: Path, rows: Sequence[EpisodeRow]) -> Path | None:
     return linked
 
 
-def most_frequent[T: Any](values: Iterable[T]) -> list[tuple[T, int]]:
-    """Values and their counts, the most frequent first, ties in their own order."""
-    return sorted(Counter(values).items(), key=lambda item: (-item[1], item[0]))
-
-
 def recorded_time(rows: Iterable[EpisodeRow]) -> str:
     """Duration of the images of some rows."""
     return duration(sum(row.video_frames / row.fps for row in rows))
@@ -261,16 +229,9 @@ def recorded_time(rows: Iterable[EpisodeRow]) -> str:
 
 
 def choose_rows(rows: Sequence[EpisodeRow], positions: Iterable[int], most: int) -> list[int]:
-    """Up to `most` positions, taken in turn from every embodiment, task and outcome."""
-    groups: dict[tuple[str, ...], list[int]] = defaultdict(list)
-    for position in positions:
-        row = rows[position]
-        groups[row.embodiment, row.task_family, row.outcome].append(position)
-    first = [groups[name][0] for name in sorted(groups)]
-    if len(first) > most:
-        return sorted(first[i] for i in evenly_spaced(len(first), most))
-    turns = zip_longest(*(groups[name] for name in sorted(groups)))
-    return sorted([position for turn in turns for position in turn if position is not None][:most])
+    """Up to `most` positions, spread over embodiments, tasks and outcomes."""
+    ordered = sorted(positions, key=lambda i: (rows[i].embodiment, rows[i].task_family, rows[i].outcome))
+    return sorted(ordered[i] for i in evenly_spaced(len(ordered), most))
 
 
 def sheet_rows(episodes: EpisodeSet, positions: Iterable[int]) -> tuple[list[SheetRow], list[str]]:
@@ -291,20 +252,6 @@ def sheet_rows(episodes: EpisodeSet, positions: Iterable[int]) -> tuple[list[She
     return shown, unreadable
 
 
-def episode_overlay(
-    episodes: EpisodeSet, index: int, tracks: EpisodeTracks, sigma_px_ref: float, title: str | None = None
-) -> Picture:
-    """Four moments of an episode in every view, with its tracks drawn over them.
-
-    Raises:
-        DataError: the episode has no view with a track, or its frames cannot be decoded.
-    """
-    row = episodes.rows[index]
-    chosen = evenly_spaced(min(tracks.num_frames, row.video_frames), 4)
-    frames = {view: np.asarray(episodes.frames(index, view, chosen)) for view in tracks.views if view in row.views}
-    return overlay_sheet(frames, tracks, chosen, style=OverlayStyle(sigma_px_ref), title=title)
-
-
 # The dataset card
 
 
@@ -323,7 +270,7 @@ def write_card(folder: Path, output: Path, title: str | None = None) -> list[Pat
     facts, episodes = DatasetFacts.read(folder), EpisodeSet.open(folder)
     heading = title or f"EpisodeSet {folder.resolve().name}"
     pictures: list[tuple[str, Path]] = []
-    for number, name in enumerate(facts.names):
+    for number, name in enumerate(facts.by_source):
         own = [i for i, row in enumerate(facts.rows) if row.source == name and row.primary_view in row.views]
         rows, _ = sheet_rows(episodes, choose_rows(facts.rows, own, ROWS_PER_SOURCE))
         if rows:
@@ -337,7 +284,7 @@ def write_card(folder: Path, output: Path, title: str | None = None) -> list[Pat
 
 def hub_metadata(facts: DatasetFacts, title: str) -> DatasetCardData:
     """The header for the hub's dataset pages and searches."""
-    name = re.sub(r"[^a-z0-9.+-]+", "-", " and ".join(facts.licenses()).lower()).strip("-") or UNKNOWN
+    name = re.sub(r"[^a-z0-9.+-]+", "-", " and ".join(facts.licenses).lower()).strip("-") or UNKNOWN
     known = HUB_LICENSES.fullmatch(name)
     datasets = sorted({row.dataset for row in facts.rows if not row.dataset.startswith("..")})
     return DatasetCardData(
@@ -346,9 +293,6 @@ def hub_metadata(facts: DatasetFacts, title: str) -> DatasetCardData:
         license_name=None if known else name,
         task_categories=["robotics"],
         tags=["LeRobot", "WorldLine", "robotics", *sorted({row.embodiment for row in facts.rows})],
-        size_categories=[
-            _SIZES[bisect_right([10**power for power in range(3, 10)], sum(row.video_frames for row in facts.rows))]
-        ],
         configs=[{"config_name": Path(d).name, "data_files": f"{d}/data/*/*.parquet"} for d in datasets] or None,
     )
 
@@ -385,34 +329,10 @@ def data_section(context: ReportContext) -> Section:
         return Section("data", TITLE, missing="no EpisodeSet was given (inputs curate or filter).")
     rows, problems = sheet_rows(episodes, choose_rows(facts.rows, range(len(facts.rows)), PAGE_ROWS))
     sheet = context.picture("contact_sheet", contact_sheet(rows), alt="Recorded episodes") if rows else None
-    overlays, unreadable = overlay_pictures(context, episodes)
-    return context.section(
-        "data", TITLE, facts.summary, facts=facts, sheet=sheet, overlays=overlays, problems=[*problems, *unreadable]
-    )
-
-
-def overlay_pictures(context: ReportContext, episodes: EpisodeSet) -> tuple[list[tuple[Markup, EpisodeRow]], list[str]]:
-    """The controls over one episode of each embodiment, held-out scenes preferred; and a line on each unreadable one."""
-    folder = context.inputs.get("render_actions")
-    if folder is None:
-        return [], ["No action tracks were given (input render_actions)."]
-    tracks, rows = ActionTracks.open(folder), episodes.rows
-    held_out_first = sorted(
-        range(len(rows)), key=lambda i: (rows[i].split not in ("test", "ood_test"), rows[i].episode_id)
-    )
-    first: dict[str, int] = {}
-    for index in held_out_first:
-        if rows[index].bank is None and len(rows[index].views) > 1 and rows[index].episode_id in tracks:
-            first.setdefault(rows[index].embodiment, index)
-    shown: list[tuple[Markup, EpisodeRow]] = []
-    unreadable: list[str] = []
-    for _, index in sorted(first.items())[:OVERLAYS]:
-        name = rows[index].episode_id
-        try:
-            picture = episode_overlay(episodes, index, tracks.tracks(name), tracks.sigma_px_ref)
-        except DataError as error:
-            unreadable.append(f"No overlay of {name}: {error.what}")
-            continue
-        alt = f"Action maps over {name}"
-        shown.append((context.picture(f"actions_{len(shown)}", picture, alt=alt), rows[index]))
-    return shown, unreadable
+    tracks = context.inputs.get("render_actions")
+    previews = [] if tracks is None else sorted((tracks / "previews").glob("*.png"))[:OVERLAYS]
+    controls = [
+        context.picture(f"actions_{n}", np.asarray(Image.open(path).convert("RGB")), alt="Controls over an episode")
+        for n, path in enumerate(previews)
+    ]
+    return context.section("data", TITLE, facts.summary, facts=facts, sheet=sheet, controls=controls, problems=problems)

@@ -7,7 +7,7 @@ kept and dropped clips by reason.
 from __future__ import annotations
 
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,7 +17,7 @@ import numpy as np
 
 from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.actions.overlays import OverlayStyle, write_overlay_video
+from worldline_core.actions.overlays import OverlayStyle, overlay_sheet, write_overlay_video
 from worldline_core.data.episodes.episode_index import EpisodeRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
@@ -27,7 +27,7 @@ from worldline_core.exports.export import export_rollout, shown_tracks
 from worldline_core.filters.verdict import REASONS
 from worldline_core.pages.page import render, words
 from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
-from worldline_core.report.data import FINDINGS_FILE, choose_rows, episode_overlay, most_frequent, sheet_rows
+from worldline_core.report.data import FINDINGS_FILE, choose_rows, sheet_rows
 from worldline_core.report.videos import compared_rows
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import kind_of, linked_folder, read_json, read_rows, verify_artifact
@@ -113,10 +113,10 @@ def describe(kind: str, folder: Path) -> list[str]:
         return [*first, f"open {folder / 'index.html'} in a browser"]
     rows, refused = read_rows(folder / "index.parquet"), read_rows(folder / "quarantine.parquet")
     counted = [(rows, key) for key in COUNTED.get(kind, ()) if rows and key in rows[0]]
-    counts = [
-        f"{key}: " + ", ".join(f"{name} {count}" for name, count in most_frequent(str(row[key]) for row in values))
-        for values, key in [*counted, *([(refused, "reason")] if refused else [])]
-    ]
+    counts = []
+    for values, key in [*counted, *([(refused, "reason")] if refused else [])]:
+        found = Counter(sorted(str(row[key]) for row in values)).most_common()
+        counts.append(f"{key}: " + ", ".join(f"{name} {count}" for name, count in found))
     episodes = len({row["episode_id"] for row in rows})
     return [*first, f"{episodes} episodes, {len(rows)} rows", f"quarantine: {len(refused)}", *counts]
 
@@ -151,10 +151,6 @@ class _Subject:
             )
         return EpisodeSet.open(self.episodes_folder)
 
-    @cached_property
-    def rollouts(self) -> RolloutSet:
-        return RolloutSet.open(self.folder)
-
     def picture(self, name: str, picture: Picture) -> str:
         self.written.append(self.output / f"{name}.jpg")
         write_bytes_atomic(self.written[-1], jpeg_bytes(picture))
@@ -168,36 +164,21 @@ class _Subject:
                 return  # dropped, or cut into segments with other names
         rows: list[SheetRow] = []
         if self.kind == "EpisodeSet":
-            chosen = choose_rows(self.episodes.rows, range(len(self.episodes)), SHEET_ROWS)
-            rows, unreadable = sheet_rows(self.episodes, chosen)
-            self.notes += unreadable
+            rows, self.notes[:0] = sheet_rows(
+                self.episodes, choose_rows(self.episodes.rows, range(len(self.episodes)), SHEET_ROWS)
+            )
         elif self.kind == "RolloutSet":
-            rows = self.prediction_rows()
+            rows = prediction_rows(RolloutSet.open(self.folder))
         if rows:
             self.picture("contact_sheet", contact_sheet(rows))
         if self.episodes_folder is None and episode_id is None and not video:
             self.notes.append("one episode is not shown: the EpisodeSet is unknown (--episodes FOLDER)")
-        else:
-            self.write_episode(self.first_episode if episode_id is None else episode_id, video=video)
-
-    @property
-    def first_episode(self) -> str:
-        """The first episode that the artifact and its EpisodeSet share."""
+            return
         own = {str(row["episode_id"]) for row in read_rows(self.folder / "index.parquet")}
-        known = [row.episode_id for row in self.episodes.rows if row.episode_id in own]
-        if not known:
+        shown = episode_id or next((row.episode_id for row in self.episodes.rows if row.episode_id in own), None)
+        if shown is None:
             raise DataError("The artifact shares no episode with this EpisodeSet", where=self.episodes.root)
-        return known[0]
-
-    def prediction_rows(self) -> list[SheetRow]:
-        """Moments of up to eight predictions, head view first."""
-        names, rows = sorted(self.rollouts.episode_ids), list[SheetRow]()
-        for name in [names[i] for i in evenly_spaced(len(names), SHEET_ROWS)]:
-            view = self.rollouts.views(name)[0]
-            frames = VideoFrames(self.rollouts.clip(name, view))
-            shown = frames[evenly_spaced(len(frames), MOMENTS)]
-            rows.append(SheetRow(f"{self.rollouts.method}  ·  {name}", shown, view))
-        return rows
+        self.write_episode(shown, video=video)
 
     def write_episode(self, episode_id: str, *, video: bool) -> None:
         """Moments of one episode, with its controls or beside its prediction; a video of the same."""
@@ -205,11 +186,14 @@ class _Subject:
         row = self.episodes.rows[position]
         title = f"{row.embodiment}  ·  {row.instruction}"
         if self.kind == "RolloutSet":
-            rows = compared_rows(self.rollouts, self.episodes, episode_id, self.rollouts.views(episode_id))
+            rollouts = RolloutSet.open(self.folder)
+            rows = compared_rows(rollouts, self.episodes, episode_id, rollouts.views(episode_id))
             self.picture(f"{stem}_prediction", contact_sheet(rows, title=title))
             if video:
-                rollouts = {self.rollouts.method: self.rollouts}
-                self.written += export_rollout(rollouts, self.episodes, None, episode_id, self.output, ("mp4",))
+                made = export_rollout(
+                    {rollouts.method: rollouts}, self.episodes, None, episode_id, self.output, ("mp4",)
+                )
+                self.written += made
             return
         recorded = ActionTracks.open(self.folder) if self.kind == "ActionTracks" else None
         try:
@@ -219,11 +203,14 @@ class _Subject:
             return
         sigma = SIGMA_PX_REFERENCE if recorded is None else recorded.sigma_px_ref
         title = f"{episode_id}  ·  {title}  ·  drawn: {tracks.controls_label}"
-        self.picture(f"{stem}_controls", episode_overlay(self.episodes, position, tracks, sigma, title))
+        clips = {view: VideoFrames(self.episodes.clip(position, view)) for view in row.views}
+        moments = evenly_spaced(min(tracks.num_frames, row.video_frames), 4)
+        frames = {view: clip[moments] for view, clip in clips.items()}
+        sheet = overlay_sheet(frames, tracks, moments, style=OverlayStyle(sigma), title=title)
+        self.picture(f"{stem}_controls", sheet)
         if video:
-            frames = {view: VideoFrames(self.episodes.clip(position, view)) for view in row.views}
             self.written.append(self.output / f"{stem}.mp4")
-            write_overlay_video(self.written[-1], frames, tracks, row.fps, style=OverlayStyle(sigma), title=title)
+            write_overlay_video(self.written[-1], clips, tracks, row.fps, style=OverlayStyle(sigma), title=title)
 
     def write_filters(self, curated: EpisodeSet, episode_id: str | None) -> bool:
         """Clips of up to four episodes of every reason, or of one episode; False where the filters judged no such episode."""
@@ -243,6 +230,16 @@ class _Subject:
                 dropped = sum(not clip.kept for clip in found.values())
                 self.reasons.append((reason, REASONS.get(reason, ""), len(found), dropped, picture))
         return episode_id in judged
+
+
+def prediction_rows(rollouts: RolloutSet) -> list[SheetRow]:
+    """Moments of up to eight predictions, head view first."""
+    names, rows = sorted(rollouts.episode_ids), list[SheetRow]()
+    for name in [names[i] for i in evenly_spaced(len(names), SHEET_ROWS)]:
+        view = rollouts.views(name)[0]
+        frames = VideoFrames(rollouts.clip(name, view))
+        rows.append(SheetRow(f"{rollouts.method}  ·  {name}", frames[evenly_spaced(len(frames), MOMENTS)], view))
+    return rows
 
 
 # Filtered sets
