@@ -10,8 +10,24 @@ import jinja2
 import numpy as np
 import pytest
 
-from worldline_core.pages.charts import VALUE_WIDTH, WIDTH, Axis, Dot, Series, interval_chart, line_chart, nice_ticks
-from worldline_core.pages.page import asset, duration, environment, interval, markdown, number, percent, render
+from worldline_core.pages.page import (
+    VALUE_WIDTH,
+    WIDTH,
+    Axis,
+    Dot,
+    Line,
+    asset,
+    duration,
+    environment,
+    interval,
+    interval_chart,
+    line_chart,
+    markdown,
+    nice_ticks,
+    number,
+    percent,
+    render,
+)
 
 
 def test_every_template_escapes_but_those_of_markdown() -> None:
@@ -66,7 +82,7 @@ def test_ticks_are_round_and_inside(low: float, high: float) -> None:
 
 
 def test_charts_are_xml_and_hold_every_point(hostile_text: str) -> None:
-    series = Series(hostile_text, [1, 2, 3], [0.5, 0.25, math.nan], [0.4, 0.2, 0.1], [0.6, 0.3, 0.2], markers=True)
+    series = Line(hostile_text, [1, 2, 3], [0.5, 0.25, math.nan], [0.4, 0.2, 0.1], [0.6, 0.3, 0.2], markers=True)
     chart = line_chart([series], title=hostile_text, x_label="step", y_label="loss", log_y=True)
     root = ElementTree.fromstring(chart)  # noqa: S314  # made two lines above
     assert len(root.findall(".//circle")) == 2  # the value that is not a number is left out

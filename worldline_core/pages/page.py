@@ -1,10 +1,11 @@
-"""Static pages from templates: every text is escaped, styles and scripts are inside the page, media beside it.
+"""Static pages from templates, their tables and charts: every text is escaped, styles and scripts are inside, media beside.
 
 Templates are beside the code that fills them, named from the package's root: `report/data.html`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -68,17 +69,13 @@ def _markdown_reader() -> MarkdownIt:
     return reader
 
 
-def markdown(text: str, *, heading: int = 4) -> Markup:
-    """Markdown as HTML; raw HTML, links and pictures stay text.
-
-    Args:
-        heading: level of the text's first level of headings.
-    """
+def markdown(text: str) -> Markup:
+    """Markdown as HTML, its headings three levels lower; raw HTML, links and pictures stay text."""
     reader = _markdown_reader()
     tokens = reader.parse(str(text))
     for token in tokens:
         if token.type in ("heading_open", "heading_close"):
-            token.tag = f"h{min(6, int(token.tag[1]) + heading - 1)}"
+            token.tag = f"h{min(6, int(token.tag[1]) + 3)}"
     return Markup(reader.renderer.render(tokens, reader.options, {}))  # noqa: S704  # raw HTML is switched off
 
 
@@ -115,17 +112,8 @@ def interval(measured: dict[str, float] | None, digits: int = 2, *, signed: bool
     if measured is None:
         return None
     low, high = (number(float(measured[key]), digits) for key in ("low", "high"))
-    return with_note(number(float(measured["mean"]), digits, signed=signed), f"[{low}, {high}]")
-
-
-def with_note(value: str, note: str) -> Markup:
-    """A value of a table with a note in smaller type."""
-    return render_macro("pages/parts.html", "with_note", value=value, note=note)
-
-
-def code(text: object) -> Markup:
-    """Inline code."""
-    return Markup("<code>{}</code>").format(text)
+    mean = number(float(measured["mean"]), digits, signed=signed)
+    return render_macro("pages/parts.html", "with_note", value=mean, note=f"[{low}, {high}]")
 
 
 @dataclass(frozen=True)
@@ -145,3 +133,145 @@ class Table:
 
     def __html__(self) -> Markup:
         return render_macro("pages/parts.html", "table", shown=self, numeric=set(self.numeric))
+
+
+# Charts as inline SVG: they follow the page's theme, fit a phone, print well, and their bytes are reproducible
+
+WIDTH, HEIGHT = 480, 270
+LEFT, RIGHT, TOP, BOTTOM = 62, 14, 12, 30
+VALUE_WIDTH, ROW_HEIGHT = 70, 46
+"""Room for the number at the right end of an interval chart's row, and the row's height."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line: points, optionally an interval around each, and a colour class (`c0` .. `c7`)."""
+
+    label: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float] = ()
+    high: Sequence[float] = ()
+    colour: str = "c0"
+    dashed: bool = False
+    markers: bool = False
+
+
+@dataclass(frozen=True)
+class Dot:
+    """One row of an interval chart."""
+
+    label: str
+    value: float
+    low: float
+    high: float
+    colour: str = "c0"
+
+
+def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
+    """Round numbers that cover a range."""
+    if low == high:
+        return [low]
+    raw = (high - low) / wanted
+    magnitude = 10.0 ** math.floor(math.log10(raw))
+    step = next(m * magnitude for m in (1, 2, 2.5, 5, 10) if m * magnitude >= raw * 0.999)
+    first = math.ceil(low / step - 1e-9)
+    return [round(i * step, 12) for i in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def tick_label(value: float) -> str:
+    """A short number for an axis."""
+    if value and (abs(value) >= 1e5 or abs(value) < 1e-3):
+        return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+    return f"{value:,.6g}".replace(",", NARROW_SPACE).replace("-", MINUS)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A linear or logarithmic map from values to the chart's units."""
+
+    low: float
+    high: float
+    start: float
+    stop: float
+    log: bool = False
+
+    def at(self, value: float) -> float:
+        """Coordinate of a value; values outside of the range are drawn at its edge."""
+        value = min(max(float(value), self.low), self.high)
+        low, high, value = (math.log10(v) if self.log else v for v in (self.low, self.high, value))
+        share = 0.5 if high == low else (value - low) / (high - low)
+        return round(self.start + share * (self.stop - self.start), 2)
+
+    def ticks(self, wanted: int = 5) -> list[float]:
+        decades = math.log10(self.high / self.low) if self.log else 0.0
+        if decades < 0.5:
+            return nice_ticks(self.low, self.high, wanted)
+        exponents = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+        factors = (1,) if decades > 3 else (1, 3) if decades > 1.3 else (1, 2, 3, 5, 7)
+        ticks = [m * 10.0**e for e in exponents for m in factors]
+        return [t for t in ticks if self.low * 0.999 <= t <= self.high * 1.001]
+
+
+def line_chart(
+    series: Sequence[Line],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    log_y: bool = False,
+    log_x: bool = False,
+    x_ticks: Sequence[float] | None = None,
+    shares: bool = False,
+) -> Markup:
+    """Lines with optional interval bands and a legend below the title.
+
+    Args:
+        log_y, log_x: logarithmic axes; values that are not positive are left out.
+        x_ticks: where the x axis is labelled (default: round numbers).
+        shares: y is from 0 to 1 and labelled in per cent.
+    """
+    found = [(item, _points(item, log_x=log_x, log_y=log_y)) for item in series]
+    xs = [x for _, points in found for x, *_ in points] or [0.0, 1.0]
+    ys = [y for _, points in found for _, *values in points for y in values if y > 0 or not log_y] or [0.1, 1.0]
+    air = 0.06 * (max(ys) - min(ys)) or 0.05 * abs(max(ys)) or 1.0
+    y_range = (min(ys) / 1.15, max(ys) * 1.15) if log_y else (min(ys) - air, max(ys) + air)
+    x_axis = Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT, log_x)
+    y_axis = Axis(*((0.0, 1.02) if shares else y_range), HEIGHT - BOTTOM, TOP, log_y)
+    rows = [(y_axis.at(v), percent(v) if shares else tick_label(v)) for v in y_axis.ticks()]
+    columns = [(x_axis.at(v), tick_label(v)) for v in (x_axis.ticks(6) if x_ticks is None else x_ticks)]
+    lines = [
+        (item, [(f"{tick_label(x)}, {y:.4g}", x_axis.at(x), *map(y_axis.at, (y, *bounds))) for x, y, *bounds in points])
+        for item, points in found
+    ]
+    return render_macro(
+        "pages/charts.html", "lines", title=title, x_label=x_label, y_label=y_label, rows=rows, columns=columns, lines=lines,
+        width=WIDTH, height=HEIGHT, left=LEFT, right=WIDTH - RIGHT, bottom=HEIGHT - BOTTOM,
+    )  # fmt: skip
+
+
+def _points(item: Line, *, log_x: bool, log_y: bool) -> list[tuple[float, ...]]:
+    """Points (x, y), or (x, y, low, high) of a series with intervals: those that can be drawn."""
+    found = zip(item.x, item.y, *([item.low, item.high] if item.low else []), strict=True)
+    usable = [point for point in found if all(map(math.isfinite, point))]
+    return [point for point in usable if (point[0] > 0 or not log_x) and (point[1] > 0 or not log_y)]
+
+
+def interval_chart(
+    dots: Sequence[Dot], *, title: str, value_label: str, zero_line: bool = False, digits: int = 3, signed: bool = False
+) -> Markup:
+    """Dots with interval whiskers below their labels, a row each: comparisons with their uncertainty."""
+    values = [v for d in dots for v in (d.value, d.low, d.high)] + [0.0] * zero_line
+    air = 0.08 * (max(values) - min(values)) or 0.1
+    axis = Axis(min(values) - air, max(values) + air, 8, WIDTH - VALUE_WIDTH)
+    rows = [
+        {
+            "dot": dot, "top": 8 + ROW_HEIGHT * i, "at": axis.at(dot.value), "ends": (axis.at(dot.low), axis.at(dot.high)),
+            "shown": number(float(dot.value), digits, signed=signed),
+        }
+        for i, dot in enumerate(dots)
+    ]  # fmt: skip
+    return render_macro(
+        "pages/charts.html", "dots", title=title, x_label=value_label, rows=rows, bottom=8 + ROW_HEIGHT * len(dots),
+        width=WIDTH, zero=axis.at(0.0) if zero_line else None, ticks=[(axis.at(v), tick_label(v)) for v in axis.ticks(4)],
+    )  # fmt: skip

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -37,10 +37,9 @@ from worldline_core.evaluation.paired import (
 )
 from worldline_core.evaluation.recordings import HEAD, ROLLOUT_PREFIX
 from worldline_core.evaluation.scores import SCORES_FILE, Interval
-from worldline_core.pages import charts
-from worldline_core.pages.page import render, words
+from worldline_core.pages.page import Line, line_chart, render, words
 from worldline_core.pictures import contact_sheet, jpeg_bytes
-from worldline_core.report.context import SPLIT_LABELS
+from worldline_core.report.context import headline_metrics
 from worldline_core.report.videos import compared_rows
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import MANIFEST_NAME, digest_value, linked_folder, read_json, verify_artifact
@@ -204,24 +203,14 @@ def aligned(lines: Sequence[Sequence[str]]) -> str:
 
 def figures_of(step: str, folder: Path) -> str:
     """The headline metrics of a finished evaluation with 95 % intervals, a line for each split and method; else nothing."""
-    found: dict[tuple[str, str], dict[str, Interval]] = {}
-    metrics = collect_metrics({step: folder})
-    most = max((int(name.split("/")[1][2:]) for name in metrics if name.startswith("planning/")), default=0)
-    for name, value in metrics.items():
-        _, group, method, metric = name.split("/", 3)
-        if group not in (*SPLIT_LABELS, "all", f"N={most}"):
-            continue
-        found.setdefault((group, method), {})[metric] = value
-    measured = {metric for values in found.values() for metric in values}
+    rows: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
+    for _, group, method, metric, value in headline_metrics(step, folder):
+        rows[group, method][metric] = f"{value.mean:.3f} [{value.low:.3f}, {value.high:.3f}] n={value.count}"
+    measured = {metric for values in rows.values() for metric in values}
     # A set without a head view has the means over its views alone.
-    columns = [m if m in measured else m.removesuffix("@head") for m in HEADLINES]
-    columns = [metric for metric in columns if metric in measured]
-    lines = [("group", "method", *columns)]
-    for (group, method), values in found.items():
-        cells = [values.get(metric) for metric in columns]
-        shown = ["" if v is None else f"{v.mean:.3f} [{v.low:.3f}, {v.high:.3f}] n={v.count}" for v in cells]
-        lines.append((group, method, *shown))
-    return aligned(lines) if columns else ""
+    columns = [m for name in HEADLINES if (m := name if name in measured else name.removesuffix("@head")) in measured]
+    lines = [(*key, *(values.get(column, "") for column in columns)) for key, values in rows.items()]
+    return aligned([("group", "method", *columns), *lines]) if columns else ""
 
 
 # A night and the nights before it
@@ -264,10 +253,10 @@ class MetricChange:
         return ", ".join(f"{recording} ({value:+.3f})" for recording, value in lost)
 
     def __str__(self) -> str:
-        if not self.worst or self.test is None:
+        if not (test := self.test) or self.verdict != "worse":
             return f"{self.metric} ({self.verdict})"
-        low, mean, high, count = self.test.low, self.test.mean, self.test.high, self.test.count
-        return f"{self.metric}: {mean:+.3f} [{low:+.3f}, {high:+.3f}] on {count} recordings, most on {self.worst}"
+        bounds = f"{test.mean:+.3f} [{test.low:+.3f}, {test.high:+.3f}]"
+        return f"{self.metric}: {bounds} on {test.count} recordings, most on {self.worst}"
 
 
 def verdict_of(metric: str, test: PairedTest) -> Verdict:
@@ -279,13 +268,10 @@ def verdict_of(metric: str, test: PairedTest) -> Verdict:
 
 def night_tests(present: Series, good: Sequence[Series]) -> dict[str, PairedTest]:
     """Tests of a night's differences to the median of each recording over the good nights before it, oldest first."""
-    nights = good[-REFERENCE_NIGHTS:]
-    medians = {
-        name: {
-            r: float(np.median([night[name][r] for night in nights if r in night.get(name, ())])) for r in recordings
-        }
-        for name, recordings in (nights[-1].items() if nights else ())
-    }
+    nights, medians = good[-REFERENCE_NIGHTS:], Series()
+    for name, recordings in nights[-1].items() if nights else ():
+        earlier = {r: [night[name][r] for night in nights if r in night.get(name, ())] for r in recordings}
+        medians[name] = {recording: float(np.median(values)) for recording, values in earlier.items()}
     return paired_tests(differences(present, medians))
 
 
@@ -309,10 +295,8 @@ class NightlyComparison:
 
     @property
     def verdicts(self) -> dict[str, str]:
-        """Every metric's verdict, those that became worse first; with what was lost, where the paired test says."""
-        order = [*self.worse, *(change for change in self.changes if change not in self.worse)]
-        lost = {c.metric: f" by {-c.test.mean:.3f}" for c in self.worse if c.test}
-        return {change.metric: change.verdict + lost.get(change.metric, "") for change in order}
+        """Every metric's verdict, those that became worse first."""
+        return {change.metric: change.verdict for change in [*self.worse, *self.changes]}
 
 
 def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -> NightlyComparison:
@@ -321,7 +305,7 @@ def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -
     Args:
         night: its name; default: today's date (UTC), with the time if today has other scores already. The same scores under the
             same name are the same night, measured again.
-        inputs: finished evaluations by step name, a variant after a dot.
+        inputs: finished evaluations by step name.
 
     Raises:
         ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
@@ -329,7 +313,8 @@ def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -
     metrics = collect_metrics(inputs)
     if not metrics:
         raise ArtifactError("A night without scores", where=night, expected=EVALUATIONS, got=sorted(inputs))
-    series = _series(inputs)
+    folders = [inputs[step] for step in EVALUATIONS if step in inputs and (inputs[step] / SCORES_FILE).is_file()]
+    series = {name: values for folder in folders for name, values in read_scores(folder).items()}
     with exclusive_lock(history / ".lock"):
         nights = read_history(history)
         known = {found.night: index for index, found in enumerate(nights)}
@@ -375,18 +360,6 @@ def accept_night(history: Path, night: str) -> None:
 def _require_night(nights: Sequence[Night], night: str) -> None:
     if night not in (names := [found.night for found in nights]):
         raise ArtifactError("No such night", expected=", ".join(names) or "a history", got=night)
-
-
-def _series(inputs: Mapping[str, Path]) -> Series:
-    """Scores by recording of all evaluations of a night; those of `evaluate_video.long` under `video.long`."""
-    found: Series = {}
-    for name, folder in sorted(inputs.items()):
-        step, _, variant = name.partition(".")
-        if step in EVALUATIONS and (folder / SCORES_FILE).is_file():
-            for series, values in read_scores(folder).items():
-                what, _, rest = series.partition("/")
-                found[f"{what}.{variant}/{rest}" if variant else series] = values
-    return found
 
 
 def scores_file(history: Path, night: str) -> Path:
@@ -438,13 +411,13 @@ def compare_with_history(
     content = asdict(compared) | {"changes": changes, "regressions": compared.regressions}
     write_json_atomic(history / "comparison.json", content)
     nights = read_history(history)
-    values = {
-        "title": "WorldLine nightly evaluation",
-        "compared": compared,
-        "nights": nights,
-        "charts": _trends(nights),
-    }
-    page = render("report/nights.html", **values)
+    page = render(
+        "report/nights.html",
+        title="WorldLine nightly evaluation",
+        compared=compared,
+        nights=nights,
+        charts=_trends(nights),
+    )
     write_bytes_atomic(history / "index.html", page.encode())
     return compared
 
@@ -465,44 +438,44 @@ def _write_pictures(history: Path, compared: NightlyComparison, artifacts: Mappi
     """Head views of the recordings that lost most, or of each method's first recording; replaces those of the night before."""
     shutil.rmtree(history / PICTURES, ignore_errors=True)
     rollouts = {
-        name.partition(".")[2]: RolloutSet.open(path) for name, path in artifacts.items() if name.startswith("rollout.")
+        n.removeprefix("rollout."): RolloutSet.open(path) for n, path in artifacts.items() if n.startswith("rollout.")
     }
     if "filter" not in artifacts or not rollouts:
         return {}
     episodes = EpisodeSet.open(artifacts["filter"])
     recorded = {row.episode_id for row in episodes.rows}
-    lost = [
-        (change.metric.split("/")[2], recording, f": {change.metric.split('/', 3)[3]} became worse by {-value:.3f}")
-        for change in compared.worse if change.test for recording, value in change.test.worst
-    ]  # fmt: skip
     shown: dict[tuple[str, str], str] = {}
-    for method, recording, what in lost or [(name, rollout.episode_ids[0], "") for name, rollout in rollouts.items()]:
-        if method in rollouts and recording in recorded and HEAD in rollouts[method].views(recording):
-            shown.setdefault((method, recording), f"{recording}, {method}{what}")
+    for change in compared.worse:
+        _, _, method, metric = change.metric.split("/", 3)
+        for recording, value in change.test.worst if change.test else ():
+            shown.setdefault((method, recording), f": {metric} became worse by {-value:.3f}")
     written: dict[str, str] = {}
-    for (method, recording), what in [*shown.items()][:MOST_PICTURES]:
-        written[what] = f"{PICTURES}/{digest_value([compared.night, what])[:16]}.jpg"
-        sheet = contact_sheet(compared_rows(rollouts[method], episodes, recording, [HEAD]), title=what)
-        write_bytes_atomic(history / written[what], jpeg_bytes(sheet))
+    for method, recording in shown or [(name, rollout.episode_ids[0]) for name, rollout in rollouts.items()]:
+        usable = method in rollouts and recording in recorded and HEAD in rollouts[method].views(recording)
+        if usable and len(written) < MOST_PICTURES:
+            what = f"{recording}, {method}{shown.get((method, recording), '')}"
+            written[what] = f"{PICTURES}/{digest_value([compared.night, what])[:16]}.jpg"
+            sheet = contact_sheet(compared_rows(rollouts[method], episodes, recording, [HEAD]), title=what)
+            write_bytes_atomic(history / written[what], jpeg_bytes(sheet))
     return written
 
 
 def _trends(nights: Sequence[Night]) -> list[Markup]:
     """Headline metrics over the nights: a chart per metric and split, a line per method."""
-    grouped: dict[tuple[str, str], list[str]] = {}
+    grouped: dict[tuple[str, str, str], list[str]] = defaultdict(list)
     for name in sorted({name for night in nights for name in night.metrics}):
         what, group, _, metric = name.split("/", 3)
         if metric.startswith(HEADLINES):
-            grouped.setdefault((f"{what}, {group}", metric), []).append(name)
+            grouped[what, group, metric].append(name)
     shown = []
-    for (where, metric), members in sorted(grouped.items())[:MOST_CHARTS]:
+    for (what, group, metric), names in sorted(grouped.items())[:MOST_CHARTS]:
         lines = []
-        for index, name in enumerate(members[:8]):
-            points = [(float(i + 1), night.metrics[name]) for i, night in enumerate(nights) if name in night.metrics]
+        for index, name in enumerate(names[:8]):
+            points = [(i, night.metrics[name]) for i, night in enumerate(nights, 1) if name in night.metrics]
             x, means, low, high = zip(*((i, v.mean, v.low, v.high) for i, v in points), strict=True)
-            lines.append(charts.Series(name.split("/")[2], x, means, low, high, colour=f"c{index}", markers=True))
-        ticks = [float(i + 1) for i in range(0, len(nights), max(1, len(nights) // MOST_TICKS))]
+            lines.append(Line(name.split("/")[2], x, means, low, high, colour=f"c{index}", markers=True))
+        ticks = range(1, len(nights) + 1, max(1, len(nights) // MOST_TICKS))
         x_label = f"night ({nights[0].night} to {nights[-1].night})"
-        title = f"{words(metric)} ({where})"
-        shown.append(charts.line_chart(lines, title=title, x_label=x_label, y_label=metric, x_ticks=ticks))
+        title = f"{words(metric)} ({what}, {group})"
+        shown.append(line_chart(lines, title=title, x_label=x_label, y_label=metric, x_ticks=ticks))
     return shown

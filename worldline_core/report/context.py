@@ -211,11 +211,6 @@ class ReportContext:
     output: Path
     run_parts: dict[str, Markup] = field(default_factory=dict)
 
-    def variants(self, step: str) -> dict[str, Path]:
-        """All folders of a step: variant -> folder; the plain name has the variant ""."""
-        found = {name.partition("."): path for name, path in sorted(self.inputs.items())}
-        return {variant: path for (name, _, variant), path in found.items() if name == step}
-
     @cached_property
     def video_scores(self) -> VideoScores:
         return VideoScores(self.inputs.get("evaluate_video"))
@@ -225,10 +220,16 @@ class ReportContext:
         found = read_json(self.inputs[step] / SUMMARY_FILE) if step in self.inputs else {}
         return found if found.get("methods") else None
 
+    @property
+    def rollout_folders(self) -> dict[str, Path]:
+        """Folders of the predicted videos by method."""
+        folders = {name.partition("."): path for name, path in sorted(self.inputs.items())}
+        return {method: path for (step, _, method), path in folders.items() if step == "rollout"}
+
     @cached_property
     def rollouts(self) -> dict[str, RolloutSet]:
-        """Predicted videos by variant of the step `rollout`."""
-        return {name: RolloutSet.open(path) for name, path in self.variants("rollout").items()}
+        """Predicted videos by method."""
+        return {name: RolloutSet.open(path) for name, path in self.rollout_folders.items()}
 
     @cached_property
     def episodes(self) -> EpisodeSet | None:

@@ -30,8 +30,13 @@ from worldline_core.report.context import (
     share_interval,
 )
 from worldline_core.report.data import data_section, dataset_facts
-from worldline_core.report.results import decisions_section, most_candidates, quality_section
-from worldline_core.report.training import provenance_section, training_section
+from worldline_core.report.results import (
+    decisions_section,
+    most_candidates,
+    provenance_section,
+    quality_section,
+    training_section,
+)
 from worldline_core.report.videos import overview_video, videos_section
 from worldline_core.store.artifact_files import JsonObject
 from worldline_core.store.atomic import remove_unfinished

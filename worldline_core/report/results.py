@@ -1,21 +1,24 @@
-"""Pages of the evaluations: "Video quality", and "Policy and planning"."""
+"""Pages of what was measured and made: "Video quality", "Policy and planning", "Training", "Provenance" with the models' cards."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 
-from markupsafe import Markup
+import numpy as np
+from markupsafe import Markup, escape
 
 from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, metric_of
 from worldline_core.evaluation.paired import EVALUATIONS
 from worldline_core.evaluation.scores import TRUE_METHOD
-from worldline_core.model.model_card import Measurement
-from worldline_core.pages.charts import Dot, Series, interval_chart, line_chart
-from worldline_core.pages.page import Table, interval, render, words
+from worldline_core.model.model_card import DESCRIPTIONS, Measurement, model_card, model_facts
+from worldline_core.pages.page import Dot, Line, Table, interval, interval_chart, line_chart, render, words
 from worldline_core.report.context import (
     SPLIT_LABELS,
     ReportContext,
@@ -32,9 +35,12 @@ from worldline_core.store.artifact_files import (
     finished_artifacts,
     linked_folder,
     read_json,
+    read_json_lines,
     read_manifest,
     verify_artifact,
 )
+from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.training.training_state import PROBE_LOG
 
 ALL = "all"
 EDGE_BLOCKS = 5
@@ -112,16 +118,14 @@ def quality_charts(scores: VideoScores, group: str) -> list[Markup]:
         return []
     differences, drifts = list[Markup](), list[Markup]()
     for metric in filter(None, (scores.headline(group, primary.name), METRICS["ssim"])):
-        dots, series = list[Dot](), list[Series]()
+        dots, series = list[Dot](), list[Line]()
         for m in scores.methods(group):
             if found := scores.difference(group, primary.name, m.name, f"{metric.name}@head"):
                 dots.append(Dot(m.long_label, found["mean"], found["low"], found["high"], m.colour))
             key = m.name, group, "head", metric.name
             rows = [row for row in scores.by_frame if (row["method"], row["split"], row["view"], row["metric"]) == key]
             if points := sorted((row["frame"], row["mean"]) for row in rows):
-                series.append(
-                    Series(m.long_label, *zip(*points, strict=True), colour=m.colour, dashed=m.group == "run")
-                )
+                series.append(Line(m.long_label, *zip(*points, strict=True), colour=m.colour, dashed=m.group == "run"))
         if dots:
             title = f"{primary.long_label} minus each other: {metric.title}"
             side = "left" if metric.lower_is_better else "right"
@@ -147,7 +151,7 @@ def block_costs(content: JsonObject) -> tuple[float, float] | None:
 
 def cost(context: ReportContext) -> Markup | None:
     """Time per frame and per block; a slot, because times differ from run to run."""
-    timed = {name: read_json(path / "run" / "speed.json") for name, path in context.variants("rollout").items()}
+    timed = {name: read_json(path / "run" / "speed.json") for name, path in context.rollout_folders.items()}
     timed = {name: content for name, content in timed.items() if content.get("seconds_per_frame") is not None}
     rows = [(method(name), name.startswith("banks_"), content, block_costs(content)) for name, content in timed.items()]
     devices = sorted({str(content.get("device_name") or "unknown device") for content in timed.values()})
@@ -207,12 +211,12 @@ def planning_evaluation(summary: JsonObject) -> dict[str, object]:
         }
         for m in order
     }
-    series = [Series("direct execution", x, [summary["direct_execution"]["mean"]] * len(x), colour="c5", dashed=True)]
+    series = [Line("direct execution", x, [summary["direct_execution"]["mean"]] * len(x), colour="c5", dashed=True)]
     for m in order:
         points = [(n, found["mean"], found["low"], found["high"]) for n, found in sorted(success[m.name].items())]
         own, mean, low, high = zip(*points, strict=True)
-        bounds = (low, high) if m.kind in MODELS else (None, None)
-        series.append(Series(m.long_label, own, mean, *bounds, m.colour, dashed=m.group == "run", markers=True))
+        bounds = (low, high) if m.kind in MODELS else ((), ())
+        series.append(Line(m.long_label, own, mean, *bounds, m.colour, dashed=m.group == "run", markers=True))
     chart = line_chart(
         series, title="Success of the chosen candidate, 95 % interval over banks", x_label="candidates N", y_label="success",
         log_x=True, x_ticks=x, shares=True,
@@ -237,6 +241,95 @@ def most_candidates(values: JsonObject) -> JsonObject:
     """A method's result among the most candidates."""
     return values["budgets"][max(values["budgets"], key=int)]
 
+
+# Training
+
+STAGES = {
+    "train_tokenizer": "Video tokenizer",
+    "train_stage1": "Stage I: action-free, text-conditioned",
+    "train_stage2": "Stage II: action-driven",
+    "distill": "Distillation",
+}
+PHASES = ("", "teacher_forcing", "trajectory_regression", "distribution_matching")
+METRICS_FILE = "metrics.jsonl"
+PARTS = 60
+"""A training loss is drawn as the means of so many parts of the run."""
+CONDITIONS = {
+    "": ("held-out", "c1"),
+    "_shuffled_actions": ("held-out, shuffled actions", "c3"),
+    "_no_actions": ("held-out, no actions", "c4"),
+    "_copy": ("held-out, copy first frame", "c5"),
+}
+LOSSES = {"parts": ("training", "c0"), **{f"validation/loss{suffix}": shown for suffix, shown in CONDITIONS.items()}}
+LATENT_ERRORS = {
+    f"validation/{error}{suffix}": shown
+    for error in ("sample_error", "rollout_error")
+    for suffix, shown in CONDITIONS.items()
+}
+TOOL_ERRORS = {
+    "tool_error_px": ("true controls", "c1"),
+    "tool_error_px_shuffled": ("another clip's controls", "c3"),
+    "tool_error_px_copy": ("copy first frame", "c5"),
+}
+"""Logged numbers of each chart, their labels and colours."""
+
+Curves = dict[str, tuple[list[float], list[float]]]
+"""Steps and values by name."""
+
+
+def training_section(context: ReportContext) -> Section:
+    """Charts of every stage's losses and held-out errors, and of the tool error as it was measured during training."""
+    charts: list[Markup] = []
+    given = {step: context.inputs[step] for step in STAGES if step in context.inputs}
+    for step, folder in given.items():
+        for phase in PHASES:
+            title = f"{STAGES[step]}, {words(phase)}" if phase else STAGES[step]
+            curves = read_curves(folder / phase / METRICS_FILE)
+            if loss := curves.get("loss"):
+                steps, values = (np.array_split(numbers, min(len(numbers), PARTS)) for numbers in loss)
+                curves["parts"] = [float(part[-1]) for part in steps], [float(part.mean()) for part in values]
+            charts += curve_chart(f"{title}: loss", "loss", curves, LOSSES)
+            charts += curve_chart(f"{title}: squared latent error", "squared latent error", curves, LATENT_ERRORS)
+            probed = read_curves((folder / "run" / phase if phase else folder) / PROBE_LOG)
+            for chart in curve_chart(f"{title}: tool error after a second", "px", probed, TOOL_ERRORS):
+                charts.append(context.slot(f"following-{step}-{phase}", chart, "See run/run.js."))
+    if not charts:
+        return Section(
+            "training", "Training", missing="no training stage was given (inputs train_stage1, train_stage2, ...)."
+        )
+    lead = (
+        f"This run's own training, from the base model on. Training loss: means of {PARTS} parts. Held-out losses always use"
+        " the same clips, noise and noise levels, with the averaged weights. Tool error: how far the tools are from where the"
+        " controls put them; a model that follows its controls is worse under another clip's."
+    )
+    missing = [title for step, title in STAGES.items() if step not in given and step != "train_tokenizer"]
+    return context.section("training", "Training", lead, missing=missing, charts=charts)
+
+
+def read_curves(file: Path) -> Curves:
+    """The curve of every logged number, finite values alone."""
+    curves: Curves = {}
+    for row in read_json_lines(file):
+        for name, value in row.items():
+            if isinstance(value, (int, float)) and math.isfinite(value):
+                steps, values = curves.setdefault(name, ([], []))
+                steps.append(float(row["step"]))
+                values.append(float(value))
+    return curves
+
+
+def curve_chart(title: str, y_label: str, curves: Curves, shown: Mapping[str, tuple[str, str]]) -> list[Markup]:
+    """A chart of some curves, logarithmic where all values are positive; nothing where none was logged."""
+    series = [
+        Line(label, *curves[name], colour=colour, markers=len(curves[name][0]) < 40)
+        for name, (label, colour) in shown.items()
+        if name in curves
+    ]
+    positive = all(value > 0 for item in series for value in item.y)
+    return [line_chart(series, title=title, x_label="step", y_label=y_label, log_y=positive)] if series else []
+
+
+# Models and their cards
 
 VIDEO_METRICS = ("robot_iou_exact", "robot_iou", "object_iou_exact", "ssim", "psnr", "lpips")
 
@@ -278,3 +371,47 @@ def measurements(model: Path, evaluations: Iterable[Path]) -> Sequence[Measureme
             source = f"{manifest.get('step')}/{manifest.get('key')}"
             found[label, recordings] = Measurement(label, recordings, **bounds, source=source)
     return [found[name] for name in sorted(found)]
+
+
+def provenance_section(context: ReportContext) -> Section:
+    """The models with their cards, and the origin of each artifact; times and versions are filled in when the page opens."""
+    if not context.inputs:
+        return Section("provenance", "Provenance", missing="no artifact was given.")
+    manifests = {name: read_json(folder / "manifest.json") for name, folder in sorted(context.inputs.items())}
+    rows: list[list[object]] = []
+    for name, manifest in manifests.items():
+        seeds = ", ".join(f"{key} {json.dumps(value)}" for key, value in sorted((manifest.get("seeds") or {}).items()))
+        digest = Markup("<code>{}</code>").format(str(manifest["digest"])[:16]) if manifest.get("digest") else None
+        rows.append([name, digest, manifest.get("version"), seeds or None])
+    folders = {name.removeprefix("models."): path for name, path in context.inputs.items()}
+    models = {n: path for n, path in folders.items() if any((path / file).is_file() for file in DESCRIPTIONS)}
+    facts = [model_facts(folder) for folder in models.values()]
+    headings = [*dict.fromkeys(key for found in facts for key in found)]
+    listed = [[name, *map(found.get, headings)] for name, found in zip(models, facts, strict=True)]
+    return context.section(
+        "provenance",
+        "Provenance",
+        "The same configuration on the same inputs gives the same digests.",
+        models=Table(["Model", *map(str.capitalize, headings)], listed) if listed else None,
+        artifacts=Table(("Artifact", "Digest", "Version", "Seeds"), rows, caption="Artifacts that this report shows"),
+        machine=context.slot("machine", render("report/machine.html", manifests=manifests), "See run/run.js."),
+        configs={
+            name: escape(json.dumps(manifest["config"], indent=2, sort_keys=True, ensure_ascii=False))  # uncut
+            for name, manifest in manifests.items()
+            if manifest.get("config") is not None
+        },
+        cards={name: written_card(context, name, folder) for name, folder in models.items()},
+    )
+
+
+def written_card(context: ReportContext, name: str, folder: Path) -> str:
+    """The card that came with a model; else one from the run's artifacts, which is written to ``cards/<name>.md``."""
+    given = folder / "MODEL_CARD.md"
+    if given.is_file():
+        return given.read_text(encoding="utf-8", errors="replace")
+    if not (folder / DESCRIPTIONS[0]).is_file():
+        return "No card came with this model."
+    evaluations = [context.inputs[step] for step in EVALUATIONS if step in context.inputs]
+    text = model_card(folder, measurements(folder, evaluations))
+    write_bytes_atomic(context.output / "cards" / f"{safe_stem(name)}.md", text.encode())
+    return text.partition("\n---\n")[2]

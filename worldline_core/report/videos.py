@@ -92,7 +92,7 @@ def chosen_episodes(context: ReportContext) -> list[ChosenEpisode]:
 
 def videos_section(context: ReportContext) -> Section:
     """A card for each chosen episode."""
-    if not context.variants("rollout"):
+    if not context.rollout_folders:
         return Section("videos", TITLE, missing="no RolloutSet was given (inputs rollout.<method>).")
     if context.episodes is None:
         return Section("videos", TITLE, missing="the recorded episodes were not given (inputs filter or curate).")
