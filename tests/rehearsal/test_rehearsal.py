@@ -9,16 +9,22 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from tasks.execution.command_line import add_task_arguments
+from worldline_core import WorldLine
 from worldline_core.config import load_config
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import UnavailableError
+from worldline_core.model.checkpoint import read_checkpoint_info
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 from worldline_core.rehearsal.outside_models import OUTSIDE_MODELS, write_outside_models
 from worldline_core.rehearsal.rehearsal import ABLATION_SIZES, changes_of, table
 from worldline_core.report.ablation_table import load_variants
+from worldline_core.serving.serve_config import ServeConfig
+from worldline_core.serving.session_host import SessionHost
 from worldline_core.store.artifact_files import finished_artifacts, read_manifest
 
 PRESET = "cosmos3-nano"
@@ -79,23 +85,45 @@ def test_torchrun_hands_the_name_of_a_call_on() -> None:
     assert parser.parse_args(handed).name == "train_stage2.head_only"
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(1560)
-def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project_root: Path) -> None:
-    """About ten minutes of two cores."""
+def rehearse(folder: Path, project_root: Path, *options: str) -> Path:
+    """The folder of a whole rehearsal."""
     environment = {
         **os.environ,
         "PYTHONPATH": str(project_root),
         "OMP_NUM_THREADS": "1",
-        "PREFECT_HOME": str(tmp_path / "p"),
+        "PREFECT_HOME": str(folder / "p"),
     }
     environment.pop("PREFECT_API_URL", None)
-    command = [sys.executable, "-m", "flows.command_line", "rehearse", "--preset", PRESET, "--output", "rehearsal"]
+    command = [sys.executable, "-m", "flows.command_line", "rehearse", "--output", "rehearsal", *options]
     done = subprocess.run(
-        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=1500, check=False
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1500, check=False
     )
     assert done.returncode == 0, (done.stdout + done.stderr)[-6000:]
-    folder = tmp_path / "rehearsal"
+    return folder / "rehearsal"
+
+
+@pytest.mark.slow
+def test_the_preset_of_one_card_runs_from_import_to_play(tmp_path: Path, project_root: Path) -> None:
+    """About two minutes of one core."""
+    folder = rehearse(tmp_path, project_root, "--preset", "edge-24gb", "--processes", "1", "--without-ablations")
+    latest = folder / "artifacts" / "latest"
+    assert read_manifest(latest / "train_stage2")["config"]["trainer"]["optimizer"]["moments"] == "8bit"
+    assert read_checkpoint_info(latest / "distill").config.feed_forward == "squared_relu"
+    world = WorldLine.from_pretrained(latest / "distill")
+    host = SessionHost(world, ServeConfig(model=latest / "distill", episodes=latest / "filter"))
+    simulation = host.simulate("ur5e_silver-test-s1-00001", [0])
+    frames = simulation.step(np.repeat(simulation.state[:, None], world.frames_per_unit, axis=1))
+    host.shut_down()
+    assert {view: video.shape for view, video in frames.items()} == dict.fromkeys(
+        VIEWS, (1, world.frames_per_unit, 64, 96, 3)
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1560)
+def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project_root: Path) -> None:
+    """About ten minutes of two cores."""
+    folder = rehearse(tmp_path, project_root, "--preset", PRESET)
     assert "train_stage2.relational.student_layer" in (folder / "changes.md").read_text()
     assert (folder / "artifacts" / "report" / "latest" / "index.html").is_file()
     for name in OUTSIDE_MODELS:

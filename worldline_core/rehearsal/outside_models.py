@@ -7,6 +7,7 @@ index, configuration, processors, tokenizer). Sizes alone differ; LPIPS keeps it
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ SHARD = "100KB"
 TRANSFORMER: dict[str, Any] = {
     "head_dim": 16, "hidden_size": 32, "intermediate_size": 48, "num_attention_heads": 2, "num_hidden_layers": 4,
     "num_key_value_heads": 1, "rope_axes_dim": (4, 2, 2), "vocab_size": 1024, "action_dim": 8, "num_embodiment_domains": 2,
+}  # fmt: skip
+EDGE: dict[str, Any] = {
+    "hidden_act": "relu2", "qk_norm_for_text": False, "use_und_k_norm_for_gen": True, "rms_norm_eps": 1e-5, "rope_theta": 1e8,
 }  # fmt: skip
 _WORDS = (
     f"{SYSTEM_PROMPT} system user assistant The video is 4.3 seconds long and is of 30 FPS. This video is of 480x640 "
@@ -64,14 +68,18 @@ def write_qwen2_tokenizer(folder: Path) -> Any:
     return tokenizer
 
 
-def write_cosmos3(folder: Path) -> None:
-    """The Cosmos3 pipeline of diffusers: transformer in shards with an index, Wan autoencoder, text tokenizer, scheduler."""
+def write_cosmos3(folder: Path, **kind: Any) -> None:
+    """The Cosmos3 pipeline of diffusers: transformer in shards with an index, Wan autoencoder, text tokenizer, scheduler.
+
+    Args:
+        kind: what its transformer has otherwise than Nano's.
+    """
     from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
     from diffusers.pipelines.cosmos.pipeline_cosmos3_omni import Cosmos3OmniPipeline
     from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
 
     pipeline = Cosmos3OmniPipeline(
-        transformer=Cosmos3OmniTransformer(**TRANSFORMER),
+        transformer=Cosmos3OmniTransformer(**TRANSFORMER, **kind),
         text_tokenizer=write_qwen2_tokenizer(folder / "text_tokenizer"),
         vae=small_wan_autoencoder(),
         scheduler=UniPCMultistepScheduler(prediction_type="flow_prediction", use_flow_sigmas=True),
@@ -212,6 +220,7 @@ def write_lpips(folder: Path) -> None:
 
 OUTSIDE_MODELS: dict[str, Callable[[Path], None]] = {
     "Cosmos3-Nano": write_cosmos3,
+    "Cosmos3-Edge": partial(write_cosmos3, **EDGE),
     "vjepa2-vitg-fpc64-384": write_vjepa2,
     "sam3": write_sam3,
     "Qwen3-VL-8B-Instruct": write_qwen3_vl,

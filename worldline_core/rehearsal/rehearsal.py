@@ -1,5 +1,5 @@
-"""A preset at small size: the same file with listed changes of size, small models, and shipped recordings at the rate and
-length of real ones, with three views and with two."""
+"""A preset at small size: the same file with listed changes of size, small models, and shipped recordings at the preset's rate and
+with the length of real ones, with three views and with two."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ SIZES: tuple[tuple[str, Any, str], ...] = (
         [{"kind": "episode_set", "path": name, "name": name} for name in (RECORDINGS, TWO_VIEW_RECORDINGS)],
         "small recordings of three views, and of two for evaluation",
     ),
-    ("models.tokenizer", f"{WEIGHTS}/Cosmos3-Nano/vae", _SMALL),
+    ("models.tokenizer", f"{WEIGHTS}/{{backbone}}/vae", _SMALL),
     ("models.base", f"{WEIGHTS}/base", _SMALL),
     ("models.teacher", f"{WEIGHTS}/vjepa2-vitg-fpc64-384", _SMALL),
-    ("*.text.path", f"{WEIGHTS}/Cosmos3-Nano/text_tokenizer", _SMALL),
+    ("*.text.path", f"{WEIGHTS}/{{backbone}}/text_tokenizer", _SMALL),
     ("*.lpips_weights", f"{WEIGHTS}/lpips", _SMALL),
     ("*.sam3_weights", f"{WEIGHTS}/sam3", _SMALL),
     ("evaluate_policy.vlm.weights", f"{WEIGHTS}/Qwen3-VL-8B-Instruct", _SMALL),
@@ -99,10 +99,15 @@ def changes_of(
         return dict(_leaves(config.model_dump(mode="json")))
 
     small: list[Change] = []
-    for key, value in values().items():
+    before = values()
+    backbone = f"Cosmos3-{before.get('import_backbone.size', 'nano').title()}"
+    for key, value in before.items():
         size = next((size for size in sizes if fnmatchcase(key, size[0])), None)
-        if size is not None and (key in ALWAYS or _larger(value, size[1])):
-            small.append(Change(key, value, *size[1:]))
+        if size is None or (size[2] == _SMALL and str(value).startswith(f"{WEIGHTS}/")):
+            continue  # small versions are where the preset expects the published ones
+        rehearsed = size[1].format(backbone=backbone) if size[2] == _SMALL else size[1]
+        if key in ALWAYS or _larger(value, rehearsed):
+            small.append(Change(key, value, rehearsed, size[2]))
     after = values([change.override for change in small])
     return [change for change in small if after[change.key] != change.published]
 
@@ -163,9 +168,10 @@ def prepare(
         shutil.rmtree(folder / f"{WEIGHTS}.partial", ignore_errors=True)
         write_outside_models(folder / f"{WEIGHTS}.partial")
         (folder / f"{WEIGHTS}.partial").rename(folder / WEIGHTS)
+    fps = PipelineConfig.load(preset, path, changed).curate.fps or FPS
     for name, episodes, split in ((RECORDINGS, THREE_VIEWS, None), (TWO_VIEW_RECORDINGS, TWO_VIEWS, "test")):
         if not (folder / name / "index.parquet").is_file():
-            write_recordings(folder / name, episodes, split=split)
+            write_recordings(folder / name, episodes, fps=fps, split=split)
     return changes, ablated
 
 
@@ -179,8 +185,8 @@ TWO_VIEWS = ("xarm7_single-train-s1-00000", "xarm7_single-train-s1-00001")
 """A head and a wrist camera, a failure and a success; here they are for evaluation alone."""
 
 
-def write_recordings(folder: Path, episodes: Sequence[str], *, split: str | None = None) -> None:
-    """Write shipped recordings as an EpisodeSet of 30 frames a second and 129 frames, the same bytes every time.
+def write_recordings(folder: Path, episodes: Sequence[str], *, fps: float = FPS, split: str | None = None) -> None:
+    """Write shipped recordings as an EpisodeSet of ``fps`` frames a second and 129 frames, the same bytes every time.
 
     States, commands, camera poses and pictures between two recorded moments are interpolated; the movement takes a twentieth
     longer than it did.
@@ -195,19 +201,19 @@ def write_recordings(folder: Path, episodes: Sequence[str], *, split: str | None
             episode = shipped.episode(position)
             moments = np.linspace(0, episode.num_frames - 1, FRAMES)
             frames = {view: _between(shipped.frames(position, view), moments) for view in shipped.rows[position].views}
-            changed = resampled(episode, moments)
+            changed = resampled(episode, moments, fps)
             writer.add(
                 replace(changed, split=split or episode.split),
                 {view: np.rint(values).astype(np.uint8) for view, values in frames.items()},
             )
 
 
-def resampled(episode: Episode, moments: np.ndarray) -> Episode:
-    """The episode at 30 frames a second, one for each of ``moments`` (frame numbers with fractions)."""
+def resampled(episode: Episode, moments: np.ndarray, fps: float = FPS) -> Episode:
+    """The episode at ``fps`` frames a second, one for each of ``moments`` (frame numbers with fractions)."""
     return replace(
         episode,
-        fps=FPS,
-        timestamps=np.arange(len(moments)) / FPS,
+        fps=fps,
+        timestamps=np.arange(len(moments)) / fps,
         video_frames=None,
         cameras={view: _moved(camera, moments) for view, camera in episode.cameras.items()},
         **{name: _poses(values, moments) if name == "T_base_ee" else _between(values, moments)
