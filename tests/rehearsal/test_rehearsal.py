@@ -112,10 +112,10 @@ def test_the_preset_of_one_card_runs_from_import_to_play(tmp_path: Path, project
     world = WorldLine.from_pretrained(latest / "distill")
     host = SessionHost(world, ServeConfig(model=latest / "distill", episodes=latest / "filter"))
     simulation = host.simulate("ur5e_silver-test-s1-00001", [0])
-    frames = simulation.step(np.repeat(simulation.state[:, None], world.frames_per_unit, axis=1))
+    (frames,) = simulation.step(np.repeat(simulation.state[:, None], world.frames_per_unit, axis=1))
     host.shut_down()
     assert {view: video.shape for view, video in frames.items()} == dict.fromkeys(
-        VIEWS, (1, world.frames_per_unit, 64, 96, 3)
+        VIEWS, (world.frames_per_unit, 64, 96, 3)
     )
 
 
