@@ -10,8 +10,8 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -91,7 +91,8 @@ def inspect(
     subject.write(episode_id, video=video)
     names = [path.name for path in subject.written]
     title = f"{kind} {folder.resolve().name}"
-    page = render("report/inspect.html", title=title, lines=lines, subject=subject, names=names)
+    kept = None if subject.curated is None else (len(read_index(folder)), len(subject.curated))
+    page = render("report/inspect.html", title=title, lines=lines, subject=subject, names=names, kept=kept)
     write_bytes_atomic(subject.output / "index.html", page.encode())
     return Inspection(kind, [*lines, *subject.notes], [subject.output / "index.html", *subject.written])
 
@@ -122,7 +123,7 @@ def describe(kind: str, folder: Path) -> list[str]:
 
 
 class _Subject:
-    """An artifact with pictures, the artifacts that it belongs to, and what is written of it."""
+    """An artifact with pictures, the episodes that it belongs to, and what is written of it."""
 
     def __init__(self, kind: str, folder: Path, given: Path | None, output: Path) -> None:
         self.kind, self.folder, self.output = kind, folder, output
@@ -140,17 +141,6 @@ class _Subject:
             else:
                 self.curated = EpisodeSet.open(linked)
 
-    @cached_property
-    def episodes(self) -> EpisodeSet:
-        if self.episodes_folder is None:
-            raise ArtifactError(
-                "The episodes that this artifact belongs to are unknown",
-                where=self.folder,
-                expected="a manifest that names a folder which is still there",
-                next_step="name the EpisodeSet with --episodes FOLDER",
-            )
-        return EpisodeSet.open(self.episodes_folder)
-
     def picture(self, name: str, picture: Picture) -> str:
         self.written.append(self.output / f"{name}.jpg")
         write_bytes_atomic(self.written[-1], jpeg_bytes(picture))
@@ -158,59 +148,62 @@ class _Subject:
 
     def write(self, episode_id: str | None, *, video: bool) -> None:
         """Write everything that the page shows."""
-        if self.curated is not None:
-            judged = self.write_filters(self.curated, episode_id)
-            if judged and episode_id not in {row.episode_id for row in self.episodes.rows}:
-                return  # dropped, or cut into segments with other names
-        rows: list[SheetRow] = []
-        if self.kind == "EpisodeSet":
-            rows, self.notes[:0] = sheet_rows(
-                self.episodes, choose_rows(self.episodes.rows, range(len(self.episodes)), SHEET_ROWS)
-            )
-        elif self.kind == "RolloutSet":
-            rows = prediction_rows(RolloutSet.open(self.folder))
-        if rows:
-            self.picture("contact_sheet", contact_sheet(rows))
+        own = dict.fromkeys(str(row["episode_id"]) for row in read_rows(self.folder / "index.parquet"))
+        if self.curated is not None and self.write_filters(self.curated, episode_id) and episode_id not in own:
+            return  # dropped, or cut into segments with other names
+        rollouts = RolloutSet.open(self.folder) if self.kind == "RolloutSet" else None
+        if rollouts is not None:
+            self.picture("contact_sheet", contact_sheet(prediction_rows(rollouts)))
         if self.episodes_folder is None and episode_id is None and not video:
             self.notes.append("one episode is not shown: the EpisodeSet is unknown (--episodes FOLDER)")
             return
-        own = {str(row["episode_id"]) for row in read_rows(self.folder / "index.parquet")}
-        shown = episode_id or next((row.episode_id for row in self.episodes.rows if row.episode_id in own), None)
+        if self.episodes_folder is None:
+            raise ArtifactError(
+                "The episodes that this artifact belongs to are unknown",
+                where=self.folder,
+                expected="a manifest that names a folder which is still there",
+                next_step="name the EpisodeSet with --episodes FOLDER",
+            )
+        episodes = EpisodeSet.open(self.episodes_folder)
+        if self.kind == "EpisodeSet":
+            rows, unreadable = sheet_rows(episodes, choose_rows(episodes.rows, range(len(episodes)), SHEET_ROWS))
+            self.notes += unreadable
+            if rows:
+                self.picture("contact_sheet", contact_sheet(rows))
+        shown = episode_id or next((row.episode_id for row in episodes.rows if row.episode_id in own), None)
         if shown is None:
-            raise DataError("The artifact shares no episode with this EpisodeSet", where=self.episodes.root)
-        self.write_episode(shown, video=video)
-
-    def write_episode(self, episode_id: str, *, video: bool) -> None:
-        """Moments of one episode, with its controls or beside its prediction; a video of the same."""
-        stem, position = safe_stem(episode_id), self.episodes.position(episode_id)
-        row = self.episodes.rows[position]
-        title = f"{row.embodiment}  ·  {row.instruction}"
-        if self.kind == "RolloutSet":
-            rollouts = RolloutSet.open(self.folder)
-            rows = compared_rows(rollouts, self.episodes, episode_id, rollouts.views(episode_id))
-            self.picture(f"{stem}_prediction", contact_sheet(rows, title=title))
+            raise DataError("The artifact shares no episode with this EpisodeSet", where=episodes.root)
+        if rollouts is None:
+            self.write_controls(episodes, shown, video=video)
+        else:
+            row = episodes.rows[episodes.position(shown)]
+            rows = compared_rows(rollouts, episodes, shown, rollouts.views(shown))
+            sheet = contact_sheet(rows, title=f"{shown}  ·  {row.embodiment}  ·  {row.instruction}")
+            self.picture(f"{safe_stem(shown)}_prediction", sheet)
             if video:
-                made = export_rollout(
-                    {rollouts.method: rollouts}, self.episodes, None, episode_id, self.output, ("mp4",)
+                self.written += export_rollout(
+                    {rollouts.method: rollouts}, episodes, None, shown, self.output, ("mp4",)
                 )
-                self.written += made
-            return
+
+    def write_controls(self, episodes: EpisodeSet, episode_id: str, *, video: bool) -> None:
+        """Moments of one episode with its controls, and a video of the same."""
+        stem, position = safe_stem(episode_id), episodes.position(episode_id)
+        row = episodes.rows[position]
         recorded = ActionTracks.open(self.folder) if self.kind == "ActionTracks" else None
         try:
-            tracks = recorded.tracks(episode_id) if recorded else shown_tracks(self.episodes.episode(position))
+            tracks = recorded.tracks(episode_id) if recorded else shown_tracks(episodes.episode(position))
         except WorldLineError as error:
             self.notes.append(f"no controls are shown: {error.what} ({error.where})")
             return
-        sigma = SIGMA_PX_REFERENCE if recorded is None else recorded.sigma_px_ref
-        title = f"{episode_id}  ·  {title}  ·  drawn: {tracks.controls_label}"
-        clips = {view: VideoFrames(self.episodes.clip(position, view)) for view in row.views}
+        style = OverlayStyle(SIGMA_PX_REFERENCE if recorded is None else recorded.sigma_px_ref)
+        title = f"{episode_id}  ·  {row.embodiment}  ·  {row.instruction}  ·  drawn: {tracks.controls_label}"
+        clips = {view: VideoFrames(episodes.clip(position, view)) for view in row.views}
         moments = evenly_spaced(min(tracks.num_frames, row.video_frames), 4)
         frames = {view: clip[moments] for view, clip in clips.items()}
-        sheet = overlay_sheet(frames, tracks, moments, style=OverlayStyle(sigma), title=title)
-        self.picture(f"{stem}_controls", sheet)
+        self.picture(f"{stem}_controls", overlay_sheet(frames, tracks, moments, style=style, title=title))
         if video:
             self.written.append(self.output / f"{stem}.mp4")
-            write_overlay_video(self.written[-1], clips, tracks, row.fps, style=OverlayStyle(sigma), title=title)
+            write_overlay_video(self.written[-1], clips, tracks, row.fps, style=style, title=title)
 
     def write_filters(self, curated: EpisodeSet, episode_id: str | None) -> bool:
         """Clips of up to four episodes of every reason, or of one episode; False where the filters judged no such episode."""
@@ -221,9 +214,14 @@ class _Subject:
             names = [name for name in found if whole in (None, name)][:CLIPS_PER_REASON]
             rows = list[SheetRow]()
             for name in names:
-                shown, unreadable = sheet_rows(curated, [curated.position(name)])
+                position, clip = curated.position(name), found[name]
+                row, (shown, unreadable) = curated.rows[position], sheet_rows(curated, [position])
                 self.notes += unreadable
-                rows += [found[name].shown(row, reason, curated) for row in shown]
+                colours = np.full((row.video_frames, 3), LOST_COLOUR, dtype=np.uint8)
+                for segment in clip.kept:
+                    colours[segment.start - row.start : segment.stop - row.start] = KEPT_COLOUR
+                title = f"{words(reason)}: {clip.decision}"
+                rows += [SheetRow(f"{title}  ·  {s.note}", s.frames, clip.numbers, colours) for s in shown]
             name = safe_stem(reason) if whole is None else f"{safe_stem(whole)}_{safe_stem(reason)}"
             if names:
                 picture = self.picture(f"reason_{name}", contact_sheet(rows, tile_height=96)) if rows else None
@@ -245,22 +243,12 @@ def prediction_rows(rollouts: RolloutSet) -> list[SheetRow]:
 # Filtered sets
 
 
-@dataclass(frozen=True)
-class FilteredClip:
+class FilteredClip(NamedTuple):
     """A curated episode as an example of a reason: what the filters did, the numbers behind it, and the segments kept."""
 
-    episode_id: str
     decision: str
     numbers: str
     kept: Sequence[EpisodeRow]
-
-    def shown(self, pictures: SheetRow, reason: str, curated: EpisodeSet) -> SheetRow:
-        """The episode's row of a sheet with the decision, and a colour for each recorded frame: kept or not."""
-        row = curated.rows[curated.position(self.episode_id)]
-        colours = np.full((row.video_frames, 3), LOST_COLOUR, dtype=np.uint8)
-        for segment in self.kept:
-            colours[segment.start - row.start : segment.stop - row.start] = KEPT_COLOUR
-        return SheetRow(f"{words(reason)}: {self.decision}  ·  {pictures.note}", pictures.frames, self.numbers, colours)
 
 
 def clips_by_reason(folder: Path) -> dict[str, dict[str, FilteredClip]]:
@@ -273,7 +261,7 @@ def clips_by_reason(folder: Path) -> dict[str, dict[str, FilteredClip]]:
         kept[episode_of(row.episode_id)].append(row)
     clips: dict[str, dict[str, FilteredClip]] = defaultdict(dict)
     for row in read_quarantine(folder):
-        clips[row.reason][row.episode_id] = FilteredClip(row.episode_id, "dropped whole", row.detail, ())
+        clips[row.reason][row.episode_id] = FilteredClip("dropped whole", row.detail, ())
     cut = set[str]()
     for row in read_rows(folder / FINDINGS_FILE):
         if row["cut_frames"] and (name := row["episode_id"]) in kept:
@@ -281,12 +269,12 @@ def clips_by_reason(folder: Path) -> dict[str, dict[str, FilteredClip]]:
             measured = {k: v for k, v in json.loads(row["numbers"]).items() if isinstance(v, float)}
             numbers = "  ·  ".join(f"{words(key)} {value:.3g}" for key, value in measured.items())
             decision = f"{row['cut_frames']} frames cut"
-            clips[row["detector"]].setdefault(name, FilteredClip(name, decision, numbers, kept[name]))
+            clips[row["detector"]].setdefault(name, FilteredClip(decision, numbers, kept[name]))
     for name, rows in sorted(kept.items()):
         barred = {row.stage2_reason or "unfit for Stage II" for row in rows if not row.stage2_ok}
         for reason in sorted(barred) or ([] if name in cut else [KEPT]):
             decision = "kept whole" if reason == KEPT else "kept for Stage I only"
-            clips[reason].setdefault(name, FilteredClip(name, decision, "", rows))
+            clips[reason].setdefault(name, FilteredClip(decision, "", rows))
     return dict(sorted(clips.items(), key=lambda item: (item[0] == KEPT, -len(item[1]), item[0])))
 
 
