@@ -203,8 +203,7 @@ def blank(height: int, width: int) -> Picture:
 def pad(picture: Picture, left: int, width: int) -> Picture:
     """The picture on paper of a given width, `left` pixels from the edge."""
     page = blank(picture.shape[0], width)
-    shown = picture[:, : width - left]
-    page[:, left : left + shown.shape[1]] = shown
+    page[:, left : left + picture.shape[1]] = picture[:, : width - left]
     return page
 
 

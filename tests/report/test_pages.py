@@ -14,7 +14,6 @@ from worldline_core.pages.page import (
     VALUE_WIDTH,
     WIDTH,
     Axis,
-    Dot,
     Line,
     asset,
     duration,
@@ -87,7 +86,7 @@ def test_charts_are_xml_and_hold_every_point(hostile_text: str) -> None:
     root = ElementTree.fromstring(chart)  # noqa: S314  # made two lines above
     assert len(root.findall(".//circle")) == 2  # the value that is not a number is left out
     name = "Stage II, shuffled actions (long-trained)"
-    intervals = interval_chart([Dot(name, 0.1, -0.2, 0.3)], title="t", value_label="v", zero_line=True)
+    intervals = interval_chart([(name, {"mean": 0.1, "low": -0.2, "high": 0.3}, "c0")], title="t", value_label="v")
     dots = ElementTree.fromstring(intervals)  # noqa: S314
     (dot,), (_,) = dots.findall(".//circle"), dots.findall(".//line[@class='whisker']")
     (label,) = (text for text in dots.findall(".//text[@class='row']") if text.text == name)

@@ -157,17 +157,6 @@ class Line:
     markers: bool = False
 
 
-@dataclass(frozen=True)
-class Dot:
-    """One row of an interval chart."""
-
-    label: str
-    value: float
-    low: float
-    high: float
-    colour: str = "c0"
-
-
 def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
     """Round numbers that cover a range."""
     if low == high:
@@ -257,21 +246,12 @@ def _points(item: Line, *, log_x: bool, log_y: bool) -> list[tuple[float, ...]]:
     return [point for point in usable if (point[0] > 0 or not log_x) and (point[1] > 0 or not log_y)]
 
 
-def interval_chart(
-    dots: Sequence[Dot], *, title: str, value_label: str, zero_line: bool = False, digits: int = 3, signed: bool = False
-) -> Markup:
-    """Dots with interval whiskers below their labels, a row each: comparisons with their uncertainty."""
-    values = [v for d in dots for v in (d.value, d.low, d.high)] + [0.0] * zero_line
+def interval_chart(rows: Sequence[tuple[str, dict[str, float], str]], *, title: str, value_label: str) -> Markup:
+    """Differences (label, `{"mean", "low", "high"}`, colour) with their intervals, a row each, beside a line at zero."""
+    values = [0.0, *(found[key] for _, found, _ in rows for key in ("mean", "low", "high"))]
     air = 0.08 * (max(values) - min(values)) or 0.1
     axis = Axis(min(values) - air, max(values) + air, 8, WIDTH - VALUE_WIDTH)
-    rows = [
-        {
-            "dot": dot, "top": 8 + ROW_HEIGHT * i, "at": axis.at(dot.value), "ends": (axis.at(dot.low), axis.at(dot.high)),
-            "shown": number(float(dot.value), digits, signed=signed),
-        }
-        for i, dot in enumerate(dots)
-    ]  # fmt: skip
     return render_macro(
-        "pages/charts.html", "dots", title=title, x_label=value_label, rows=rows, bottom=8 + ROW_HEIGHT * len(dots),
-        width=WIDTH, zero=axis.at(0.0) if zero_line else None, ticks=[(axis.at(v), tick_label(v)) for v in axis.ticks(4)],
+        "pages/charts.html", "dots", title=title, x_label=value_label, rows=rows, at=axis.at, height=ROW_HEIGHT,
+        width=WIDTH, ticks=[(axis.at(v), tick_label(v)) for v in axis.ticks(4)],
     )  # fmt: skip

@@ -25,25 +25,17 @@ from worldline_core.store.atomic import atomic_path, write_bytes_atomic
 
 VARIANTS_FILE = Path(__file__).with_name("ablations.yaml")
 FULL = "full"
-COLUMNS = {
-    "held_out_lpips": "held out: LPIPS ↓",
-    "held_out_robot_iou": "held out: robot IoU ↑",
-    "held_out_object_iou": "held out: object IoU ↑",
-    "held_out_tool_error": "held out: tool error [px] ↓",
-    "ood_lpips": "out of domain: LPIPS ↓",
-    "ood_robot_iou": "out of domain: robot IoU ↑",
-    "success": "planning: success [%] ↑",
-    "gain": "planning: gain [points] ↑",
-}
 VIDEO_COLUMNS = {
-    "held_out_lpips": ("test", "lpips"),
-    "held_out_robot_iou": ("test", "robot_iou"),
-    "held_out_object_iou": ("test", "object_iou_exact"),
-    "held_out_tool_error": ("test", "end_effector_error_px"),
-    "ood_lpips": ("ood_test", "lpips"),
-    "ood_robot_iou": ("ood_test", "robot_iou"),
+    "held_out_lpips": ("held out: LPIPS ↓", "test", "lpips"),
+    "held_out_robot_iou": ("held out: robot IoU ↑", "test", "robot_iou"),
+    "held_out_object_iou": ("held out: object IoU ↑", "test", "object_iou_exact"),
+    "held_out_tool_error": ("held out: tool error [px] ↓", "test", "end_effector_error_px"),
+    "ood_lpips": ("out of domain: LPIPS ↓", "ood_test", "lpips"),
+    "ood_robot_iou": ("out of domain: robot IoU ↑", "ood_test", "robot_iou"),
 }
-"""Splits that stand for the paper's AgiBotWorld (held out) and DROID (out of domain), and their metrics."""
+"""Headings, splits that stand for the paper's AgiBotWorld (held out) and DROID (out of domain), and their metrics."""
+PLANNING_COLUMNS = {"success": "planning: success [%] ↑", "gain": "planning: gain [points] ↑"}
+COLUMNS = {name: heading for name, (heading, *_) in VIDEO_COLUMNS.items()} | PLANNING_COLUMNS
 POLICIES = {"pi05": "π0.5", "lingbot": "LingBot-VLA"}
 
 
@@ -150,14 +142,14 @@ def _read(name: str, method: str, inputs: Mapping[str, Path]) -> _Measured:
         raise ArtifactError(
             "The evaluation has no such method", where=folder, expected=method, got=summary.get("methods")
         )
-    for column, (split, metric) in VIDEO_COLUMNS.items():
+    for column, (_, split, metric) in VIDEO_COLUMNS.items():
         if (found := series.get(f"video/{split}/{method}/{metric}")) is not None:
             values[column] = found
         else:
             none = f"no recordings of the split {split}" if split not in summary["metrics"] else "not measured"
             reasons[column] = summary["unavailable"].get(metric, none)
     if planning is None:
-        return values, reasons | dict.fromkeys(("success", "gain"), "this run plans over no banks")
+        return values, reasons | dict.fromkeys(PLANNING_COLUMNS, "this run plans over no banks")
     planned = read_json(planning / SUMMARY_FILE)
     budgets = planned["methods"][f"banks_{method}"]["budgets"]
     success = budgets[max(budgets, key=int)]["banks"]

@@ -54,11 +54,9 @@ the truth; and for robots that no segmenter knows the distance of the predicted 
 
 
 class ReportConfig(StrictModel):
-    """Options of the step `report`."""
+    """``tile_height``: of one video in a side-by-side video, pixels."""
 
-    tile_height: int = Field(
-        default=256, ge=32, le=1080, description="height of one video in a side-by-side video, pixels"
-    )
+    tile_height: int = Field(256, ge=32, le=1080)
 
 
 class Method(NamedTuple):
@@ -220,16 +218,11 @@ class ReportContext:
         found = read_json(self.inputs[step] / SUMMARY_FILE) if step in self.inputs else {}
         return found if found.get("methods") else None
 
-    @property
-    def rollout_folders(self) -> dict[str, Path]:
-        """Folders of the predicted videos by method."""
-        folders = {name.partition("."): path for name, path in sorted(self.inputs.items())}
-        return {method: path for (step, _, method), path in folders.items() if step == "rollout"}
-
     @cached_property
     def rollouts(self) -> dict[str, RolloutSet]:
         """Predicted videos by method."""
-        return {name: RolloutSet.open(path) for name, path in self.rollout_folders.items()}
+        folders = {name.partition("."): path for name, path in sorted(self.inputs.items())}
+        return {method: RolloutSet.open(path) for (step, _, method), path in folders.items() if step == "rollout"}
 
     @cached_property
     def episodes(self) -> EpisodeSet | None:

@@ -277,24 +277,20 @@ def write_card(folder: Path, output: Path, title: str | None = None) -> list[Pat
             pictures.append((name, output / PICTURES / f"source_{number:02d}.jpg"))
             write_bytes_atomic(pictures[-1][1], jpeg_bytes(contact_sheet(rows, min_width=SHEET_WIDTH)))
     text = render("report/card.md", facts=facts, heading=heading, pictures=pictures, plain=plain, table=markdown_table)
-    card = DatasetCard(f"---\n{hub_metadata(facts, heading).to_yaml()}\n---\n\n{text}\n")
-    write_bytes_atomic(output / "README.md", str(card).encode())
-    return [output / "README.md", *(path for _, path in pictures)]
-
-
-def hub_metadata(facts: DatasetFacts, title: str) -> DatasetCardData:
-    """The header for the hub's dataset pages and searches."""
-    name = re.sub(r"[^a-z0-9.+-]+", "-", " and ".join(facts.licenses).lower()).strip("-") or UNKNOWN
-    known = HUB_LICENSES.fullmatch(name)
+    license_name = re.sub(r"[^a-z0-9.+-]+", "-", " and ".join(facts.licenses).lower()).strip("-") or UNKNOWN
+    known = HUB_LICENSES.fullmatch(license_name)
     datasets = sorted({row.dataset for row in facts.rows if not row.dataset.startswith("..")})
-    return DatasetCardData(
-        pretty_name=title,
-        license=name if known else "other",
-        license_name=None if known else name,
+    header = DatasetCardData(
+        pretty_name=heading,
+        license=license_name if known else "other",
+        license_name=None if known else license_name,
         task_categories=["robotics"],
         tags=["LeRobot", "WorldLine", "robotics", *sorted({row.embodiment for row in facts.rows})],
         configs=[{"config_name": Path(d).name, "data_files": f"{d}/data/*/*.parquet"} for d in datasets] or None,
     )
+    card = DatasetCard(f"---\n{header.to_yaml()}\n---\n\n{text}\n")
+    write_bytes_atomic(output / "README.md", str(card).encode())
+    return [output / "README.md", *(path for _, path in pictures)]
 
 
 def plain(text: str) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from markupsafe import Markup
 
 from worldline_core.evaluation.metric_registry import Metric
 from worldline_core.evaluation.scores import TRUE_METHOD
-from worldline_core.pages.page import NARROW_SPACE, number, percent, render, words
+from worldline_core.pages.page import percent, render, words
 from worldline_core.progress import with_progress
 from worldline_core.report.context import (
     SPLIT_LABELS,
@@ -77,16 +76,13 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
     return {"sections": pages, "missing": missing, "media": len(list((output / "media").glob("*")))}
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """One number of the first page beside a reference.
 
     Attributes:
-        measured: mean, its 95 % interval and the count of `cases` that it rests on.
-        bounds: 95 % interval of the difference to the reference; the verdict is its sign.
+        measured: mean, its 95 % interval and the count of `cases` that it rests on; a share where the unit is %.
+        bounds: 95 % interval of the difference to the reference, positive where the figure is better; the verdict is its sign.
         where: the model and the recordings.
-        shares: shown in per cent.
-        lower_is_better: than the reference; `bounds` are positive where the figure is better all the same.
     """
 
     what: str
@@ -96,36 +92,18 @@ class Figure:
     reference: float
     bounds: tuple[float, float] | None
     where: str
-    shares: bool = False
+    unit: str = "%"
     lower_is_better: bool = False
-    unit: str = ""
-
-    def shown(self, value: float) -> str:
-        """A value of this figure: one digit more where two of them look equal."""
-        mean, reference = self.measured["mean"], self.reference
-        if self.shares:
-            return percent(value)
-        shown = number(value, 2 if number(mean) != number(reference) else 3)
-        return f"{shown}{NARROW_SPACE}{self.unit}" if self.unit else shown
 
     @property
-    def rests_on(self) -> str:
-        low, high = (self.shown(float(self.measured[bound])) for bound in ("low", "high"))
-        return f"95{NARROW_SPACE}%: {low} to {high}, {self.measured['count']} {self.cases}"
+    def gain(self) -> float:
+        return (self.measured["mean"] - self.reference) * (-1 if self.lower_is_better else 1)
 
     @property
     def verdict(self) -> str:
         """`better` or `worse` where the interval of the difference leaves out zero, else `unclear`."""
-        if self.bounds is not None and self.bounds[0] > 0:
-            return "better"
-        return "worse" if self.bounds is not None and self.bounds[1] < 0 else "unclear"
-
-    @property
-    def comparison(self) -> str:
-        gain = (self.measured["mean"] - self.reference) * (-1 if self.lower_is_better else 1)
-        order = "better than" if gain > 0 else "worse than" if gain < 0 else "as"
-        doubt = ", within chance" if self.verdict == "unclear" else ""
-        return f"{order} {self.beside}: {self.shown(self.reference)}{doubt}"
+        low, high = self.bounds or (0, 0)
+        return "better" if low > 0 else "worse" if high < 0 else "unclear"
 
 
 class HeadView(NamedTuple):
@@ -159,7 +137,7 @@ class HeadView(NamedTuple):
         where = f"{method.long_label}; {SPLIT_LABELS[self.group]}, head view"
         return Figure(
             what, mean, "recordings", "copying the first frame", reference["mean"], self.difference(copy, method), where,
-            lower_is_better=self.metric.lower_is_better, unit=self.metric.unit,
+            self.metric.unit, self.metric.lower_is_better,
         )  # fmt: skip
 
 
@@ -218,7 +196,7 @@ def planning_figure(context: ReportContext) -> Figure | None:
     beside = f"the best rule without video ({words(over['shortcut'])})"
     ceiling = summary["methods"].get(TRUE_METHOD)
     where = order[0].long_label + by_recorded_videos(ceiling and most_candidates(ceiling)["success"])
-    return Figure(what, measured, "banks", beside, reference, (bounds["low"], bounds["high"]), where, shares=True)
+    return Figure(what, measured, "banks", beside, reference, (bounds["low"], bounds["high"]), where)
 
 
 def policy_figure(context: ReportContext) -> Figure | None:
@@ -232,7 +210,7 @@ def policy_figure(context: ReportContext) -> Figure | None:
     found, what = accuracy[first.name], "of outcomes judged from predicted videos are right"
     bounds = found["low"] - 0.5, found["high"] - 0.5
     where = first.long_label + by_recorded_videos(accuracy.get(TRUE_METHOD))
-    return Figure(what, found, "recordings", "guessing", 0.5, bounds, where, shares=True)
+    return Figure(what, found, "recordings", "guessing", 0.5, bounds, where)
 
 
 def by_recorded_videos(measured: JsonObject | None) -> str:
@@ -241,28 +219,19 @@ def by_recorded_videos(measured: JsonObject | None) -> str:
 
 
 def headline(context: ReportContext, view: HeadView | None, controls: Figure | None, planning: Figure | None) -> str:
-    """The result in one short sentence; its numbers are on the cards below."""
-    clauses: list[tuple[bool, str]] = []
+    """The result in one or two short sentences; its numbers are on the cards below."""
+    clauses: list[str] = []
     if view is not None and controls is not None:
         shuffled = view.difference(view.method(f"{view.primary.kind}_shuffled", view.primary.group))
-        follows = shuffled is None or shuffled[0] > 0
-        if controls.verdict != "better":
-            clauses.append((False, "does not yet beat a copy of the first frame"))
-        else:
-            clauses.append((follows, "follows the controls" if follows else "does not yet follow the controls"))
+        follows = "follows the controls" if shuffled is None or shuffled[0] > 0 else "does not yet follow the controls"
+        clauses.append(follows if controls.verdict == "better" else "does not yet beat a copy of the first frame")
     if planning is not None:
-        clause = {
-            "better": "plans better than any rule that sees no video",
-            "worse": "plans worse than a rule that sees no video",
-            "unclear": f"does not clearly plan better than a rule that sees no video on {planning.measured['count']} banks",
-        }[planning.verdict]
-        clauses.append((planning.verdict == "better", clause))
+        unclear = f"does not clearly plan better than a rule that sees no video on {planning.measured['count']} banks"
+        better, worse = "plans better than any rule that sees no video", "plans worse than a rule that sees no video"
+        clauses.append({"better": better, "worse": worse, "unclear": unclear}[planning.verdict])
     if not clauses:
         facts = dataset_facts(context)
         kept = f"{facts.num_episodes} of {facts.num_found} episodes were kept; no prediction" if facts else "Nothing"
         return f"{kept} was measured yet."
     subject = "The shipped simulator" if view is None or view.primary.group == "shipped" else "This run's simulator"
-    if len(clauses) == 1:
-        return f"{subject} {clauses[0][1]}."
-    (good, first), (also, second) = clauses
-    return f"{subject} {first} {'and' if good == also else 'but'} {second}."
+    return f"{subject} {'. It '.join(clauses)}."

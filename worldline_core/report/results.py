@@ -18,7 +18,7 @@ from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, metri
 from worldline_core.evaluation.paired import EVALUATIONS
 from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.model.model_card import DESCRIPTIONS, Measurement, model_card, model_facts
-from worldline_core.pages.page import Dot, Line, Table, interval, interval_chart, line_chart, render, words
+from worldline_core.pages.page import Line, Table, interval, interval_chart, line_chart, render, words
 from worldline_core.report.context import (
     SPLIT_LABELS,
     ReportContext,
@@ -58,21 +58,21 @@ def quality_section(context: ReportContext) -> Section:
     scores = context.video_scores
     if not scores.groups:
         return Section("quality", "Video quality", missing="no video evaluation was given (input evaluate_video).")
-    names = {name for group in scores.groups for found in scores.metrics[group].values() for name in found}
+    names = {name for methods in scores.metrics.values() for found in methods.values() for name in found}
     measured = {metric.name for metric in map(metric_of, names) if metric}
     return context.section(
         "quality",
         "Video quality",
         QUALITY,
+        asked=[METRICS[name] for name in ON_REQUEST if name in measured],
         instruments=[(s["description"], instrument_accuracy(scores, s)) for s in scores.summary["segmenters"]],
         unavailable=sorted(scores.summary["unavailable"].items()),
-        asked=[METRICS[name] for name in ON_REQUEST if name in measured],
         groups=[
-            {
-                "title": SPLIT_LABELS[group].capitalize(),
-                "tables": [table for view in VIEWS for table in metric_tables(scores, group, view)],
-                "charts": quality_charts(scores, group),
-            }
+            (
+                SPLIT_LABELS[group].capitalize(),
+                [table for view in VIEWS for table in metric_tables(scores, group, view)],
+                quality_charts(scores, group),
+            )
             for group in scores.groups
         ],
         cost=cost(context),
@@ -118,10 +118,10 @@ def quality_charts(scores: VideoScores, group: str) -> list[Markup]:
         return []
     differences, drifts = list[Markup](), list[Markup]()
     for metric in filter(None, (scores.headline(group, primary.name), METRICS["ssim"])):
-        dots, series = list[Dot](), list[Line]()
+        dots, series = list[tuple[str, JsonObject, str]](), list[Line]()
         for m in scores.methods(group):
             if found := scores.difference(group, primary.name, m.name, f"{metric.name}@head"):
-                dots.append(Dot(m.long_label, found["mean"], found["low"], found["high"], m.colour))
+                dots.append((m.long_label, found, m.colour))
             key = m.name, group, "head", metric.name
             rows = [row for row in scores.by_frame if (row["method"], row["split"], row["view"], row["metric"]) == key]
             if points := sorted((row["frame"], row["mean"]) for row in rows):
@@ -130,7 +130,7 @@ def quality_charts(scores: VideoScores, group: str) -> list[Markup]:
             title = f"{primary.long_label} minus each other: {metric.title}"
             side = "left" if metric.lower_is_better else "right"
             value_label = f"paired difference, 95 % interval; {side} of zero, {primary.label} is better"
-            differences.append(interval_chart(dots, title=title, value_label=value_label, zero_line=True, signed=True))
+            differences.append(interval_chart(dots, title=title, value_label=value_label))
         if series:
             title = f"{metric.title} along the prediction"
             drifts.append(line_chart(series, title=title, x_label="frame (0 is given)", y_label=metric.title))
@@ -151,7 +151,7 @@ def block_costs(content: JsonObject) -> tuple[float, float] | None:
 
 def cost(context: ReportContext) -> Markup | None:
     """Time per frame and per block; a slot, because times differ from run to run."""
-    timed = {name: read_json(path / "run" / "speed.json") for name, path in context.rollout_folders.items()}
+    timed = {name: read_json(rollout.root / "run" / "speed.json") for name, rollout in context.rollouts.items()}
     timed = {name: content for name, content in timed.items() if content.get("seconds_per_frame") is not None}
     rows = [(method(name), name.startswith("banks_"), content, block_costs(content)) for name, content in timed.items()]
     devices = sorted({str(content.get("device_name") or "unknown device") for content in timed.values()})
@@ -182,10 +182,6 @@ def policy_evaluation(summary: JsonObject) -> dict[str, object]:
         for m in methods
     }
     groups = {group for own in accuracy.values() for group in own}
-    means = [(m, accuracy[m.name][ALL]) for m in methods]
-    dots = [Dot(m.long_label, found["mean"], found["low"], found["high"], m.colour) for m, found in means]
-    title = f"Accuracy over {summary['trajectories']} trajectories (judge: {summary['judge']})"
-    value_label = "agreement with the recorded outcome, 95 % interval"
     return {
         "summary": summary,
         "methods": methods,
@@ -194,7 +190,6 @@ def policy_evaluation(summary: JsonObject) -> dict[str, object]:
             group: words(SPLIT_LABELS.get(group, group)).capitalize()
             for group in sorted(groups, key=lambda g: (g != ALL, g not in SPLIT_LABELS, g))
         },
-        "chart": interval_chart(dots, digits=2, value_label=value_label, title=title),
         "ranked": in_order(summary.get("policies", ())),
         "trusted": predicting(summary.get("trust", {}).get("methods", ())),
     }

@@ -6,7 +6,6 @@ Episodes are never picked by hand: shown are the best, the median and the worst 
 from __future__ import annotations
 
 import os
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -24,6 +23,7 @@ from worldline_core.pages.page import words
 from worldline_core.pictures import (
     Picture,
     SheetRow,
+    WrittenVideo,
     draw_tag,
     evenly_spaced,
     side_by_side,
@@ -85,43 +85,26 @@ def choose_episodes(scores: VideoScores, available: Sequence[str]) -> list[Chose
 
 def chosen_episodes(context: ReportContext) -> list[ChosenEpisode]:
     """The episodes shown in video; the first is the median of the held-out ones."""
-    known = {row.episode_id for row in context.episodes.rows} if context.episodes else set()
+    if context.episodes is None or not context.rollouts:
+        return []
     predicted = {name for rollout in context.rollouts.values() for name in rollout.episode_ids}
-    return choose_episodes(context.video_scores, sorted(predicted & known))
+    known = predicted & {row.episode_id for row in context.episodes.rows}
+    return choose_episodes(context.video_scores, sorted(known))
 
 
 def videos_section(context: ReportContext) -> Section:
     """A card for each chosen episode."""
-    if not context.rollout_folders:
-        return Section("videos", TITLE, missing="no RolloutSet was given (inputs rollout.<method>).")
-    if context.episodes is None:
-        return Section("videos", TITLE, missing="the recorded episodes were not given (inputs filter or curate).")
-    chosen = chosen_episodes(context)
-    if not chosen:
-        return Section("videos", TITLE, missing="no RolloutSet holds an episode of the given EpisodeSet.")
+    episodes, chosen = context.episodes, chosen_episodes(context)
+    if episodes is None or not chosen:
+        missing = "no prediction of a given episode was given (inputs rollout.<method>, and filter or curate)."
+        return Section("videos", TITLE, missing=missing)
     lead = "Every column starts from the same first frame; from there on a model sees only the controls."
     if any(item.score is not None for item in chosen):
         lead += (
             " The episodes are not chosen by hand: they are the median, the best and the worst by the first model's prediction of"
             " the robot."
         )
-    cards = [card(context, context.episodes, item, number) for number, item in enumerate(chosen)]
-    return context.section("videos", TITLE, lead, cards=cards)
-
-
-def card(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, number: int) -> dict[str, Any]:
-    """One episode: its description, its videos by view, and the recordings beside it."""
-    row = episodes.rows[episodes.position(item.episode_id)]
-    wanted = [(view, group) for view in VIEWS if view in row.views for group in GROUP_CAPTIONS]
-    # The report runs last and alone; encoder and resizing let go of the interpreter, so threads use the other cores.
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        videos = list(pool.map(lambda place: video(context, episodes, item, place[0], place[1], number), wanted))
-    panels: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for (view, _), found in zip(wanted, videos, strict=True):
-        if found is not None:
-            panels[view].append(found)
-    tone = {"success": "good", "failure": "bad"}.get(row.outcome, "")
-    return {"item": item, "row": row, "number": number, "panels": list(panels.items()), "tone": tone}
+    return context.section("videos", TITLE, lead, cards=[card(context, episodes, *item) for item in enumerate(chosen)])
 
 
 def methods_of_group(context: ReportContext, episode_id: str, group: str) -> list[Method]:
@@ -131,29 +114,36 @@ def methods_of_group(context: ReportContext, episode_id: str, group: str) -> lis
     return [*own, *[m for m in methods if m.group == "baseline"]][: MOST_COLUMNS - 1] if own else []
 
 
-def video(
-    context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, view: str, group: str, number: int
-) -> dict[str, Any] | None:
-    """Truth and one group's predictions of one view, with a caption; None when the group has none."""
-    name = item.episode_id
-    methods = [m for m in methods_of_group(context, name, group) if view in context.rollouts[m.name].views(name)]
-    if not methods:
-        return None
-    index = episodes.position(name)
-    columns = {"true": VideoFrames(episodes.clip(index, view))}
-    columns |= {method.label: VideoFrames(context.rollouts[method.name].clip(name, view)) for method in methods}
-    path = context.media / f"episode{number}_{group}_{view}.mp4"
-    size = {"tile_height": context.config.tile_height, "most": IN_A_LINE}
-    made = write_side_by_side(path, columns, episodes.rows[index].fps, **size)
-    return {"video": made, "caption": f"{GROUP_CAPTIONS[group]} ({words(view)} view, {made.num_frames} frames)."}
+def card(context: ReportContext, episodes: EpisodeSet, number: int, item: ChosenEpisode) -> dict[str, Any]:
+    """One episode: its description, and by view the truth beside each group's predictions."""
+    name, position = item.episode_id, episodes.position(item.episode_id)
+    row = episodes.rows[position]
+
+    def panel(view: str) -> tuple[str, list[tuple[WrittenVideo, str]]]:
+        written: list[tuple[WrittenVideo, str]] = []
+        for group, caption in GROUP_CAPTIONS.items():
+            shown = [(m.label, context.rollouts[m.name]) for m in methods_of_group(context, name, group)]
+            columns = {
+                label: VideoFrames(videos.clip(name, view)) for label, videos in shown if view in videos.views(name)
+            }
+            if columns:
+                columns = {"true": VideoFrames(episodes.clip(position, view)), **columns}
+                path, height = context.media / f"episode{number}_{group}_{view}.mp4", context.config.tile_height
+                made = write_side_by_side(path, columns, row.fps, tile_height=height, most=IN_A_LINE)
+                written.append((made, f"{caption} ({words(view)} view, {made.num_frames} frames)."))
+        return view, written
+
+    # The report runs last and alone; encoder and resizing let go of the interpreter, so threads use the other cores.
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        panels = [found for found in pool.map(panel, [view for view in VIEWS if view in row.views]) if found[1]]
+    return {"item": item, "row": row, "number": number, "panels": panels}
 
 
 def overview_video(context: ReportContext) -> dict[str, Any] | None:
     """Truth beside the first model's prediction, one row per view, of the first chosen episode; None without one."""
-    episodes = context.episodes
-    chosen = chosen_episodes(context) if episodes else []
+    episodes, chosen = context.episodes, chosen_episodes(context)[:1]
     methods = [
-        m for item in chosen[:1] for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)
+        m for item in chosen for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)
     ]
     if episodes is None or not methods:
         return None
