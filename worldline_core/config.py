@@ -81,7 +81,7 @@ def _count(node: yaml.Node, known: dict[int, int]) -> int:
     return known[id(node)]
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=128)  # more than there are robots: a dataset is compared with all of them
 def _parsed(text: str, name: str) -> Any:
     loader = _StrictLoader(text)  # derives from SafeLoader: no object construction
     loader.name = name

@@ -9,7 +9,7 @@ import numpy as np
 
 from worldline_core.discovery.columns import ArmColumns, plain, words_of
 from worldline_core.discovery.findings import named
-from worldline_core.geometry.embodiment import Arm, Embodiment, embodiment_names, load_embodiment
+from worldline_core.geometry.embodiment import Arm, Embodiment, embodiment_files, load_embodiment
 
 LEROBOT_ARMS = ("so100", "so101", "so", "koch", "omx", "lekiwi")
 """Arms of LeRobot's own motors, which it records in degrees or as -100..100; grippers are 0 closed .. 100 open."""
@@ -53,8 +53,8 @@ def match_robot(
     fitting: list[tuple[float, Match]] = []
     considered = 0
     stranger = any(name in "".join(words_of(robot_type)) for name in STRANGERS)
-    for name in embodiment_names():
-        robot = load_embodiment(name)
+    for name, path in sorted(embodiment_files().items()):
+        robot = load_embodiment(path)
         if [len(arm.joints) for arm in robot.arms] != [len(arm.joints) for arm in arms]:
             continue
         considered += 1
