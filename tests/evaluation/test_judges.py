@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from transformers import LogitsProcessor, LogitsProcessorList
 
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError, UnavailableError
@@ -322,11 +321,11 @@ class Calls:
         if self.answer is not None:
             tokens = [*self.tokenizer(self.answer)["input_ids"], self.tokenizer.eos_token_id]
             leading = [Leading(tokens, inputs["input_ids"].shape[1])]
-        self.outputs.append(self.inner(**inputs, logits_processor=LogitsProcessorList(leading)))
+        self.outputs.append(self.inner(**inputs, logits_processor=leading))
         return self.outputs[-1]
 
 
-class Leading(LogitsProcessor):
+class Leading:
     """Makes the model say given tokens, then end: what weights would have to be trained for."""
 
     def __init__(self, tokens, prompt):

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
-from diffusers.pipelines.cosmos.pipeline_cosmos3_omni import get_3d_mrope_ids_text_tokens, get_3d_mrope_ids_vae_tokens
 from torch.profiler import ProfilerActivity, profile
 
 from tests.model.test_checkpoint import most_bytes
@@ -40,9 +38,16 @@ KINDS = {
 }  # fmt: skip
 
 
+def transformer_class():
+    """Diffusers' network, whose import takes seconds: only where a test runs it."""
+    from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
+
+    return Cosmos3OmniTransformer
+
+
 def random_transformer(kind, seed=3):
     torch.manual_seed(seed)
-    model = Cosmos3OmniTransformer(**SHAPE | KINDS[kind])
+    model = transformer_class()(**SHAPE | KINDS[kind])
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.normal_(0.0, 0.25)
@@ -56,11 +61,13 @@ def diffusers_model():
 
 def reference_velocity(model, latents, sigma, text_ids, fps):
     """Velocity through diffusers' own packing functions, first frame clean."""
+    from diffusers.pipelines.cosmos import pipeline_cosmos3_omni as omni
+
     _, _, frames, height, width = latents.shape
     rows, columns = height // 2, width // 2
     count, size = len(text_ids), frames * rows * columns
-    text, offset = get_3d_mrope_ids_text_tokens(count, 0)
-    video, _ = get_3d_mrope_ids_vae_tokens(frames, rows, columns, offset + 15000, fps=fps)
+    text, offset = omni.get_3d_mrope_ids_text_tokens(count, 0)
+    video, _ = omni.get_3d_mrope_ids_vae_tokens(frames, rows, columns, offset + 15000, fps=fps)
     noisy = torch.arange(1, frames)
     noisy_tokens = torch.arange(count + rows * columns, count + size)
     return model(
@@ -113,7 +120,7 @@ def test_diffusers_weights_give_the_same_velocity_and_gradients(kind, seed, tmp_
 def test_the_import_holds_one_file_of_the_result(tmp_path):
     """No model in float32 beside the weights, and the same bytes whatever was drawn before."""
     shape = SHAPE | {"hidden_size": 256, "intermediate_size": 1024, "num_hidden_layers": 6}
-    pretrained = Cosmos3OmniTransformer(**shape).to(torch.bfloat16)
+    pretrained = transformer_class()(**shape).to(torch.bfloat16)
     pretrained.save_pretrained(tmp_path / "pretrained")
     config, inputs = ImportBackboneConfig(dtype="bfloat16"), {"diffusers": tmp_path / "pretrained"}
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
@@ -145,7 +152,7 @@ def test_a_trained_checkpoint_goes_back_to_diffusers(kind, towers, tmp_path):
     save = partial(save_checkpoint, model=model, action_contract=None, dtype=torch.float32)
     save(tmp_path / "trained", kind="stage1")
     output = write_cosmos3(tmp_path / "trained", tmp_path / "published", tmp_path / "back")
-    theirs = Cosmos3OmniTransformer.from_pretrained(output / "transformer").eval()
+    theirs = transformer_class().from_pretrained(output / "transformer").eval()
     untouched = ["lm_head.weight", *(["embed_tokens.weight"] if towers == "generation" else [])]
     assert all(torch.equal(theirs.get_parameter(name), pretrained.get_parameter(name)) for name in untouched)
     moved = "layers.1.mlp_moe_gen.up_proj.weight"
@@ -257,7 +264,7 @@ PUBLISHED_EDGE = {
     [("nano", {}, (6.9e9, 7.1e9), (14.5e9, 14.6e9)), ("edge", PUBLISHED_EDGE, (1.41e9, 1.42e9), (3.0e9, 3.1e9))],
 )
 def test_the_published_config_is_the_full_size(size, published, generation, both):
-    parameters = inspect.signature(Cosmos3OmniTransformer.__init__).parameters.values()
+    parameters = inspect.signature(transformer_class().__init__).parameters.values()
     defaults = {parameter.name: parameter.default for parameter in parameters if parameter.name != "self"}
     config = config_from_diffusers(defaults | published, where="published", expected=size)
     assert config == cosmos3_config(size)

@@ -5,7 +5,6 @@ import shutil
 
 import pytest
 import torch
-from peft import PeftConfig, inject_adapter_in_model, set_peft_model_state_dict
 from safetensors.torch import load_file
 
 from tests.training.conftest import stage1, stage2, trainer
@@ -69,6 +68,8 @@ def test_attention_and_feed_forward_of_every_network_are_adapted(make_model, net
 
 
 def test_peft_reads_the_adapter(inputs, trained):
+    from peft import PeftConfig, inject_adapter_in_model, set_peft_model_state_dict  # seconds, of this test alone
+
     model = load_checkpoint(inputs["stage1"], towers="generation")[0]
     inject_adapter_in_model(PeftConfig.from_pretrained(trained / "adapter"), model)
     read = set_peft_model_state_dict(model, load_file(trained / "adapter" / "adapter_model.safetensors"))

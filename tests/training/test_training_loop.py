@@ -15,7 +15,6 @@ from pydantic import ValidationError
 from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
-from torchao.optim.subclass_8bit import OptimState8bit
 
 from worldline_core.errors import ArtifactError, ConfigError, StoppedError, TrainingError
 from worldline_core.store.store import ArtifactStore
@@ -154,6 +153,8 @@ def test_forms_that_save_memory_take_small_steps_and_go_on_with_the_same_bytes(t
 
 @pytest.mark.parametrize("signed", [True, False])
 def test_moments_are_rounded_to_the_nearest_as_torchao_does(signed):
+    from torchao.optim.subclass_8bit import OptimState8bit  # seconds, of this test alone
+
     parameter = nn.Parameter(torch.zeros(64, 256))
     config = TrainerConfig.model_validate({"steps": 1, "optimizer": {"moments": "8bit"}})
     found = make_optimizer(config, [[parameter]])._new_buffer(parameter, signed)
