@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
+from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -72,19 +74,37 @@ def write_video(
     tick: Fraction | None = None,
     pixel_format: str = "yuv420p",
 ) -> Path:
-    """As another program would; `times` in ticks, by default one tick a frame."""
+    """As another program would; `times` in ticks, by default one tick a frame. The same pictures are encoded once."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w", format="mp4") as out:
-        stream: Any = out.add_stream(codec, rate=rate, options=options or {})
-        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixel_format
-        stream.codec_context.thread_count = 1
-        stream.codec_context.time_base = tick or Fraction(1, rate)
-        for time, image in zip(times or range(len(frames)), frames, strict=True):
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            frame.pts, frame.time_base = time, stream.codec_context.time_base
-            out.mux(stream.encode(frame))
-        out.mux(stream.encode(None))
+    ticks, chosen = tuple(times or range(len(frames))), tuple((options or {}).items())
+    given = (frames.tobytes(), frames.shape, rate, codec, chosen, ticks, tick or Fraction(1, rate), pixel_format)
+    path.write_bytes(_encoded(*given))
     return path
+
+
+@lru_cache(maxsize=64)
+def _encoded(
+    pictures: bytes,
+    shape: tuple[int, ...],
+    rate: int,
+    codec: str,
+    options: tuple[tuple[str, str], ...],
+    times: tuple[int, ...],
+    tick: Fraction,
+    pixel_format: str,
+) -> bytes:
+    with BytesIO() as file:
+        with av.open(file, "w", format="mp4") as out:
+            stream: Any = out.add_stream(codec, rate=rate, options=dict(options))
+            stream.height, stream.width, stream.pix_fmt = *shape[1:3], pixel_format
+            stream.codec_context.thread_count = 1
+            stream.codec_context.time_base = tick
+            for time, image in zip(times, np.frombuffer(pictures, np.uint8).reshape(shape), strict=True):
+                frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+                frame.pts, frame.time_base = time, tick
+                out.mux(stream.encode(frame))
+            out.mux(stream.encode(None))
+        return file.getvalue()
 
 
 Damage = Callable[[Path], object]

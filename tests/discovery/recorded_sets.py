@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+
+from tests.data import curating
 
 HEIGHT, WIDTH = 48, 64
 SO_JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
@@ -40,17 +40,8 @@ def pictures(states: np.ndarray, kind: str, seed: int = 0) -> np.ndarray:
     return frames
 
 
-def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rate = Fraction(fps).limit_denominator(1000)
-    with av.open(str(path), "w", format="mp4") as out:
-        stream = out.add_stream("libx264", rate=rate, options={"crf": "18", "g": "8"})
-        stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], "yuv420p"
-        for n, image in enumerate(frames):
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            frame.pts, frame.time_base = n, 1 / rate
-            out.mux(stream.encode(frame))
-        out.mux(stream.encode(None))
+def write_video(path: Path, frames: np.ndarray, fps: int) -> None:
+    curating.write_video(path, frames, rate=fps, options={"crf": "18", "g": "8"})
 
 
 def write_lerobot(
