@@ -178,17 +178,19 @@ BAD_ANSWERS = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_ANSWERS)
-def test_a_bad_answer_puts_its_episode_into_quarantine(name, server, inputs, tmp_path):
-    spoil, message = BAD_ANSWERS[name]
-    answers = iter([False, True, False, False])
-    server.spoil = lambda answer: spoil(answer) if next(answers) else (200, answer)
-    done = run(server, inputs, tmp_path)
-    assert (done["episodes"], done["left_out"]) == (3, {"simulator_failed": 1})
-    assert RolloutSet.open(tmp_path).episode_ids == ["a", "c", "long"]
-    ((reason, detail),) = quarantine(tmp_path).values()
-    assert reason == "simulator_failed"
-    assert re.search(message, detail), detail
+def test_a_bad_answer_puts_its_episode_into_quarantine(server, tmp_path):
+    """Every second episode gets a good one: three bad ones in a row would end the step."""
+    names = [name for bad in sorted(BAD_ANSWERS) for name in (bad, f"{bad} good")]  # in the order of their names
+    made = write_recordings(tmp_path, [(name, "test", 9, VIEWS, VIEWS) for name in names], 16)
+    answers = iter([BAD_ANSWERS.get(name) for name in names])
+    server.spoil = lambda answer: bad[0](answer) if (bad := next(answers)) else (200, answer)
+    done = run(server, {**made, "tokenizer": tmp_path}, tmp_path / "out")
+    assert (done["episodes"], done["left_out"]) == (len(BAD_ANSWERS), {"simulator_failed": len(BAD_ANSWERS)})
+    found = quarantine(tmp_path / "out")
+    assert found.keys() == BAD_ANSWERS.keys()
+    for name, (_, message) in BAD_ANSWERS.items():
+        assert found[name][0] == "simulator_failed"
+        assert re.search(message, found[name][1]), found[name]
 
 
 def test_a_server_out_of_order_ends_the_step_and_what_is_finished_is_kept(server, inputs, tmp_path):

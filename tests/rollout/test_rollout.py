@@ -151,7 +151,7 @@ def test_copying_needs_no_checkpoint_and_repeats_the_first_frame(inputs, tmp_pat
 @pytest.mark.parametrize("kind", ["copy_first_frame", "text_to_video", "stage1", "film"])
 def test_what_no_camera_is_needed_for_is_predicted_without_tracks(inputs, tmp_path, kind):
     """Recordings without cameras have no action tracks."""
-    made = write_recordings(tmp_path, [("a", "test", N, VIEWS, ()), ("b", "test", N, VIEWS, ())])
+    made = write_recordings(tmp_path, [("a", "test", 9, VIEWS, ()), ("b", "test", 9, VIEWS, ())])
     given = {"episodes": made["episodes"], "tokenizer": inputs["tokenizer"]}
     sampler = {"kind": "full_clip" if kind == "film" else "text_to_video", "steps": 1}
     if kind == "copy_first_frame":

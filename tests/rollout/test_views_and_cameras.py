@@ -312,7 +312,8 @@ def test_what_cannot_be_driven_is_named(inputs, tmp_path):
 
 
 def test_a_rollout_takes_maps_where_there_are_cameras_and_vectors_elsewhere(inputs, tmp_path):
-    episodes = [("all", "test", N, VIEWS, VIEWS), ("some", "test", N, VIEWS, ("head",)), ("none", "test", N, VIEWS, ())]
+    sets = {"all": VIEWS, "some": ("head",), "none": ()}
+    episodes = [(name, "test", 17, VIEWS, calibrated) for name, calibrated in sets.items()]
     made = inputs | write_recordings(tmp_path, episodes)
     either = made | {"checkpoint": inputs["checkpoint"].parent / "either_causal"}
     config = RolloutConfig.model_validate({"num_frames": 17, "bfloat16": False})
@@ -343,10 +344,9 @@ def test_a_rollout_takes_maps_where_there_are_cameras_and_vectors_elsewhere(inpu
     assert {row.reason for row in read_quarantine(tmp_path / "stranger")} >= {"unknown_embodiment"}
 
 
-@pytest.mark.parametrize("cameras", [(), ("head",)])
-def test_an_environment_a_server_and_the_page_drive_a_robot_without_cameras(inputs, tmp_path, cameras):
+def test_an_environment_a_server_and_the_page_drive_a_robot_without_cameras(inputs, tmp_path):
     world = world_of(inputs, "either_causal")
-    made = write_recordings(tmp_path, [("a", "test", N, VIEWS, cameras)])
+    made = write_recordings(tmp_path, [("a", "test", N, VIEWS, ("head",))])
     environment = WorldLineEnv(model=world, recordings=made["episodes"], success=None, episode_frames=16)
     first, _ = environment.reset(seed=0)
     for _ in range(16):
@@ -382,7 +382,7 @@ def test_an_environment_a_server_and_the_page_drive_a_robot_without_cameras(inpu
     *_, saved, error = [message for message in told if message["type"] in ("saved", "error")]
     assert "view without a camera" in error["what"]
     episode = EpisodeSet.open(Path(saved["path"])).episode(0)
-    assert (episode.num_frames, set(episode.cameras)) == (17, set(cameras))
+    assert (episode.num_frames, set(episode.cameras)) == (17, {"head"})
     host.shut_down()
 
 
@@ -402,7 +402,7 @@ def test_an_observation_as_files_may_lack_cameras(tmp_path):
     [("no_calibration", {"a", "b"}), ("invalid_controls", {"a"}), ("missing_actions", {"a"}), (None, {"a", "b"})],
 )
 def test_what_was_refused_for_its_controls_is_no_vector_either(tmp_path, reason, known):
-    made = write_recordings(tmp_path, [("a", "test", N, VIEWS, VIEWS), ("b", "test", N, VIEWS, ())])
+    made = write_recordings(tmp_path, [("a", "test", 5, VIEWS, VIEWS), ("b", "test", 5, VIEWS, ())])
     rows = [row for row in ActionTracks.open(made["tracks"]).rows if row["episode_id"] == "a"]
     write_index(made["tracks"], rows, sigma_px_ref=40.0)
     write_quarantine(made["tracks"], [QuarantineRow("b", "synthetic", reason, "", "{}")] if reason else [])
