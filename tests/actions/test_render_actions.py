@@ -154,11 +154,13 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("file", ["cameras.parquet", "file-000.parquet"])
-@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
-def test_damaged_data_is_no_verdict_on_an_episode(linked, tmp_path, damage, file):
+@pytest.mark.parametrize(
+    ("kind", "file"),
+    [*((kind, "cameras.parquet") for kind in DAMAGE), ("gone", "file-000.parquet"), ("cut", "file-000.parquet")],
+)
+def test_damaged_data_is_no_verdict_on_an_episode(linked, tmp_path, kind, file):
     filtered, curated = linked
-    damage(next(path for path in sorted(curated.rglob(file)) if "episodes" not in path.parts))
+    DAMAGE[kind](next(path for path in sorted(curated.rglob(file)) if "episodes" not in path.parts))
     with pytest.raises(ArtifactError, match="An input of this step is missing or damaged"):
         render_actions_task.run(ArtifactStore(tmp_path / "store", "off"), CONFIG, {"episodes": filtered})
     assert not list((tmp_path / "store" / "render_actions").glob("*/manifest.json"))

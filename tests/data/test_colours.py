@@ -90,6 +90,7 @@ class Made:
 CASES = [
     Made(codec, matrix, full, mark=12 * number)
     for number, (codec, matrix, full) in enumerate(itertools.product(CODECS, LUMA, (False, True)))
+    if codec == "h264" or (matrix == "bt2020") == full
 ]
 
 
@@ -146,7 +147,8 @@ def test_colours_stay_through_curation_and_export(tmp_path: Path, made: dict[Pat
     for number, case in enumerate(CASES):
         for episodes in (curated, exported):
             assert off(episodes.frames(number, "head")) <= TOLERANCE, case
-        shown = by_ffmpeg(Path(str(curated.clip(number, "head").path)))
+        # Without another size the packets are those that the test above shows to ffmpeg.
+        shown = by_ffmpeg(Path(str(curated.clip(number, "head").path))) if image_size else None
         assert shown is None or off(shown) <= TOLERANCE, case
 
 

@@ -281,9 +281,7 @@ def test_byte_order_marks_numbers_with_a_fraction_of_zero_and_version_2_0(tmp_pa
     assert curated.episode(0).conventions["layout"] == "lerobot v2.0"
 
 
-@pytest.mark.parametrize(
-    "line", ["null", "[]", "7", "{}", '"x"', '{"episode_index": true}', '{"episode_index": 1e400}']
-)
+@pytest.mark.parametrize("line", ["null", '{"episode_index": true}', '{"episode_index": 1e400}'])
 def test_a_line_that_is_no_episode_is_one_message(tmp_path: Path, line: str) -> None:
     """Arrow's reader of JSON crashes on some of them."""
     write_robocoin(tmp_path / "raw", episodes=2)
@@ -295,7 +293,7 @@ def test_a_line_that_is_no_episode_is_one_message(tmp_path: Path, line: str) -> 
 
 @pytest.mark.parametrize(
     "tasks",
-    [*([index] * FRAMES for index in (7.0, -1.0, float("nan"), None, 1e300, 0.5)), [0] * (FRAMES - 1) + [2]],
+    [*([index] * FRAMES for index in (-1.0, float("nan"), None, 0.5)), [0] * (FRAMES - 1) + [2]],
 )
 def test_a_task_that_is_not_listed_costs_its_episode(tmp_path: Path, tasks: list[Any]) -> None:
     write_droid(tmp_path / "raw")

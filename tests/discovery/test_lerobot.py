@@ -57,7 +57,7 @@ def test_an_so101_runs_as_it_was_recorded(tmp_path: Path, version: str) -> None:
     assert found.views == ["head", "right_wrist"]
     config = PipelineConfig.load(None, path)
     assert (config.render_actions, config.train_stage2.native_size) == (None, 6)
-    if version == "v2.0":  # but for its name as v2.1
+    if version != "v3.0":
         return
     counts, curated = run(path, tmp_path)
     assert (counts["found"], counts["kept"]) == (4, 4)

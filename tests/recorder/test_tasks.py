@@ -70,7 +70,7 @@ def test_every_task_succeeds_in_about_half_of_the_draws_and_fails_in_several_way
 def test_bodies_reach_their_workspace(name: str) -> None:
     recorder = EpisodeRecorder(name)
     tasks = [task for task in TASKS if task != "carry" or len(BODIES[name].arms) == 2]
-    for number in range(15):
+    for number in range(10):
         random = np.random.default_rng([3, number])
         assert recorder.move(layout_of(recorder, tasks[number % len(tasks)], random), random, 33) is not None
 
@@ -154,16 +154,18 @@ def moved(contact: EpisodeRecorder, family: str, seed: int, policy: ScriptedPoli
 
 @pytest.mark.parametrize("family", CONTACT)
 def test_who_looks_succeeds_and_who_does_not_fails_at_times(contact: EpisodeRecorder, family: str) -> None:
-    good = [moved(contact, family, seed, ScriptedPolicy()) for seed in range(3)]
-    assert [(motion.outcome, motion.failure) for motion in good] == [("success", "")] * 3
+    good = moved(contact, family, 0, ScriptedPolicy())
+    assert (good.outcome, good.failure) == ("success", "")
     if contact.scene.robot.name != "ur5e_silver":
         return
     # Who does not fails at times; and physics repeats itself.
-    careless = [moved(contact, family, seed, None) for seed in range(12)]
-    assert {motion.outcome for motion in careless} == {"success", "failure"}
+    careless: list[ExecutedMotion] = []
+    while {motion.outcome for motion in careless} != {"success", "failure"}:
+        assert len(careless) < 12
+        careless.append(moved(contact, family, len(careless), None))
     assert all((motion.outcome == "failure") == bool(motion.failure) for motion in careless)
-    again = moved(contact, family, 5, None)
-    assert (again.outcome, again.facts) == (careless[5].outcome, careless[5].facts)
+    again = moved(contact, family, 0, None)
+    assert (again.outcome, again.facts) == (careless[0].outcome, careless[0].facts)
     assert again.facts and np.isfinite(list(again.facts.values())).all()
 
 

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("short_pauses")
 @pytest.fixture
 def recordings(tmp_path: Path) -> Path:
     with EpisodeSetWriter(tmp_path / "raw", video_crf=8) as writer:
-        for number in range(3):
+        for number in range(2):
             writer.add(*make_sample(number))
     return tmp_path / "raw"
 
@@ -48,7 +48,7 @@ def config(path: object, **changes: Any) -> CurateConfig:
 
 
 def curated_digest(configured: CurateConfig, output: Path) -> str:
-    curate(configured, {}, output, SerialMapper(RunnerConfig(episodes_per_shard=2, retries=1, retry_seconds=0.01)))
+    curate(configured, {}, output, SerialMapper(RunnerConfig(episodes_per_shard=1, retries=1, retry_seconds=0.01)))
     return digest_folder(output)
 
 
