@@ -25,7 +25,7 @@ import torch
 from benchmarks.harness import RECORDINGS, command_line, print_table
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.training.clip_config import ClipSampling, FrameInput, ReadingConfig
+from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import ClipDataset, read_ahead
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
 from worldline_core.training.clip_source import FrameSource
@@ -89,8 +89,8 @@ class RepeatedClips:
     def __init__(self, sampler: ClipSampler, steps: int) -> None:
         self.sampler, self.steps = sampler, steps
 
-    def clips(self, index: int) -> ClipBatch:
-        return self.sampler.clips(index % self.steps)
+    def clips(self, index: int, attempt: int = 0) -> ClipBatch:
+        return self.sampler.clips(index % self.steps, attempt)
 
 
 def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple[str, float, float, float]:
@@ -105,7 +105,7 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple
     clips = [clip for index in range(steps) for clip in sampler.clips(index).clips]
     frames = len(VIEWS) * sum(clip.num_frames for clip in clips)
     repeated: Any = RepeatedClips(sampler, steps)
-    loader = read_ahead(ClipDataset(source, repeated, ReadingConfig(workers=processes)), 0, None)
+    loader = read_ahead(ClipDataset(source, repeated), 0, processes)
     everyone = [os.getpid()]
 
     def load() -> None:

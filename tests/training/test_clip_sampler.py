@@ -90,13 +90,14 @@ def test_single_view_steps_take_larger_batches(store):
     assert {(batch.views, len(batch.clips)) for batch in batches} == {(VIEWS, 4), (("head",), 12)}
 
 
-def test_a_replacement_is_another_clip_of_the_same_kind(store):
-    sampler, again = (make(store, ClipSampling(lengths=(5, 9))) for _ in range(2))
-    drawn = [sampler.replacement(3, 1, attempt) for attempt in range(20)]
-    assert drawn == [again.replacement(3, 1, attempt) for attempt in range(20)]
-    assert {clip.num_frames for clip in drawn} == {sampler.clips(3).clips[1].num_frames}
-    assert len(set(drawn)) > 8
-    assert [sampler.replacement(3, 0, attempt) for attempt in range(20)] != drawn
+def test_further_attempts_draw_other_clips_of_the_same_kind(store):
+    config = ClipSampling(lengths=(5, 9), view_weights={"joint": 1.0, "head": 1.0})
+    sampler, other = (make(store, config, plan=BatchPlan(2, 2, rank, 2)) for rank in range(2))
+    drawn = [sampler.clips(3, attempt) for attempt in range(20)]
+    assert drawn == [make(store, config, plan=BatchPlan(2, 2, 0, 2)).clips(3, attempt) for attempt in range(20)]
+    assert len({(batch.views, batch.clips[0].num_frames) for batch in drawn}) == 1
+    assert len({batch.clips for batch in drawn}) == 20
+    assert all(batch.clips != other.clips(3, attempt).clips for attempt, batch in enumerate(drawn))
 
 
 def test_lengths_may_be_a_range_and_fit_the_tokenizer_and_the_recordings(store):
@@ -159,7 +160,7 @@ def test_batches_hold_clips_of_one_set_of_views(latents):
     for index in range(600):
         batch = sampler.clips(index)
         assert {latents.row(clip.episode_id).views for clip in batch.clips} == {batch.views}
-        assert sampler.replacement(index, 0, 0).episode_id[:3] == batch.clips[0].episode_id[:3]
+        assert sampler.clips(index, 1).views == batch.views
         drawn.update(clip.episode_id for clip in batch.clips)
     # Grouping changes nothing of how often an episode is drawn.
     assert min(drawn.values()) > 0.7 * 1200 / 6

@@ -179,10 +179,9 @@ class DistillationRun:
         sampler = self._sampler(settings.trainer, self.config.first_clips, plan)
         teacher = self._frozen(settings.trainer) if settings.teacher_share else None
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
-        stop = settings.trainer.steps and settings.trainer.steps * plan.accumulation
         loader = copy(self.loader)
         loader.object_weights = weights_of(settings.weighting, self.episodes, self.source)
-        load = loader.batches(sampler, self.config.input, work, stop)
+        load = loader.batches(sampler, self.config.input, work)
         return self._train(STEPS[0], settings.trainer, objective, load, info, self.start)
 
     def trajectory_regression(self) -> dict[str, float]:

@@ -10,7 +10,6 @@ import json
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import NamedTuple
@@ -45,14 +44,11 @@ MOST_SKIPPED = 100
 
 
 class ReadBatch(NamedTuple):
-    """Clips as read, (b, v, ...) as the source gives them.
-
-    ``batch`` names the clips that are in it, replacements included; ``skipped`` those that were replaced, with the reason.
-    """
+    """Clips as read, (b, v, ...) as the source gives them, and the errors of those that were replaced."""
 
     batch: ClipBatch
     data: Tensor
-    skipped: tuple[tuple[Clip, str], ...] = ()
+    errors: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -61,15 +57,38 @@ class ClipDataset(Dataset[ReadBatch | WorldLineError]):
 
     source: ClipSource
     sampler: ClipSampler
-    reading: ReadingConfig
+    skip: bool = False
 
     def __getitem__(self, index: int) -> ReadBatch | WorldLineError:
-        skips = self.reading.on_unreadable == "skip"
-        replacement = partial(self.sampler.replacement, index) if skips else None
         try:
-            return read_batch(self.source, self.sampler.clips(index), replacement)
+            return self._read(index)
         except WorldLineError as error:
             return error
+
+    def _read(self, index: int) -> ReadBatch:
+        """What cannot be read is replaced by the clip at its place in the next draw."""
+        read: dict[int, tuple[Clip, Tensor]] = {}
+        errors: list[str] = []
+        for attempt in range(_ATTEMPTS):
+            batch = self.sampler.clips(index, attempt)
+            for place in set(range(len(batch.clips))) - read.keys():
+                clip = batch.clips[place]
+                try:
+                    read[place] = clip, self.source.read(clip, recorded_views(self.source, batch, clip))
+                except DataError as error:
+                    if not self.skip:
+                        raise
+                    errors.append(str(error))
+            if len(read) == len(batch.clips):
+                clips, data = zip(*(read[place] for place in sorted(read)), strict=True)
+                return ReadBatch(replace(batch, clips=clips), torch.stack(data), errors)
+        raise DataError(
+            "No readable clip was found.",
+            where=f"micro-step {index}",
+            expected=f"one of {_ATTEMPTS} clips that can be read",
+            got=errors[-1],
+            next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
+        )
 
 
 def recorded_views(source: ClipSource, batch: ClipBatch, clip: Clip) -> tuple[str, ...]:
@@ -77,77 +96,32 @@ def recorded_views(source: ClipSource, batch: ClipBatch, clip: Clip) -> tuple[st
     return (source.row(clip.episode_id).primary_view,) if batch.primary else batch.views
 
 
-def read_batch(
-    source: ClipSource, batch: ClipBatch, replacement: Callable[[int, int], Clip] | None = None
-) -> ReadBatch:
-    """Read the clips of a batch.
-
-    Args:
-        replacement: of a clip that cannot be read, by its place and the attempt; None: reading ends there.
-
-    Raises:
-        DataError: a clip cannot be read, or nothing readable can be found for it.
-        ArtifactError: the source does not hold what is asked of it.
-    """
-    read: list[tuple[Clip, Tensor]] = []
-    skipped: list[tuple[Clip, str]] = []
-    for place, clip in enumerate(batch.clips):
-        for attempt in range(_ATTEMPTS):
-            try:
-                read.append((clip, source.read(clip, recorded_views(source, batch, clip))))
-                break
-            except DataError as error:
-                if replacement is None:
-                    raise
-                skipped.append((clip, str(error)))
-                clip = replacement(place, attempt)
-        else:
-            raise DataError(
-                "No readable clip was found.",
-                where=str(batch.clips[place]),
-                expected=f"one of {_ATTEMPTS} clips that can be read",
-                got=skipped[-1][1],
-                next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
-            )
-    clips, data = zip(*read, strict=True)
-    return ReadBatch(replace(batch, clips=clips), torch.stack(data), tuple(skipped))
-
-
 def read_ahead(
-    dataset: ClipDataset, first: int, stop: int | None, *, pinned: bool = False
+    dataset: ClipDataset, first: int, workers: int, *, pinned: bool = False
 ) -> Iterator[ReadBatch | WorldLineError]:
-    """The items of a dataset from ``first`` to ``stop``, in order, read ahead by the configured workers.
+    """The items of a dataset from ``first`` on, in order, read ahead by so many processes.
 
     Args:
         pinned: in page-locked memory, which a GPU reads at full speed.
     """
-    workers = dataset.reading.workers
     loader = DataLoader(
         dataset,
         batch_size=None,
-        sampler=count(first) if stop is None else range(first, max(stop, first + 1)),
+        sampler=count(first),
         num_workers=workers,
         multiprocessing_context=START_METHOD if workers else None,
         worker_init_fn=_start_worker,
-        collate_fn=_as_it_is,
         pin_memory=pinned,
         generator=torch.Generator(),  # its own: training's random state stays as it is
     )
     return iter(loader)
 
 
-def _as_it_is[T](item: T) -> T:
-    return item
-
-
-def _start_worker(number: int) -> None:
-    import cv2
-
-    del number
+def _start_worker(_: int) -> None:
     cv2.setNumThreads(1)
 
 
-def _record_skipped(run: Path, index: int, skipped: tuple[tuple[Clip, str], ...]) -> None:
+def _record_skipped(run: Path, index: int, errors: Sequence[str]) -> None:
     """Write down what a micro-step skipped; a step that is done again after a kill adds nothing.
 
     Raises:
@@ -155,10 +129,9 @@ def _record_skipped(run: Path, index: int, skipped: tuple[tuple[Clip, str], ...]
     """
     path = run / f"skipped_clips-{processes()[0]}.jsonl"
     rows = read_json_lines(path)
-    for clip, reason in skipped:
-        row = {"index": index, "clip": str(clip), "reason": reason}
+    for row in ({"index": index, "reason": error} for error in errors):
         if row not in rows:
-            logger.warning("Clip skipped: %s", reason)
+            logger.warning("Clip skipped: %s", row["reason"])
             rows.append(row)
     write_bytes_atomic(path, "".join(f"{json.dumps(row)}\n" for row in rows).encode())
     if len(rows) > MOST_SKIPPED:
@@ -233,9 +206,7 @@ class ClipLoader:
             names = [row.episode_id for row in self.source.rows if row.episode_id in self.tracks]
             self._resident = ResidentTracks(self.tracks, names, self.views, self.device, self.native_size)
 
-    def batches(
-        self, sampler: ClipSampler, reading: ReadingConfig, run: Path | None = None, stop: int | None = None
-    ) -> Callable[[int], Batch]:
+    def batches(self, sampler: ClipSampler, reading: ReadingConfig, run: Path | None = None) -> Callable[[int], Batch]:
         """A function that gives the batch of a micro-step, read ahead by the configured workers.
 
         Asked for in order, batches are there already; any other order starts reading anew. The function raises DataError
@@ -243,20 +214,19 @@ class ClipLoader:
 
         Args:
             run: folder in which skipped clips are written down.
-            stop: nothing is read from this micro-step on.
 
         Raises:
             ConfigError: the source has no clips of this length.
         """
         self.source.require_length(sampler.longest, "clips.lengths")
-        dataset = ClipDataset(self.source, sampler, reading)
+        dataset = ClipDataset(self.source, sampler, reading.on_unreadable == "skip")
         pinned = torch.device(self.device).type == "cuda" and not isinstance(self.source, ResidentLatents)
         ahead: tuple[int, Iterator[ReadBatch | WorldLineError]] | None = None
 
         def load(index: int) -> Batch:
             nonlocal ahead
-            if ahead is None or ahead[0] != index or (stop is not None and index >= stop):
-                ahead = (index, read_ahead(dataset, index, stop, pinned=pinned))
+            if ahead is None or ahead[0] != index:
+                ahead = (index, read_ahead(dataset, index, reading.workers, pinned=pinned))
             batches, ahead = ahead[1], None  # after an error nothing holds the loader processes
             try:
                 read = next(batches)
@@ -272,9 +242,9 @@ class ClipLoader:
                 del batches
                 raise read
             ahead = (index + 1, batches)
-            if read.skipped and run is not None:
-                _record_skipped(run, index, read.skipped)
-            return self._finish(read)
+            if read.errors and run is not None:
+                _record_skipped(run, index, read.errors)
+            return self._finish(read.batch, read.data)
 
         return load
 
@@ -282,14 +252,15 @@ class ClipLoader:
         """Read the clips of one batch in this process, and finish it.
 
         Raises:
-            ArtifactError: if the source or the tracks lack an episode.
-            DataError: if a clip is damaged, or cached latents are not finite.
+            ArtifactError: the source or the tracks lack an episode.
+            DataError: a clip is damaged.
         """
-        return self._finish(read_batch(self.source, batch))
+        read = [self.source.read(clip, recorded_views(self.source, batch, clip)) for clip in batch.clips]
+        return self._finish(batch, torch.stack(read))
 
-    def _finish(self, read: ReadBatch) -> Batch:
-        frames = read.data if read.data.dtype == torch.uint8 else None
-        return self.conditioned(read.batch, self.source.latents(read.data, self.device), frames)
+    def _finish(self, batch: ClipBatch, read: Tensor) -> Batch:
+        frames = read if read.dtype == torch.uint8 else None
+        return self.conditioned(batch, self.source.latents(read, self.device), frames)
 
     def conditioned(self, batch: ClipBatch, latents: Tensor, frames: Tensor | None = None) -> Batch:
         """Latents of a batch's clips, with the conditions that this loader adds. Raises: ArtifactError: the tracks lack an episode."""

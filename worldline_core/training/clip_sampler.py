@@ -169,11 +169,8 @@ class ClipSampler:
         self.longest = max(kind.length for kind in self._kinds)
         """Frames of the longest clips that are drawn."""
 
-    def clips(self, index: int) -> ClipBatch:
-        """The clips of this process's micro-step ``index``."""
-        return self._batch(index)[0]
-
-    def _batch(self, index: int) -> tuple[ClipBatch, _Kind]:
+    def clips(self, index: int, attempt: int = 0) -> ClipBatch:
+        """The clips of this process's micro-step ``index``; further attempts draw others of its length, stride and views."""
         index, part = self.plan.drawn(index)
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         kind = self._kinds[int(random.choice(len(self._kinds), p=self._kind_weights))]
@@ -184,8 +181,9 @@ class ClipSampler:
         size = self.batch_size * (1 if name in (JOINT, SUBSET) else self.single_view_factor)
         sets = self._sets(name, kind)
         views = sets[0] if len(sets) == 1 else sets[int(random.integers(len(sets)))]
-        clips = self._draw(random, kind, size, part)
-        return ClipBatch(clips, views, primary=name == PRIMARY), kind
+        if attempt:  # a stream of its own
+            random = np.random.Generator(np.random.Philox(key=[self.seed, index], counter=[0, 0, attempt, 1 + part]))
+        return ClipBatch(self._draw(random, kind, size, part), views, primary=name == PRIMARY)
 
     def _drawn(self, kind: _Kind) -> dict[str, float]:
         """Choices of views for steps on clips of a kind, with their weights."""
@@ -197,14 +195,6 @@ class ClipSampler:
         if name == SUBSET:
             return view_subsets(kind.views)
         return [kind.views if name == JOINT else (self.views[0],) if name == PRIMARY else (name,)]
-
-    def replacement(self, index: int, place: int, attempt: int) -> Clip:
-        """Another clip of the length, stride and views of micro-step ``index``, for its unreadable clip at ``place``."""
-        kind = self._batch(index)[1]
-        index, part = self.plan.drawn(index)
-        counter = [0, 0, 1 + attempt, 1 + place]  # a stream of its own
-        random = np.random.Generator(np.random.Philox(key=[self.seed, index], counter=counter))
-        return self._draw(random, kind, 1, part)[0]
 
     def view_sets(self, slots: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
         """Sets of the model's ``slots`` that `LEAST_SHARE` of the steps or more fill together."""

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -187,15 +188,12 @@ class LatentStore(ClipSource):
         """The clip's latents.
 
         Raises:
-            ArtifactError: if the episode, stride or view is not stored, or a shard is damaged.
-            DataError: if the clip does not fit, starts between stored start frames, or holds values that are not finite.
+            ArtifactError: the clip or a view is not stored, or a shard is damaged.
         """
         selected = self.stored_views(clip, views)
         with self.shard(clip.episode_id) as shard:
             frames = [shard.get_slice(name)[:, :, first:stop] for name, first, stop in self.parts(clip)]
-        latents = torch.cat(frames, dim=2)[selected].float()
-        self.require_finite(latents, clip.episode_id)
-        return latents
+        return torch.cat(frames, dim=2)[selected].float()
 
     def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
         return read.to(device)
@@ -215,24 +213,15 @@ class LatentStore(ClipSource):
     def stored_views(self, clip: Clip, views: tuple[str, ...]) -> list[int]:
         """Numbers of a clip's views among those that are stored; raises as `read` does."""
         row = self.row(clip.episode_id)
-        if clip.stride not in self.strides:
-            raise ArtifactError(
-                "The latent store was not encoded at this stride.",
-                where=self.root,
-                expected=self.strides,
-                got=clip.stride,
-            )
         longest = min(longest_clip(row.num_frames, clip.start, clip.stride), self.clip_frames or row.num_frames)
-        if clip.start % self.start_step or clip.start < 0 or clip.num_frames > longest:
-            raise DataError(
-                "A clip does not fit the stored latents of its episode.",
-                where=clip.episode_id,
-                expected=f"a start frame divisible by {self.start_step}, within {row.num_frames} frames",
-                got=f"start {clip.start}, {clip.num_frames} frames, stride {clip.stride}",
-            )
-        if missing := [view for view in views if view not in row.views]:
+        fits = clip.start >= 0 and clip.start % self.start_step == 0 and clip.num_frames <= longest
+        if clip.stride not in self.strides or not fits or not set(views) <= set(row.views):
             raise ArtifactError(
-                "The latent store does not hold this view.", where=clip.episode_id, expected=row.views, got=missing
+                "The latents do not hold this clip.",
+                where=self.root,
+                expected=f"strides {self.strides}, a start divisible by {self.start_step}, at most "
+                f"{self.clip_frames or row.num_frames} of {row.num_frames} frames, views {row.views}",
+                got=f"{clip}, views {views}",
             )
         return [row.views.index(view) for view in views]
 
@@ -252,15 +241,6 @@ class LatentStore(ClipSource):
                 next_step="encode the latents again",
             ) from error
 
-    def require_finite(self, latents: Tensor, episode_id: str) -> None:
-        """Raises DataError for latents of an episode that are not finite."""
-        if not bool(torch.isfinite(latents).all()):
-            raise DataError(
-                "Cached latents hold values that are not finite.",
-                where=f"{self._shard_of[episode_id]}, episode {episode_id}",
-                next_step="delete this Latents artifact and encode it again; check the tokenizer",
-            )
-
 
 class ResidentLatents(LatentStore):
     """A store whose latents are all on one device, in half precision."""
@@ -271,8 +251,7 @@ class ResidentLatents(LatentStore):
         for row in with_progress(self.rows, "reading latents", "episode"):
             with store.shard(row.episode_id) as shard:
                 for name in (name for name in shard.keys() if name.startswith(f"{row.episode_id}/")):  # noqa: SIM118
-                    self.require_finite(tensor := shard.get_tensor(name), row.episode_id)
-                    self._tensors[name] = tensor.to(device, torch.float16)
+                    self._tensors[name] = shard.get_tensor(name).to(device, torch.float16)
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
         selected = self.stored_views(clip, views)
@@ -293,43 +272,32 @@ class ResidentTracks:
         episode_ids: Sequence[str],
         views: tuple[str, ...],
         device: str,
-        native_size: int | None = None,
+        native_size: int | None,
     ) -> None:
-        samples: list[TrackBatch] = []
-        self._first: dict[str, int] = {}
-        sizes: set[tuple[int, int]] = set()
-        count = 0
-        for episode_id in episode_ids:
-            episode = tracks.tracks(episode_id)
-            samples.append(collate_tracks([episode], views, native_size))
-            self._first[episode_id] = count
-            count += episode.num_frames
-            sizes |= {episode.image_size} if episode.calibrated_views else set()
+        episodes = [tracks.tracks(episode_id) for episode_id in episode_ids]
+        sizes = {episode.image_size for episode in episodes if episode.calibrated_views}
         if len(sizes) > 1:
             raise DataError("Resident action tracks have frames of one size", where=tracks.root, got=sorted(sizes))
         self.image_size = sizes.pop() if sizes else (1, 1)
-        arms = max(sample.valid.shape[3] for sample in samples)
+        self._first = dict(zip(episode_ids, accumulate((one.num_frames for one in episodes), initial=0), strict=False))
+        samples = [vars(collate_tracks([episode], views, native_size)) for episode in episodes]
+        arms = max(len(episode.arms) for episode in episodes)
         self._samples = {
-            name: torch.cat([_padded(getattr(sample, name)[0], arms) for sample in samples]).to(device)
-            for name in SAMPLES
-        }
-        self._vectors = {
-            name: torch.cat([getattr(sample, name)[0] for sample in samples]).to(device)
-            for name in (() if native_size is None else ("native", "camera"))
+            name: torch.cat([_padded(one[name][0], arms) if name in SAMPLES else one[name][0] for one in samples]).to(
+                device
+            )
+            for name in (name for name, values in samples[0].items() if values is not None)
         }
         self._views = views
 
     def batch(self, clips: Sequence[Clip], per_latent_frame: int, views: Sequence[str]) -> TrackBatch:
         """Samples of the control frames of clips of one length, as `collate_tracks` gives them."""
         within = np.array(control_frames(clips[0].num_frames, per_latent_frame))
-        firsts = np.array([self._first[clip.episode_id] + clip.start for clip in clips])
-        strides = np.array([clip.stride for clip in clips])
-        numbers = torch.from_numpy(firsts[:, None] + strides[:, None] * within).to(self._samples["uv"].device)
+        frames = [self._first[clip.episode_id] + clip.start + clip.stride * within for clip in clips]
+        numbers = torch.from_numpy(np.stack(frames)).to(self._samples["uv"].device)
         chosen = [self._views.index(view) for view in views]
-        vectors = {name: values[numbers] for name, values in self._vectors.items()}
-        if vectors:
-            vectors["camera"] = vectors["camera"][:, :, chosen]
-        return TrackBatch(**{name: values[numbers][:, :, chosen] for name, values in self._samples.items()}, **vectors)
+        found = {name: values[numbers] for name, values in self._samples.items()}
+        return TrackBatch(**{k: values if k == "native" else values[:, :, chosen] for k, values in found.items()})
 
 
 def _padded(values: Tensor, arms: int) -> Tensor:
@@ -467,43 +435,32 @@ def training_rows(
         DataError: if none is left.
     """
 
-    def fit(row: EpisodeRow) -> bool:
-        stage2_ok = row.stage2_ok or (vectors and row.stage2_reason == "missing_calibration")
-        return (row.stage1_ok if stage == 1 else stage2_ok) and (outcomes is None or row.outcome in outcomes)
+    held = {row.episode_id: row for row in source.rows}
+    drawn = dict[str, tuple[str, ...]]()
 
-    allowed = {row.episode_id for row in episodes.rows if fit(row)}
-    usable = [row for row in source.rows if row.episode_id in allowed]
-    if stage == 1:
-        rows = [row for row in usable if row.primary_view in row.views]
-    else:
-        known = usable if tracks is None else [row for row in usable if row.episode_id in tracks]
-        if len(known) < len(usable):
-            logger.warning(
-                "%d of %d episodes have no controls and are left out.", len(usable) - len(known), len(usable)
-            )
-        if tracks is not None and not vectors:
-            drawn = {row.episode_id: tracks.calibrated_views(row.episode_id) for row in known}
-            cut = [replace(row, views=tuple(v for v in row.views if v in drawn[row.episode_id])) for row in known]
-            if fewer := sum(now.views != row.views for now, row in zip(cut, known, strict=True)):
-                logger.warning(
-                    "Of %d episodes the views without a camera are left out: the model takes action maps alone "
-                    "(train_stage2.native_size).", fewer,
-                )  # fmt: skip
-            known = cut
-        rows = [row for row in known if set(views) & set(row.views)]
+    def left_out(row: EpisodeRow) -> str:
+        """The reason why an episode is not trained on; empty where it is."""
+        if outcomes is not None and row.outcome not in outcomes:
+            return f"outcome {row.outcome}"
+        if not (
+            row.stage1_ok if stage == 1 else row.stage2_ok or (vectors and row.stage2_reason == "missing_calibration")
+        ):
+            return (stage == 2 and row.stage2_reason) or f"not fit for Stage {stage}"
+        if row.episode_id not in held:
+            return f"split {row.split}: not among the clips"
+        if stage == 2 and tracks is not None and row.episode_id not in tracks:
+            return "no controls"
+        shown = held[row.episode_id].views
+        if stage == 2 and tracks is not None and not vectors:
+            cameras = tracks.calibrated_views(row.episode_id)
+            shown = tuple(view for view in shown if view in cameras)
+        drawn[row.episode_id] = shown
+        return "" if (row.primary_view in shown if stage == 1 else set(views) & set(shown)) else "none of the views"
+
+    reasons = {row.episode_id: left_out(row) for row in episodes.rows}
+    rows = [replace(row, views=drawn[row.episode_id]) for row in source.rows if reasons.get(row.episode_id) == ""]
+    counts = Counter(filter(None, reasons.values()))
     if not rows:
-        clips = {row.episode_id for row in source.rows}
-
-        def left_out(row: EpisodeRow) -> str:
-            if outcomes is not None and row.outcome not in outcomes:
-                return f"outcome {row.outcome}"
-            if not fit(row):
-                return (stage == 2 and row.stage2_reason) or f"not fit for Stage {stage}"
-            if row.episode_id not in clips:
-                return f"split {row.split}: not among the clips"
-            return "no controls" if tracks is not None and row.episode_id not in tracks else "none of the views"
-
-        counts = Counter(map(left_out, episodes.rows))
         raise DataError(
             "No episode is left to train on.",
             where=f"stage {stage}, one of the views {', '.join(views) or 'that are task-facing'}",
@@ -512,6 +469,13 @@ def training_rows(
             next_step="docs/filters.md says what each reason asks for; other episodes are in the quarantine tables of curate,"
             " filter and render_actions",
         )
+    if counts["no controls"]:
+        logger.warning("%d episodes have no controls and are left out.", counts["no controls"])
+    if fewer := sum(drawn[row.episode_id] != held[row.episode_id].views for row in rows):
+        logger.warning(
+            "Of %d episodes the views without a camera are left out: the model takes action maps alone "
+            "(train_stage2.native_size).", fewer,
+        )  # fmt: skip
     return rows
 
 

@@ -43,9 +43,12 @@ _SPAN = 2 * TEMPORAL_FACTOR + 1
 def encode_clip(
     tokenizer: VideoTokenizer, video: UInt8[Tensor, "3 n h w"], device: str
 ) -> Float[Tensor, "c t h_l w_l"]:
-    """Latents of one clip, rounded to half precision as they are stored."""
+    """Latents of one clip, rounded to half precision as they are stored. Raises: DataError for numbers that are not finite."""
     with torch.no_grad():
-        return tokenizer.encode((video.float() / 127.5 - 1.0)[None].to(device))[0].to("cpu", torch.float16)
+        latents = tokenizer.encode((video.float() / 127.5 - 1.0)[None].to(device))[0].to("cpu", torch.float16)
+    if not bool(torch.isfinite(latents).all()):
+        raise DataError("The tokenizer's latents are not finite in half precision.", next_step="check the tokenizer")
+    return latents
 
 
 def encode_episode(
@@ -351,6 +354,6 @@ def _select(episodes: EpisodeSet, config: EncodeLatentsConfig) -> list[int]:
                 for (split, views), count in Counter((row.split, row.views) for row in episodes.rows).most_common(5)
             )
             or "an empty EpisodeSet",
-            next_step="encode_latents.splits, views and primary_alone say which are encoded",
+            next_step="encode_latents.splits and views say which are encoded",
         )
     return selected

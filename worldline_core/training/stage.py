@@ -169,12 +169,11 @@ class Stage:
             ArtifactError: a saved state is damaged or belongs to another run.
         """
         config, trainer = self.config, self.config.trainer
-        stop = trainer.steps and trainer.steps * self.plan.accumulation
         return train(
             trainer,
             groups=groups,
             objective=objective,
-            load=loader.batches(self.sampler, config.input, self.output / "run", stop),
+            load=loader.batches(self.sampler, config.input, self.output / "run"),
             validate=self.held_out(loader).validation(trainer, objective),
             probe=probe,
             output=self.output,
@@ -315,7 +314,7 @@ class HeldOutClips:
             batch_size=size, seed=VALIDATION_SEED, vector_share=self.vector_share,
         )  # fmt: skip
         reading = self.config.input.model_copy(update={"workers": 0})
-        load = self.loader.batches(sampler, reading, stop=trainer.validation_batches)
+        load = self.loader.batches(sampler, reading)
         return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)
 
     def action_following(
