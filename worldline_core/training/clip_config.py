@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, ByteSize, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ByteSize, Field, model_validator
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import ImageSize, StrictModel
@@ -24,6 +24,15 @@ def view_subsets(views: Sequence[str]) -> list[tuple[str, ...]]:
     first, *others = views
     chosen = (rest for count in range(max(len(others), 1)) for rest in combinations(others, count))
     return [(first, *rest) for rest in chosen]
+
+
+def _coded(frames: int) -> int:
+    if frames < 1 or (frames - 1) % TEMPORAL_FACTOR:
+        raise ValueError(f"{frames} frames: a causal tokenizer codes clips of 4 k + 1")
+    return frames
+
+
+ClipFrames = Annotated[int, AfterValidator(_coded)]
 
 
 def _expand_range(value: Any) -> Any:
@@ -50,18 +59,11 @@ class ClipSampling(StrictModel):
     alone.
     """
 
-    lengths: Annotated[tuple[int, ...], BeforeValidator(_expand_range)] = Field(default=(33,), min_length=1)
+    lengths: Annotated[tuple[ClipFrames, ...], BeforeValidator(_expand_range)] = Field(default=(33,), min_length=1)
     strides: tuple[int, ...] = Field(default=(1,), min_length=1)
     source_weights: dict[str, float] = Field(default_factory=dict)
     view_weights: dict[str, float] | None = None
     single_view_factor: int = Field(default=1, ge=1)
-
-    @model_validator(mode="after")
-    def _lengths_the_tokenizer_codes(self) -> Self:
-        odd = [length for length in self.lengths if length < 1 or (length - 1) % TEMPORAL_FACTOR]
-        if odd:
-            raise ValueError(f"lengths {odd}: a causal tokenizer codes clips of 4 k + 1 frames")
-        return self
 
     def shown_views(self, views: Sequence[str]) -> tuple[str, ...]:
         """Those of some views that clips may show."""
@@ -127,13 +129,7 @@ class EncodeLatentsConfig(StrictModel):
     image_size: ImageSize = (64, 96)
     start_step: int = Field(default=4, ge=1)
     strides: tuple[int, ...] = Field(default=(1,), min_length=1)
-    clip_frames: int | None = Field(default=None, ge=1 + TEMPORAL_FACTOR)
+    clip_frames: ClipFrames | None = Field(default=None, ge=1 + TEMPORAL_FACTOR)
     disk: ByteSize | None = Field(default=None, gt=0)
     episodes_per_shard: int = Field(default=16, ge=1)
     device: str = "cpu"
-
-    @model_validator(mode="after")
-    def _frames_the_tokenizer_codes(self) -> Self:
-        if self.clip_frames is not None and (self.clip_frames - 1) % TEMPORAL_FACTOR:
-            raise ValueError(f"clip_frames {self.clip_frames}: a causal tokenizer codes clips of 4 k + 1 frames")
-        return self

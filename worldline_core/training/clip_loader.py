@@ -352,17 +352,9 @@ class ObjectWeights:
                     "A recording has no exact masks of things", where=f"{episode_id}, view {view}",
                     expected="recordings of `worldline record`", next_step="set weighting.things to [0, 0]",
                 )  # fmt: skip
-            height, width = self._grid_size
-            self._shares[episode_id, view] = np.stack(
-                [
-                    [
-                        cv2.resize(255 * mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA)
-                        for mask in (frame == 1, frame > 1)
-                    ]
-                    for frame in labels
-                ],
-                axis=1,
-            )
+            masks = (255 * np.stack((frame == 1, frame > 1), axis=-1).astype(np.uint8) for frame in labels)
+            resized = [cv2.resize(mask, self._grid_size[::-1], interpolation=cv2.INTER_AREA) for mask in masks]
+            self._shares[episode_id, view] = np.moveaxis(np.stack(resized), -1, 0)
         return self._shares[episode_id, view]
 
 

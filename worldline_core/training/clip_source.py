@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -163,22 +164,17 @@ class LatentStore(ClipSource):
         Raises:
             ArtifactError: if the folder is not a Latents artifact.
         """
-        missing = [name for name in (DESCRIPTION, INDEX) if not (root / name).is_file()]
-        if missing:
+        try:
+            rows = [LatentRow(**{**row, "views": tuple(row["views"])}) for row in read_rows(root / INDEX)]
+            return cls(root, read_json(root / DESCRIPTION), rows)
+        except (TypeError, KeyError) as error:
             raise ArtifactError(
                 "This folder is not a Latents artifact.",
                 where=root,
-                expected=f"{DESCRIPTION} and {INDEX}",
-                got=f"no {' and no '.join(missing)}",
+                expected=f"{DESCRIPTION} and {INDEX} of encode_latents",
+                got=f"{type(error).__name__}: {error}",
                 next_step="run the encode_latents step first",
-            )
-        try:
-            rows = [LatentRow(**{**row, "views": tuple(row["views"])}) for row in read_rows(root / INDEX)]
-        except (TypeError, KeyError) as error:
-            raise ArtifactError(
-                "The index of the latents has other columns", where=root / INDEX, got=str(error)
             ) from error
-        return cls(root, read_json(root / DESCRIPTION), rows)
 
     def __getstate__(self) -> dict[str, Any]:
         # Open shards stay in the process that opened them.
@@ -332,21 +328,19 @@ class FrameSource(ClipSource):
         self.image_size = config.image_size
         self.start_step = config.start_step
         self.latent_shape = (self._tokenizer.latent_channels, height // space, width // space)
-        self._decoder: FrameDecoder | None = None
         fingerprint = tokenizer_fingerprint(self._tokenizer, tokenizer_folder)
         self.description = {"tokenizer": fingerprint, "decoder": FrameDecoder.name}
 
     def __getstate__(self) -> dict[str, Any]:
         # Loader processes read frames: they open files themselves and have no use for the tokenizer.
         episodes = EpisodeSet(self.episodes.root, self.episodes.rows)
-        return {**self.__dict__, "episodes": episodes, "_tokenizer": None, "_decoder": None}
+        own = {name: value for name, value in self.__dict__.items() if name != "decoder"}
+        return {**own, "episodes": episodes, "_tokenizer": None}
 
-    @property
+    @cached_property
     def decoder(self) -> FrameDecoder:
         """This process's decoder."""
-        if self._decoder is None:
-            self._decoder = FrameDecoder()
-        return self._decoder
+        return FrameDecoder()
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> UInt8[Tensor, "v n h w 3"]:
         """The clip's frames at the training size, RGB.
