@@ -272,12 +272,14 @@ def read_manifest(folder: Path) -> JsonObject:
         ArtifactError: it is damaged, or of another form.
     """
     path = folder / MANIFEST_NAME
+    if not path.is_file():
+        return {}
     try:
         manifest = read_json(path)
     except ArtifactError as error:
         raise ArtifactError(error.what, where=path, got=error.got, next_step=how_to_rebuild(folder)) from error
     stated = manifest.pop("manifest_sha256", None)
-    if manifest and stated != (found := digest_value(manifest)):
+    if stated != (found := digest_value(manifest)):
         raise ArtifactError(
             "A manifest is damaged",
             where=path,
@@ -286,7 +288,7 @@ def read_manifest(folder: Path) -> JsonObject:
             next_step=how_to_rebuild(folder),
         )
     try:
-        _Manifest.model_validate(manifest or {"digest": "", "files": {}})
+        _Manifest.model_validate(manifest)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         raise ArtifactError(
