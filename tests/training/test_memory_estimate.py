@@ -143,7 +143,7 @@ def test_checkpointing_and_more_devices_are_proposed_in_this_order():
         (1.001 * plain, ""), (1.001 * block, "trainer.sharding.checkpointing: block"), (0.7 * block, "on 4 devices"),
         (1e3, "shorter clips"),
     ):  # fmt: skip
-        found = training.fitting_setting(1, memory / memory_estimate.USABLE)
+        found = training.row(1, memory / memory_estimate.USABLE)[1]
         assert proposed in found if proposed else found == ""
 
 

@@ -119,25 +119,14 @@ class Sources:
         count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
         return views, count * trainer.batch_size
 
-    def video(self, frames: int, views: int = 1) -> Tensor:
-        """Pictures of a clip; clips are encoded one by one, and so are their views."""
-        return torch.empty(views, 3, frames, *self.image_size)
-
     @cache  # noqa: B019 - a few sources a process
-    def encoding(self, frames: int, precision: Literal["bf16", "fp32"]) -> Held:
-        """What the tokenizer takes to encode a view of a clip."""
-        trainer = TrainerConfig(steps=1, precision=precision)
-        with FakeTensorMode(), torch.no_grad(), autocast(trainer):
-            tokenizer = tokenizer_outline(self.tokenizer)
-            return traced(lambda: tokenizer.encode(self.video(frames)))
-
-    @cache  # noqa: B019 - a few sources a process
-    def teaching(self, frames: int, views: int, precision: Literal["bf16", "fp32"]) -> Held:
-        """What the relational teacher takes to look at a clip."""
-        trainer = TrainerConfig(steps=1, precision=precision)
-        with FakeTensorMode(), torch.no_grad(), autocast(trainer):
-            features = teacher_outline(self.teacher)[1]
-            return traced(lambda: features(self.video(frames, views)))
+    def looking(
+        self, by: Literal["tokenizer", "teacher"], frames: int, precision: Literal["bf16", "fp32"], views: int = 1
+    ) -> Held:
+        """What the tokenizer takes to encode a view of a clip, or the relational teacher to look at all."""
+        with FakeTensorMode(), torch.no_grad(), autocast(TrainerConfig(steps=1, precision=precision)):
+            look = teacher_outline(self.teacher)[1] if by == "teacher" else tokenizer_outline(self.tokenizer).encode
+            return traced(lambda: look(torch.empty(views, 3, frames, *self.image_size)))
 
 
 def _text(model: WorldModelConfig, clips: int, tokens: int) -> Tensor:
@@ -174,10 +163,6 @@ class Estimate:
 
     def describe_parts(self) -> str:
         return ", ".join(f"{name} {gigabytes(size)}" for name, size in self.parts.items())
-
-
-Row = tuple[Estimate, str]
-"""A line of the sheet: what a training takes, and the setting with which it would fit; empty where it does."""
 
 
 class Work(NamedTuple):
@@ -236,6 +221,7 @@ class Training:
         trained: whether a parameter gets gradients, by its name.
         turns: numbers of steps, one of each kind that the training takes (distribution matching alternates), and their shares.
         before: what is done before a step's forward pass, and how often: clips are encoded, a teacher looks at them.
+        smaller: the only setting with which it takes less; by default devices and checkpointing are proposed.
     """
 
     title: str
@@ -246,6 +232,7 @@ class Training:
     lora: LoRAConfig | None = None
     turns: Mapping[int, float] = field(default_factory=lambda: {0: 1.0})
     before: Sequence[tuple[int, Callable[[], Held]]] = ()
+    smaller: str = ""
 
     def outline(self, layers: int) -> Work:
         """The step of a model of so many layers; call it within a FakeTensorMode."""
@@ -303,13 +290,12 @@ class Training:
             return {
                 "weights": sum(_new_bytes(model, seen) for model in work.models) / shards,
                 "moments": sum(_moment_bytes(value, trainer) for values in trained for value in values) / shards,
-                "average": sum(4 * value.numel() for value in trained[0]) / shards
-                if trainer.average == "device"
-                else 0,
+                "average": (trainer.average == "device") * sum(4 * value.numel() for value in trained[0]) / shards,
                 **whole_bytes(work.whole),
                 "frozen scores": scores / shards,
                 "gradients": max(sum(value.nbytes for value in values) for values in trained),
-                "trained": sum(value.numel() for values in trained for value in values),
+                "trained": sum(value.numel() for values in trained for value in values)
+                or sum(value.numel() for value in work.models[0].parameters()),
                 "block": sum(value.numel() for value in work.models[0].layers[0].parameters()),
             }
 
@@ -340,10 +326,13 @@ class Training:
         parts = {name: size for name, size in parts.items() if size}
         return Estimate(self.title, trained, parts, operations, trainer.steps, trainer.minutes)
 
-    def fitting_setting(self, devices: int, memory: float) -> str:
-        """The nearest setting with which this training would fit devices of ``memory`` bytes; empty where it does."""
-        if self.estimate(devices).fits(memory):
-            return ""
+    def row(self, devices: int, memory: float) -> tuple[Estimate, str]:
+        """A line of the sheet: what the training takes, and the nearest setting with which it would fit devices of ``memory`` bytes;
+        empty where it does."""
+        need = self.estimate(devices)
+        return need, "" if need.fits(memory) else self.smaller or self._fitting_setting(devices, memory)
+
+    def _fitting_setting(self, devices: int, memory: float) -> str:
         block = ShardingConfig(checkpointing="block", reduce_every_micro_step=True)
         for count in (devices * 2**power for power in range(11)):
             if (need := self.estimate(count, block)).fits(memory):
@@ -373,11 +362,11 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
 
     def encoded(clips: ClipSampling, views: Sequence[str], trainer: TrainerConfig) -> tuple[int, Callable[[], Held]]:
         shown, count = source.shown(trainer, clips, views)
-        return count * len(shown), partial(source.encoding, max(clips.lengths), trainer.precision)
+        return count * len(shown), partial(source.looking, "tokenizer", max(clips.lengths), trainer.precision)
 
     if isinstance(config, DistillConfig):
         model, first = model.model_copy(update={"towers": "generation"}), config.teacher_forcing.trainer
-        return [
+        found = [
             Training(
                 f"distill: {part.replace('_', ' ')}", getattr(config, part).trainer, model,
                 partial(_distillation, part, config, source), lora=config.lora,
@@ -386,6 +375,7 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
             )
             for part in ("teacher_forcing", "trajectory_regression", "distribution_matching")
         ]  # fmt: skip
+        return [found[0], _trajectory_shard(config, model, source), *found[1:]]
     relational = config.relational if isinstance(config, Stage2Config) else None
     stage1 = config if isinstance(config, Stage1Config) else None
     text, tower = (0, "") if stage1 is None else (stage1.text.max_length, stage1.text_tower)
@@ -401,9 +391,8 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
         objective = FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
         if tower == "stored":
             layers = network.config.num_layers
-            reader = hold_weights(
-                build_world_model(whole_model.model_copy(update={"num_layers": layers})), "bf16", "bf16"
-            )
+            reader = build_world_model(whole_model.model_copy(update={"num_layers": layers}))
+            hold_weights(reader, "bf16", "bf16")
             objective.encode_text = torch.no_grad()(reader.encode_text)
 
         def run(step: int) -> Tensor:
@@ -412,15 +401,11 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
         return Work(run, (network,), whole=whole)
 
     title = "stage II" if stage1 is None else {"base": "base", "stage1": "stage I"}[stage1.kind]
-    longest, precision, before = (
-        max(config.clips.lengths),
-        config.trainer.precision,
-        list[tuple[int, Callable[[], Held]]](),
-    )
-    if frames:
-        before.append(encoded(config.clips, model.views, config.trainer))
+    before = [encoded(config.clips, model.views, config.trainer)] if frames else []
     if relational is not None:
-        before.append((config.trainer.batch_size, partial(source.teaching, longest, len(model.views), precision)))
+        longest, precision, count = max(config.clips.lengths), config.trainer.precision, len(model.views)
+        teaching = partial(source.looking, "teacher", longest, precision, count)
+        before.append((config.trainer.batch_size, teaching))
     trained = partial(_stage1_trains, tower) if text else lambda _: True
     return [Training(title, config.trainer, model, work, trained, config.lora, before=before)]
 
@@ -435,9 +420,7 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
     clips = config.first_clips if part == "teacher_forcing" else config.clips
     batch = source.largest(model, getattr(config, part).trainer, clips, config.views)
     whole: dict[str, nn.Module] = {}
-    if isinstance(
-        config.input, FrameInput
-    ):  # it stays there, though the later steps use the latents of the trajectories
+    if isinstance(config.input, FrameInput):  # it stays, though the later steps use the latents of the trajectories
         whole["encoder"] = tokenizer_outline(source.tokenizer)
     models, scores, distance = [network], list[WorldModel](), None
     if part == "teacher_forcing":
@@ -471,71 +454,36 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
     return Work(run, models, scores, whole)
 
 
-def trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sources) -> Estimate:
+def _trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sources) -> Training:
     """A shard of the teacher's trajectories, whose clips are made together; the teacher is whole on every device."""
-    model, regression = model.model_copy(update={"towers": "generation"}), config.trajectory_regression
-    clips = min(regression.trajectories.clips, regression.trajectories.clips_per_shard)
-    trainer = regression.trainer.model_copy(update={"device": "cpu"})
-    with FakeTensorMode() as fake:
-        batch = source.batch(model, clips, config.views, max(config.clips.lengths))
-        encoder = {"encoder": tokenizer_outline(source.tokenizer)} if isinstance(config.input, FrameInput) else {}
+    regression, steps = config.trajectory_regression, config.trajectory_regression.trajectories
+    clips, longest = min(steps.clips, steps.clips_per_shard), max(config.clips.lengths)
+    frames = isinstance(config.input, FrameInput)
 
-    def made(layers: int) -> WorldModel:
-        teacher = build_world_model(model.model_copy(update={"num_layers": layers})).requires_grad_(False)
-        return hold_weights(teacher, trainer.precision)
+    def work(teacher: WorldModel) -> Work:
+        batch = source.batch(model, clips, config.views, longest)
 
-    def trace(layers: int) -> Held:
-        with fake, torch.no_grad(), autocast(trainer):
-            teacher = made(layers)
+        def run(_: int) -> None:
+            teacher_trajectories(
+                teacher, batch.latents, maps_of(batch), torch.empty_like(batch.latents), views=batch.views,
+                spec=config.spec, substeps=(1,) * config.spec.steps,
+            )  # fmt: skip
 
-            def run() -> None:
-                teacher_trajectories(
-                    teacher, batch.latents, maps_of(batch), torch.empty_like(batch.latents), views=batch.views,
-                    spec=config.spec, substeps=(1,) * config.spec.steps,
-                )  # fmt: skip
+        return Work(run, [teacher], whole={"encoder": tokenizer_outline(source.tokenizer)} if frames else {})
 
-            return traced(run)
-
-    traced_once = extrapolated(trace, model.num_layers)
-    with torch.device("meta"):
-        weights = list(made(model.num_layers).parameters())
-    held, steps = traced_once.forward, regression.trajectories
-    # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
-    passes = (1 + sum(steps.substeps)) / (1 + config.spec.steps)
-    operations = passes * traced_once.operations
-    if encoder:
-        encoding = source.encoding(batch.clips[0].num_frames, trainer.precision)
-        held, operations = max(held, encoding.forward), operations + clips * len(batch.views) * encoding.operations
-    parts = {"weights": sum(value.nbytes for value in weights), **whole_bytes(encoder), "activations": held}
-    title, shards = f"distill: trajectories (a shard of {clips} clips)", -(-steps.clips // clips)
-    return Estimate(
-        title,
-        sum(value.numel() for value in weights),
-        parts,
-        operations if trainer.precision == "bf16" else None,
-        shards,
+    trainer = TrainerConfig(
+        steps=-(-steps.clips // clips),
+        batch_size=clips,
+        precision=regression.trainer.precision,
+        sharding=ShardingConfig(shards=1),
     )
-
-
-def stage_rows(
-    config: AnyStage, model: WorldModelConfig, source: Sources, devices: int, memory: float
-) -> list[Callable[[], Row]]:
-    """Functions that estimate the trainings of one step, and the setting with which each would fit; empty where it does."""
-    rows: list[Callable[[], Row]] = []
-    for one in trainings(config, model, source):
-        if isinstance(config, DistillConfig) and one.title.endswith("regression"):
-            rows.append(partial(_shard_row, config, model, source, memory))
-        rows.append(partial(_training_row, one, devices, memory))
-    return rows
-
-
-def _training_row(training: Training, devices: int, memory: float) -> Row:
-    return training.estimate(devices), training.fitting_setting(devices, memory)
-
-
-def _shard_row(config: DistillConfig, model: WorldModelConfig, source: Sources, memory: float) -> Row:
-    shard = trajectory_shard(config, model, source)
-    return shard, "" if shard.fits(memory) else "fewer clips_per_shard"
+    encoded = (clips * len(config.views), partial(source.looking, "tokenizer", longest, trainer.precision))
+    return Training(
+        f"distill: trajectories (a shard of {clips} clips)", trainer, model, work, trained=lambda _: False,
+        # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
+        turns={0: (1 + sum(steps.substeps)) / (1 + config.spec.steps)}, before=[encoded] if frames else [],
+        smaller="fewer clips_per_shard",
+    )  # fmt: skip
 
 
 def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
@@ -556,8 +504,8 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
         model = read_checkpoint_info(Path(start)).config
     if isinstance(config, Stage2Config):
         model = stage2_model_config(config, model)
-    for row in stage_rows(config, model, source, int(os.environ.get("WORLD_SIZE", "1")), memory):
-        need, setting = row()
+    for training in trainings(config, model, source):
+        need, setting = training.row(int(os.environ.get("WORLD_SIZE", "1")), memory)
         if setting:
             raise ConfigError(
                 "This training does not fit the device's memory.",

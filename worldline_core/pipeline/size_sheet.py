@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
@@ -15,11 +15,14 @@ from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import DESCRIPTION, read_checkpoint_info
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline.cards import CARDS, UTILISATION, CardName
-from worldline_core.pipeline.memory_estimate import USABLE, AnyStage, Estimate, Row, Sources, gigabytes, stage_rows
+from worldline_core.pipeline.memory_estimate import USABLE, AnyStage, Estimate, Sources, Training, gigabytes, trainings
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.progress import Progress
 from worldline_core.shipped import project_path
 from worldline_core.training.clip_config import FrameInput
+
+Row = tuple[Estimate, str]
+"""What a training takes, and the setting with which it would fit; empty where it does."""
 
 
 class SizeSheet(StrictModel):
@@ -75,7 +78,7 @@ class SizeSheet(StrictModel):
         reading = stage.input if isinstance(stage.input, FrameInput) else self.config.encode_latents
         return Sources.of(self.folder("tokenizer"), self.folder("teacher"), reading.image_size)
 
-    def _rows(self) -> list[Callable[[], Row]]:
+    def _trainings(self) -> list[Training]:
         generation = self.model.model_copy(update={"towers": "generation"})
         stages = (
             (self.config.train_stage1, self.model),
@@ -83,15 +86,15 @@ class SizeSheet(StrictModel):
             (self.config.distill, generation),
         )
         given = ((stage, model) for stage, model in stages if stage is not None)
-        return [row for s, m in given for row in stage_rows(s, m, self.source(s), self.devices, self.bytes)]
+        return [training for stage, model in given for training in trainings(stage, model, self.source(stage))]
 
     def row(self, number: int) -> Row:
         """One line of the sheet."""
-        return self._rows()[number]()
+        return self._trainings()[number].row(self.devices, self.bytes)
 
     def _finished(self) -> Iterator[tuple[int, Row]]:
         """Lines by their numbers as they are done, a core each; those that take longest are begun first."""
-        numbers = range(len(self._rows()))
+        numbers = range(len(self._trainings()))
         with ProcessPoolExecutor(len(os.sched_getaffinity(0)), multiprocessing.get_context("fork")) as pool:
             waiting = {pool.submit(self.row, number): number for number in reversed(numbers)}
             try:
@@ -103,7 +106,7 @@ class SizeSheet(StrictModel):
     def rows(self) -> list[Row]:
         """Memory of every training in the order of a run, and the setting with which it would fit."""
         made: dict[int, Row] = {}
-        with Progress("worldline plan", len(self._rows()), "training") as progress:
+        with Progress("worldline plan", len(self._trainings()), "training") as progress:
             for number, row in self._finished():
                 made[number] = row
                 progress.advance()
