@@ -20,7 +20,7 @@ from worldline_core.calibration.estimate.mount_search import mounts_around
 from worldline_core.calibration.estimate.recordings import recorded_views
 from worldline_core.calibration.estimate.refine import fit_still
 from worldline_core.calibration.estimate.still_camera import agreement, tools_apart
-from worldline_core.calibration.estimate.verdict import ViewEstimate, full_size
+from worldline_core.calibration.estimate.verdict import ViewEstimate, cause_of_disagreement, clearest_step, full_size
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
@@ -70,9 +70,13 @@ def test_a_still_camera_is_found_and_bad_sets_are_unsure(tmp_path: Path) -> None
     assert found.verdict == "sure", found.reasons
     tools = np.concatenate([robot.tool_poses(episode.state.astype(np.float64)).numpy() for episode, _ in loaded])
     assert benchmark.estimate_errors(found, loaded[0][0].cameras["head"], tools, None)["tool"] < 3
-    for spoil in ("mirrored", "other states"):
-        (found,) = estimate_views(iter(benchmark.SPOILED[spoil](loaded)), robot, len(loaded))
-        assert found.verdict == "unsure", spoil
+    (late,) = estimate_views(iter(benchmark.SPOILED["states late by 3 frames"](loaded)), robot, len(loaded))
+    assert late.verdict == "sure" and abs(late.lag_frames + 3) < 0.3
+    named = {"mirrored": "left and right", "other states": "other episodes", "moved half way": "stands elsewhere"}
+    for spoil, words in (named | {"nothing": "another robot"}).items():
+        declared = robot if spoil in named else ArmKinematics(load_embodiment("panda_ivory"))
+        (found,) = estimate_views(iter(benchmark.SPOILED[spoil](loaded)), declared, len(loaded))
+        assert found.verdict == "unsure" and words in " ".join(found.reasons), (spoil, found.reasons)
         assert not camera_file([found])["views"]
 
 
@@ -109,6 +113,17 @@ def test_what_moves_outside_of_the_robot_s_masks_does_not_count(bank: Loaded, ki
     assert np.mean((seen[0] > 0) & (seen[0] < [width, height])) > 0.8
 
 
+@pytest.mark.parametrize(
+    ("later", "deviations", "expected"),
+    [((0.0, 0.0), 1.0, None), ((-8.0, -6.0), 6.0, None), ((-8.0, -8.0), 1.0, 6), ((-8.0, 9.0), 1.0, None)],
+    ids=["stands", "hardly known", "moved", "scattered"],
+)
+def test_a_camera_has_moved_where_episodes_that_know_it_say_so(later, deviations, expected):
+    values, spread = np.random.default_rng(0).normal(0, 0.5, (10, 2)), np.ones(10)
+    values[6::2, 0], values[7::2, 0], spread[6:] = later[0], later[1], deviations
+    assert clearest_step(values, spread[:, None, None] ** 2 * np.eye(2), 2.5) == expected
+
+
 def test_a_segmenter_needs_its_weights(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["calibrate", "estimate", "my.yaml", "--segmenter", "sam3"])
@@ -121,6 +136,28 @@ def test_what_cannot_be_estimated_is_named(bank: Loaded, kinematics: ArmKinemati
     for episodes, reason in spoiled:
         (found,) = estimate_views(iter(episodes), kinematics, len(episodes))
         assert found.camera is None and reason in found.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "views", "words"),
+    [
+        ("nothing", ("head", "left_wrist"), "another robot"),
+        ("wrists exchanged", ("left_wrist", "right_wrist"), "exchanged"),
+        ("other states", ("head", "left_wrist"), "other episodes"),
+    ],
+)
+def test_why_pictures_do_not_show_the_robot_of_the_states_is_named(spoil, views, words):
+    found, defects = EpisodeSet.open(benchmark.RECORDINGS), benchmark.RECORDINGS / "injected_defects.json"
+    rows = {i: row for i, row in enumerate(found.rows) if row.episode_id not in json.loads(defects.read_text())}
+    of_one_arm = [i for i, row in rows.items() if row.embodiment == "ur5e_silver" and row.task_family != "carry"]
+    loaded = [
+        (replace(found.episode(i), cameras={}), {v: found.frames(i, v) for v in ("head", "left_wrist", "right_wrist")})
+        for i in of_one_arm[:6]
+    ]
+    robot = ArmKinematics(load_embodiment("ur5e_silver"))
+    recorded = recorded_views(iter(benchmark.SPOILED[spoil](loaded)), robot, len(loaded))
+    for view in views:
+        assert words in cause_of_disagreement(recorded[view], {"left_wrist": 0, "right_wrist": 1}.get(view))
 
 
 @pytest.mark.parametrize(

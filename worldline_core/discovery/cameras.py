@@ -36,7 +36,7 @@ class Seen:
 
     moving: float
     resting: float
-    follows: Mapping[Side, float]
+    follows: Mapping[str, float]
 
     def sentence(self) -> str:
         return (
@@ -44,20 +44,21 @@ class Seen:
         )
 
 
-def watch(frames: np.ndarray, motion: Mapping[Side, np.ndarray]) -> Seen | None:
-    """Compare pictures (N, H, W, 3) with the motion (N - 1,) of each arm between them; None where nothing moves."""
+def watch[S: str](frames: np.ndarray, motion: Mapping[S, np.ndarray]) -> Seen | None:
+    """Compare pictures (N, H, W, 3) or grey (N, H, W) with the motion (N - 1,) of each arm between them; None where nothing moves."""
     if len(frames) < 12 or not motion or max(float(values.max()) for values in motion.values()) <= 1e-3:
         return None
-    grey = [cv2.cvtColor(cv2.resize(f, _SIZE, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY) for f in frames]
+    small = [cv2.resize(f, _SIZE, interpolation=cv2.INTER_AREA) for f in frames]
+    grey = [f if f.ndim == 2 else cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in small]
     kernel = np.ones((3, 3), np.uint8)
     details = np.stack([cv2.dilate(g, kernel) - cv2.erode(g, kernel) for g in grey])[:-1] > _LEVELS
     changed = np.abs(np.diff(np.stack(grey).astype(np.int16), axis=0)) > _LEVELS
     share = (changed & details).sum(axis=(1, 2)) / np.maximum(details.sum(axis=(1, 2)), 1)
-    follows: dict[Side, float] = {
+    follows: dict[str, float] = {
         side: float(np.corrcoef(share, values)[0, 1]) if values.std() > 0 and share.std() > 0 else 0.0
         for side, values in motion.items()
     }
-    order = np.argsort(motion[max(follows, key=follows.__getitem__)], kind="stable")
+    order = np.argsort(motion[max(motion, key=lambda side: follows[side])], kind="stable")
     quarter = max(3, len(order) // 4)
     return Seen(float(np.median(share[order[-quarter:]])), float(np.median(share[order[:quarter]])), follows)
 

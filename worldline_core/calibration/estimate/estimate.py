@@ -82,7 +82,7 @@ def _estimate(recorded: RecordedView, kinematics: ArmKinematics, mask_robot: Mas
         count = len(recorded.episodes)
         return ViewEstimate(recorded.view, arm is not None, "unsure", None, reasons=(reason,), episodes=count)
     if arm is not None:
-        return judge_wrist(recorded, estimate_wrist(recorded, arm, mount))
+        return judge_wrist(recorded, estimate_wrist(recorded, arm, mount), arm)
     found = estimate_still(recorded)
     if mask_robot is None:
         return judge_still(recorded, found)

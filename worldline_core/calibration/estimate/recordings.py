@@ -92,6 +92,10 @@ class RecordedView:
     def of(self, episodes: Sequence[ViewOfEpisode]) -> RecordedView:
         return replace(self, episodes=tuple(episodes))
 
+    def mirrored(self) -> RecordedView:
+        """The same robot before pictures with left and right exchanged."""
+        return self.of([replace(episode, gray=episode.gray[:, :, ::-1].copy()) for episode in self.episodes])
+
     def unknown_camera(self, *, fine: bool) -> CameraTrack:
         """A camera of a focal length of one width at the base, to be replaced."""
         first = self.episodes[0]

@@ -37,7 +37,7 @@ class StillCamera:
         halves: of the even and of the odd episodes.
         agreements: (e,) of each episode with the camera of the half that it does not belong to.
         rival: the best camera elsewhere, and its agreements.
-        mirrored: log-likelihood that mirrored pictures gain, on some episodes at the rough size.
+        mirrored: log-likelihood that mirrored pictures gain, on some episodes at the rough size, and their agreement then.
     """
 
     fitted: FittedCamera
@@ -47,6 +47,7 @@ class StillCamera:
     rival: FittedCamera | None
     rival_agreements: np.ndarray | None
     mirrored: float
+    mirrored_agreement: float
 
 
 def estimate_still(recorded: RecordedView) -> StillCamera:
@@ -68,7 +69,9 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
         fit_still(mirrored_views, _at(camera, each), lag, ROUGH_BLURS, 5, recorded.shared)
         for each in search_cameras(_mirrored(motion))[: STARTS_REFINED // 3]
     ]
-    gain = max(fit.likelihood for fit in mirrored) - distinct[0].likelihood
+    other = max(mirrored, key=lambda fit: fit.likelihood)
+    gain = other.likelihood - distinct[0].likelihood
+    agreed = float(np.median([agreement(view, other) for view in mirrored_views]))
     views = recorded.still_views(fine=True)
     fine = recorded.unknown_camera(fine=True)
     fits = [
@@ -80,7 +83,7 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
     halves, agreements = _by_halves(views, best, recorded.shared)
     rival = next((fit for fit in fits[1:] if tools_apart(best.camera, fit.camera, recorded) > RIVAL_APART), None)
     rivals = None if rival is None else np.array([agreement(view, rival) for view in views])
-    return StillCamera(best, halves, agreements, found[0].score, rival, rivals, gain)
+    return StillCamera(best, halves, agreements, found[0].score, rival, rivals, gain, agreed)
 
 
 def refine_with_masks(masked: RecordedView, found: StillCamera) -> StillCamera:

@@ -14,11 +14,10 @@ from typing import Literal
 import numpy as np
 
 from worldline_core.calibration.camera_errors import (
-    LAG,
     PARAMETERS,
     SCALE,
+    Equations,
     KindOfError,
-    StillView,
     kinds_of_error,
     projected,
 )
@@ -32,7 +31,9 @@ from worldline_core.calibration.estimate.still_camera import (
     tools_in_view,
 )
 from worldline_core.calibration.estimate.wrist_camera import LEAST_WRIST_AGREEMENT, SHARED_WRIST_CAMERA, WristCamera
+from worldline_core.calibration.observation import tool_travel
 from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.discovery.cameras import watch
 from worldline_core.geometry.cameras import Resize, project_points
 
 ZOOM_ERROR = 0.15
@@ -44,6 +45,9 @@ LARGEST_HALVES_APART, LARGEST_INTERVAL = 0.035, 6.0
 """Between the tools of the two halves [widths], and of the interval in the picture [% of the width]."""
 MIRRORED_GAIN = -20.0
 """Log-likelihood above which mirrored pictures cannot be told apart; of usual sets it is -90 to -260."""
+LEAST_FOLLOWED, FOLLOWED_MORE = 0.3, 0.1
+"""Correlation of how much a view changes with an arm's motion, 0.4 to 0.9 of the arm's own episodes and views and up to 0.2 of others;
+and by how much another arm's is larger where wrist views are exchanged."""
 LEAST_IN_VIEW = 0.1
 FEWEST_FINGER_STEPS = 20
 LARGEST_WRIST_HALVES_APART, LARGEST_WRIST_INTERVAL = 0.05, 10.0
@@ -53,6 +57,14 @@ LEAST_TRAVEL_M, LEAST_CHANGE = 1.5, 0.02
 """Travel of the busiest tool over all episodes together; after less, a mirrored camera can look right."""
 MOVED_SHARE, MOVED_DEVIATIONS = 2.5, 5.0
 """Displacement of the robot in the picture from one episode on: shares of the width, standard deviations."""
+MOVED = "from episode {} on the camera stands elsewhere: give the two parts a source each"
+LEAST_SPREAD = 0.5
+"""Standard deviation [% of the width] of an episode's place in the picture, however much it shows."""
+USUAL_AGREEMENT, CLEAR_AGREEMENT, LARGEST_SCATTER = 0.7, 0.8, 1.7
+"""An agreement below the first, with episodes that contradict each other by more than these squares (usual sets: 0.4 to 0.9), is that
+of another robot, unless mirrored pictures agree better than the second."""
+AGREEMENT_SPREAD = 0.15
+"""Standard deviation of the agreements of episodes that one camera fits."""
 
 Verdict = Literal["sure", "unsure"]
 
@@ -131,15 +143,23 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     if typical < LEAST_AGREEMENT:
         reasons.append(
             f"what moves in the pictures is not the robot of these states (agreement {typical:.2f},"
-            f" {LEAST_AGREEMENT} needed): it is hardly in view, the states or the robot are others, or the view is"
+            f" {LEAST_AGREEMENT} needed): {cause_of_disagreement(recorded, None)}"
         )
     if (inside := tools_in_view(fitted.camera, recorded)) < LEAST_IN_VIEW:
         reasons.append(f"the tools are in the picture {inside:.0%} of the time")
-    if found.mirrored > MIRRORED_GAIN:
-        how = (
-            "better: left and right are exchanged" if found.mirrored > 0 else "as well: the motion shows no difference"
+    own = [equations_at([view], fitted.camera, fitted.lag, AGREEMENT_BLUR, recorded.shared) for view in views]
+    places, known = _places(own, [view.at(fitted.camera).shown(np.zeros(PARAMETERS)) for view in views])
+    moved, scatter = _moved_at(recorded, found, places, known), scatter_of(places, known)
+    contradictory = moved is None and typical < USUAL_AGREEMENT and scatter > LARGEST_SCATTER
+    if found.mirrored > -MIRRORED_GAIN and (not contradictory or found.mirrored_agreement > CLEAR_AGREEMENT):
+        reasons.append("mirrored pictures fit better: left and right are exchanged")
+    elif contradictory:
+        reasons.append(
+            f"each episode puts the robot elsewhere ({scatter:.1f} times the expected squares, agreement {typical:.2f}): another"
+            " robot is declared, its columns or units are others, or other things move"
         )
-        reasons.append(f"mirrored pictures fit {how}")
+    elif found.mirrored > MIRRORED_GAIN:
+        reasons.append("mirrored pictures fit as well: the motion shows no difference")
     if found.rival is not None and found.rival_agreements is not None:
         apart = 100 * tools_apart(fitted.camera, found.rival.camera, recorded)
         gain = found.agreements - found.rival_agreements
@@ -153,15 +173,14 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     interval = kinds[-1].half_interval
     if interval > LARGEST_INTERVAL:
         reasons.append(f"the robot's place in the picture is known to {interval:.1f} % of the width only")
-    moved = _moved_at(recorded, found, views)
     if moved is not None:
-        reasons.append(f"from episode {moved} on the camera stands elsewhere: give the two parts a source each")
+        reasons.insert(0, MOVED.format(moved))
     low = [e.episode_id for e, a in zip(recorded.episodes, found.agreements, strict=True) if a < LEAST_EPISODE]
     notes = (f"episodes that do not fit: {', '.join(low)}",) if low and moved is None else ()
     if 2 * len(low) > len(recorded.episodes):
         reasons.append(f"{len(low)} of {len(recorded.episodes)} episodes do not fit")
-    if typical < LEAST_AGREEMENT:  # then nothing else means anything
-        reasons, moved = reasons[:1], None
+    if typical < LEAST_AGREEMENT and moved is None:  # then nothing else means anything
+        reasons = reasons[:1]
     estimate = _estimate(recorded, fitted, kinds, typical, reasons, wrist=False)
     agreements = found.rival_agreements
     return replace(
@@ -173,7 +192,7 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     )
 
 
-def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
+def judge_wrist(recorded: RecordedView, found: WristCamera, arm: int) -> ViewEstimate:
     """The estimate of a wrist view with its intervals and all reasons against it."""
     fitted = found.fitted
     _, _, ahead, slope = projected(np.zeros((1, 1, 3)), fitted.camera)
@@ -185,8 +204,12 @@ def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
         reasons.append(f"the scene's motion is seen in {known} episodes, {FEWEST_EPISODES} needed")
     elif typical < LEAST_WRIST_AGREEMENT:
         reasons.append(
-            f"the scene does not move as the hand does (agreement {typical:.2f}, {LEAST_WRIST_AGREEMENT} needed): the"
-            " states, the robot or the arm are others, or the view is no wrist camera of this arm"
+            f"the scene does not move as the hand does (agreement {typical:.2f}, {LEAST_WRIST_AGREEMENT} needed):"
+            f" {cause_of_disagreement(recorded, arm)}"
+        )
+    if found.mirrored_agreement > max(typical, LEAST_WRIST_AGREEMENT):
+        reasons.append(
+            f"mirrored pictures fit better (agreement {found.mirrored_agreement:.2f}): left and right are exchanged"
         )
     if found.rival_agreements is not None:
         deviations = _deviations(found.agreements - found.rival_agreements)
@@ -205,11 +228,42 @@ def judge_wrist(recorded: RecordedView, found: WristCamera) -> ViewEstimate:
         reasons.append("the tool is behind the camera")
     elif halves > 100 * LARGEST_WRIST_HALVES_APART:
         reasons.append(f"two halves of the episodes give cameras {halves:.1f} % of the width apart")
+    split = clearest_step(*_places(found.own, [shown] * len(found.own)), MOVED_SHARE)
+    moved = None if split is None else recorded.episodes[split].episode_id
+    if moved is not None:
+        reasons.insert(0, MOVED.format(moved))
     interval = kinds[-1].half_interval
     if interval > LARGEST_WRIST_INTERVAL:
         reasons.append(f"the tool's place in the picture is known to {interval:.1f} % of the width only")
     notes = ("the mount was searched: the description has none, or another one",) if found.searched else ()
-    return replace(_estimate(recorded, fitted, kinds, typical, reasons, wrist=True), notes=notes)
+    return replace(_estimate(recorded, fitted, kinds, typical, reasons, wrist=True), notes=notes, moved_at=moved)
+
+
+def cause_of_disagreement(recorded: RecordedView, arm: int | None) -> str:
+    """Why the pictures do not show the robot of the states; `arm` is that of a wrist view."""
+    follows = correlations(recorded)
+    most = float(follows.max())
+    if most < LEAST_FOLLOWED:
+        return (
+            f"they do not change when the robot moves (correlation {most:.2f}), so states or pictures are of other episodes,"
+            " or the robot is hardly in view"
+        )
+    if arm is not None and most > follows[arm] + FOLLOWED_MORE:
+        return (
+            f"the pictures change when another arm moves (correlation {most:.2f}), not with their own ({follows[arm]:.2f}):"
+            " two wrist views are exchanged"
+        )
+    return (
+        f"they change when the robot moves (correlation {most:.2f}), but not as it does: another robot is declared, its columns"
+        " or units are others, the pictures are mirrored, or the view is another camera's"
+    )
+
+
+def correlations(recorded: RecordedView) -> np.ndarray:
+    """(a,) correlation of how much the pictures change with the motion of each arm, in the median of the episodes."""
+    seen = [watch(e.gray, {str(i): m for i, m in enumerate(tool_travel(e.tools).T)}) for e in recorded.episodes]
+    known = [[each.follows[str(i)] for i in range(len(each.follows))] for each in seen if each is not None]
+    return np.median(known, axis=0) if known else np.zeros(recorded.episodes[0].tools.shape[1])
 
 
 def _estimate(
@@ -263,29 +317,48 @@ def _intervals(
     return (*kinds_of_error(none, (covariance + np.outer(systematic, systematic)) * units, None), in_the_picture)
 
 
-def _moved_at(recorded: RecordedView, found: StillCamera, views: Sequence[StillView]) -> str | None:
+def _places(own: Sequence[Equations], shown: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Where each episode alone puts the robot in the picture (e, 2), beside where all do [% of the width], and covariances (e, 2, 2).
+
+    Args:
+        own: its equations at the camera of all. shown: displacement in the picture (2, 8) by each parameter.
+    """
+    weak = np.diag(np.array([0.2] * 3 + [0.2] * 3 + [0.02, 0.3]) ** -2.0)
+    places = [A @ np.linalg.solve(e.information + weak, e.gradient) for e, A in zip(own, shown, strict=True)]
+    known = [A @ np.linalg.inv(e.information + weak) @ A.T for e, A in zip(own, shown, strict=True)]
+    return np.stack(places), np.stack(known) + LEAST_SPREAD**2 * np.eye(2)
+
+
+def _moved_at(recorded: RecordedView, found: StillCamera, places: np.ndarray, known: np.ndarray) -> str | None:
     """The first episode that the camera of those before it does not fit; None where all have one camera."""
-    fitted, count = found.fitted, len(views)
-    places, weak = np.zeros((count, 2)), np.diag(np.array([0.2] * 3 + [0.2] * 3 + [0.02, 0.3]) ** -2.0)
-    for i, view in enumerate(views):
-        own = equations_at([view], fitted.camera, fitted.lag, AGREEMENT_BLUR, recorded.shared)
-        change = np.linalg.solve(own.information + weak, own.gradient)
-        change[LAG] = 0.0
-        places[i] = view.at(fitted.camera).shown(np.zeros(PARAMETERS)) @ change
-    split = _clearest_split(places, MOVED_SHARE)
+    split = clearest_step(places, known, MOVED_SHARE)
     if split is None:
-        split = _clearest_split(found.agreements[:, None], LEAST_EPISODE)
+        spread = np.full((len(places), 1, 1), AGREEMENT_SPREAD**2)
+        split = clearest_step(found.agreements[:, None], spread, LEAST_EPISODE)
     return None if split is None else recorded.episodes[split].episode_id
 
 
-def _clearest_split(values: np.ndarray, least: float) -> int | None:
-    """Index at which a series (n, k) steps by `least` and by many standard deviations of what remains; None where it does not."""
-    best, at = 0.0, None
+def scatter_of(values: np.ndarray, covariances: np.ndarray) -> float:
+    """Squares of a series (n, k) about its mean by its covariances (n, k, k), in those that are expected."""
+    weights = np.linalg.inv(covariances)
+    left = values - np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, values))
+    return float(np.einsum("ni,nij,nj->", left, weights, left)) / (left.size - left.shape[1])
+
+
+def clearest_step(values: np.ndarray, covariances: np.ndarray, least: float) -> int | None:
+    """Index at which a series (n, k) of known covariances (n, k, k) steps by `least` and by many standard deviations; None where
+    it does not. A value counts as much as it is known, and a series that scatters more than that is known less.
+    """
+    best, at = MOVED_DEVIATIONS**2, None
+    weights = np.linalg.inv(covariances)
     for k in range(2, len(values) - 1):
-        before, after = values[:k], values[k:]
-        step = float(np.linalg.norm(np.median(after, axis=0) - np.median(before, axis=0)))
-        spread = np.median(np.abs(np.concatenate([before - np.median(before, 0), after - np.median(after, 0)])))
-        error = 1.48 * max(float(spread), least / 20) * np.sqrt(1 / k + 1 / (len(values) - k))
-        if step > least and step / error > max(best, MOVED_DEVIATIONS):
-            best, at = step / error, k
+        parts = slice(None, k), slice(k, None)
+        errors = [np.linalg.inv(weights[part].sum(axis=0)) for part in parts]
+        means = [e @ np.einsum("nij,nj->i", weights[p], values[p]) for e, p in zip(errors, parts, strict=True)]
+        left = np.concatenate([values[part] - mean for part, mean in zip(parts, means, strict=True)])
+        scatter = max(1.0, float(np.einsum("ni,nij,nj->", left, weights, left)) / (left.size - 2 * left.shape[1]))
+        step = means[1] - means[0]
+        squares = float(step @ np.linalg.solve(scatter * (errors[0] + errors[1]), step))
+        if np.linalg.norm(step) > least and squares > best:
+            best, at = squares, k
     return at

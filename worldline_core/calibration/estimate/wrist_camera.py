@@ -27,6 +27,7 @@ from worldline_core.calibration.camera_errors import (
 from worldline_core.calibration.estimate.mount_search import mounts_around
 from worldline_core.calibration.estimate.recordings import RecordedView, ViewOfEpisode, certainty
 from worldline_core.calibration.estimate.refine import LAG_PRIOR, FittedCamera, climb, inflation
+from worldline_core.calibration.estimate.still_camera import lag_by_amounts
 from worldline_core.calibration.evidence import MIN_OPENING_STEP
 from worldline_core.calibration.observation import tool_travel
 from worldline_core.data.episodes.episode import CameraTrack
@@ -42,8 +43,8 @@ MOUNT_PRIOR, SEARCHED_PRIOR = np.array([0.25] * 3 + [0.04] * 3), np.array([1.0] 
 """Standard deviations from a described mount, and from one that was searched [rad, m]."""
 WRIST_FOCALS, SEARCHED_FOCALS = (0.5, 0.75, 1.1), (0.5, 0.85)
 """Starts, in widths of the picture: 90, 67 and 49 degrees across; and of a search, in which every mount is seen with each."""
-LEAST_WRIST_AGREEMENT = 0.3
-"""Share of the scene's flow, in the median of held-out episodes, that a camera must explain."""
+LEAST_WRIST_AGREEMENT, USUAL_WRIST_AGREEMENT = 0.3, 0.7
+"""Shares of the scene's flow, in the median of held-out episodes, that a camera must explain, and that it explains in usual sets."""
 EPISODES_OF_STARTS, FOLLOWED = 5, 6
 """Episodes in which starts are compared, and how many starts of a search are followed."""
 MOST_COVERED, BLIND = 0.7, pose_from_rotation(np.array([0.0, 0.0, 9.0]), np.eye(3))
@@ -156,42 +157,70 @@ class WristCamera:
 
     Attributes:
         agreements: (e,) of each episode with the camera of the half that it does not belong to; NaN where it shows nothing.
+        own: equations of each episode alone at the fitted camera.
         fingers: number of steps in which the fingers' own motion is seen.
         searched: whether the mount was searched, not described.
         rival: the best camera of a search that is mounted otherwise.
         rival_agreements: (e,) of each episode with the rival; NaN as above.
+        mirrored_agreement: the median of some episodes whose pictures are mirrored; 0 where the pictures agree as usual.
     """
 
     fitted: FittedCamera
     halves: tuple[FittedCamera, ...]
     agreements: np.ndarray
+    own: tuple[Equations, ...]
     fingers: int
     searched: bool = False
     rival: FittedCamera | None = None
     rival_agreements: np.ndarray | None = None
+    mirrored_agreement: float = 0.0
 
     @property
     def agreement(self) -> float:
         """The median of the episodes that show something; 0 where none does."""
-        known = self.agreements[np.isfinite(self.agreements)]
-        return float(np.median(known)) if len(known) else 0.0
+        return _median(self.agreements)
+
+
+def _median(agreements: np.ndarray) -> float:
+    known = agreements[np.isfinite(agreements)]
+    return float(np.median(known)) if len(known) else 0.0
 
 
 def estimate_wrist(recorded: RecordedView, arm: int, T_tool_mount: np.ndarray | None) -> WristCamera:
+    """The camera of a wrist view, and how well its pictures fit mirrored where they agree less than usual."""
+    found = _estimate_wrist(recorded, arm, T_tool_mount)
+    if found.agreement >= USUAL_WRIST_AGREEMENT:
+        return found
+    few = _few(recorded).mirrored()
+    start = found.fitted.camera if T_tool_mount is None else mounted(recorded, T_tool_mount, WRIST_FOCALS[1])
+    evidence = wrist_evidence(few, arm, start)
+    fit = fit_wrist(evidence, start, found.fitted.lag, start, MOUNT_PRIOR)
+    return replace(found, mirrored_agreement=_median(np.array([e.agreement(fit.camera, fit.lag) for e in evidence])))
+
+
+def _few(recorded: RecordedView) -> RecordedView:
+    return recorded.of(recorded.episodes[:: max(1, len(recorded.episodes) // EPISODES_OF_STARTS)])
+
+
+def _estimate_wrist(recorded: RecordedView, arm: int, T_tool_mount: np.ndarray | None) -> WristCamera:
     """The camera of a wrist view, from where the description mounts it about; from all around the hand where it says nothing,
     or what it says does not fit. The focal length is not known at all.
     """
-    few = recorded.of(recorded.episodes[:: max(1, len(recorded.episodes) // EPISODES_OF_STARTS)])
+    lag = lag_by_amounts(recorded)
+    few = _few(recorded)
     if T_tool_mount is not None:
         starts = [mounted(recorded, T_tool_mount, focal) for focal in WRIST_FOCALS]
         evidence = wrist_evidence(few, arm, starts[1])
-        rough = [fit_wrist(evidence, start, 0.0, starts[1], MOUNT_PRIOR) for start in starts]
+        # From a lag of frames, the nearest optimum is another one.
+        rough = [
+            fit_wrist(evidence, s, late, starts[1], MOUNT_PRIOR) for s in starts for late in dict.fromkeys((0.0, lag))
+        ]
         best = max(rough, key=lambda fit: fit.likelihood)
         found = _made_exact(recorded, arm, best, starts[1], MOUNT_PRIOR)
         if found.agreement >= LEAST_WRIST_AGREEMENT:
             return found
-    starts = _searched_starts(few, arm)
-    rough = [(each, fit_wrist(each, start, 0.0, start, SEARCHED_PRIOR)) for start, each in starts]
+    starts = _searched_starts(few, arm, lag)
+    rough = [(each, fit_wrist(each, start, lag, start, SEARCHED_PRIOR)) for start, each in starts]
     distinct = _distinct(rough)
     # The hand hides something else from each of them: they are compared by what the first one sees, in all episodes.
     common = wrist_evidence(recorded, arm, distinct[0].camera)
@@ -218,10 +247,11 @@ def _made_exact(
     halves = tuple(fit_wrist(evidence[i::2], best.camera, best.lag, prior_at, prior) for i in (0, 1))
     others = [halves[1 - i % 2] for i in range(len(evidence))]
     agreements = np.array([e.agreement(other.camera, other.lag) for e, other in zip(evidence, others, strict=True)])
-    return WristCamera(best, halves, agreements, sum(each.finger_steps for each in evidence))
+    own = tuple(each.at(best.camera, best.lag, BLURS[-1]) for each in evidence)
+    return WristCamera(best, halves, agreements, own, sum(each.finger_steps for each in evidence))
 
 
-def _searched_starts(few: RecordedView, arm: int) -> list[tuple[CameraTrack, list[WristEvidence]]]:
+def _searched_starts(few: RecordedView, arm: int, lag: float) -> list[tuple[CameraTrack, list[WristEvidence]]]:
     """The cameras around the hand that explain the scene's flow best, the best first, and what they see."""
     blind = mounted(few, BLIND, 1.0)  # nothing of the hand is hidden from it
     evidence = wrist_evidence(few, arm, blind)
@@ -236,21 +266,21 @@ def _searched_starts(few: RecordedView, arm: int) -> list[tuple[CameraTrack, lis
             twice = replace(camera, T_base_camera=np.repeat(camera.T_base_camera, 2, axis=0))
             covered = covered_cells(twice, np.stack([hand, hand]), radii, (1, *cells))[0]
             seen = [replace(each, scene=each.scene.without(covered)) for each in evidence]
-            scored.append((covered.mean() > MOST_COVERED, -explained(seen, camera), camera))
+            scored.append((covered.mean() > MOST_COVERED, -explained(seen, camera, lag), camera))
     best = sorted(scored, key=lambda each: each[:2])[:FOLLOWED]
     return [(camera, wrist_evidence(few, arm, camera)) for *_, camera in best]
 
 
-def explained(evidence: Sequence[WristEvidence], camera: CameraTrack) -> float:
-    """Share of the scene's flow of all episodes together that a camera explains, without a lag."""
-    left, none = np.sum([each.scene_errors(camera, 0.0) for each in evidence], axis=0)
+def explained(evidence: Sequence[WristEvidence], camera: CameraTrack, lag: float) -> float:
+    """Share of the scene's flow of all episodes together that a camera explains."""
+    left, none = np.sum([each.scene_errors(camera, lag) for each in evidence], axis=0)
     return 1.0 - float(left / none) if none > 0 else 0.0
 
 
 def _distinct(rough: Sequence[tuple[list[WristEvidence], FittedCamera]]) -> list[FittedCamera]:
     """Cameras that are mounted apart, those that explain most of what they see first."""
     kept: list[FittedCamera] = []
-    for _, fit in sorted(rough, key=lambda each: -explained(each[0], each[1].camera)):
+    for _, fit in sorted(rough, key=lambda each: -explained(each[0], each[1].camera, each[1].lag)):
         if all(_apart(fit.camera, other.camera) for other in kept):
             kept.append(fit)
     return kept
