@@ -38,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("short_pauses")
 def recordings(tmp_path: Path) -> Path:
     with EpisodeSetWriter(tmp_path / "raw", video_crf=8) as writer:
         for number in range(2):
-            writer.add(*make_sample(number))
+            writer.add(*make_sample(number, views=("head",)))
     return tmp_path / "raw"
 
 
