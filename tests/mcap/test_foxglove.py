@@ -282,7 +282,7 @@ def avcc(packet: bytes, size: int = 4) -> bytes:
 def test_avcc_is_named(tmp_path: Path, codec: str, name: str) -> None:
     for size in (4, 2):
         write(tmp_path / "a.mcap", [avcc(packet, size) for packet in annex_b(codec)], format_name=name)
-        with pytest.raises(RejectedInputError, match=rf"(?s)Annex B.*AVCC: lengths of {size} bytes.*mp4toannexb"):
+        with pytest.raises(RejectedInputError, match=r"(?s)Annex B.*AVCC.*mp4toannexb"):
             load(declared(tmp_path)).frames("head")
 
 

@@ -111,20 +111,9 @@ class EncodedImage:
                 "Video messages are not in Annex B",
                 where=where,
                 expected="a start code (00 00 00 01) before every NAL unit",
-                got=f"AVCC: lengths of {self._length_bytes} bytes" if self._length_bytes else self.data[:8].hex(" "),
+                got=f"{self.data[:8].hex(' ')}, in AVCC the length of the unit",
                 next_step="write the packets through FFmpeg's bitstream filter h264_mp4toannexb or hevc_mp4toannexb",
             )
-
-    @property
-    def _length_bytes(self) -> int | None:
-        """Size of the lengths before the NAL units of mp4 (AVCC, HVCC); None where such lengths do not end with the data."""
-        for size in (4, 2, 1):
-            position = 0
-            while len(self.data) - position > size:
-                position += size + int.from_bytes(self.data[position : position + size])
-            if position == len(self.data) > 0:
-                return size
-        return None
 
 
 @dataclass(frozen=True, slots=True)
