@@ -155,9 +155,15 @@ def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> t
     lengths: list[int] = []
 
     def add(
-        kind: str = "clean", stage: Stage = "kept", reasons: tuple[str, ...] = (), *,
-        seed: int | None = None, num_frames: int = NUM_FRAMES, change: PictureDefect | None = None, still: bool = False,
-    ) -> _Episode:  # fmt: skip
+        kind: str = "clean",
+        stage: Stage = "kept",
+        reasons: tuple[str, ...] = (),
+        *,
+        seed: int | None = None,
+        num_frames: int = NUM_FRAMES,
+        change: PictureDefect | None = None,
+        still: bool = False,
+    ) -> _Episode:
         """The next episode; equal seeds make equal ones."""
         episode = _Episode(root, len(labels))
         labels.append(Label(f"{root.name}-{episode.index:06d}", "lerobot_v21", kind, stage, reasons))
@@ -178,11 +184,8 @@ def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> t
             add(name, "filter", reasons, change=change)
         add("still", "filter", ("static",), change=_frozen, still=True)
     _write_meta(root, lengths)
-    source = {
-        "kind": "lerobot_v21", "path": str(root), "name": root.name, "embodiment": EMBODIMENT, "angle_unit": "rad",
-        "views": _VIEWS, "split": "train",
-    }  # fmt: skip
-    return labels, source
+    source = {"kind": "lerobot_v21", "path": str(root), "name": root.name, "views": _VIEWS, "split": "train"}
+    return labels, source | {"embodiment": EMBODIMENT, "angle_unit": "rad"}
 
 
 def _write_episode(

@@ -84,12 +84,23 @@ def _camera(focal_px: float = 80.0) -> CameraTrack:
 
 def _episode(random: np.random.Generator, **changes: Any) -> Episode:
     state = pair_motion(random)
-    values = {
-        "source": "mcap", "embodiment": "ur5e_pair", "scene": "mcap", "task_family": "lift", "instruction": "lift the block",
-        "outcome": "success", "split": "train", "fps": FPS, "state": state, "action": state + np.float32(0.002),
-        "timestamps": np.arange(NUM_FRAMES) / FPS, "cameras": {"head": _camera()}, "state_names": PAIR_NAMES,
-    }  # fmt: skip
-    return Episode(**values | changes)
+    episode = Episode(
+        episode_id="",
+        source="mcap",
+        embodiment="ur5e_pair",
+        scene="mcap",
+        task_family="lift",
+        instruction="lift the block",
+        outcome="success",
+        split="train",
+        fps=FPS,
+        state=state,
+        action=state + np.float32(0.002),
+        timestamps=np.arange(NUM_FRAMES) / FPS,
+        cameras={"head": _camera()},
+        state_names=PAIR_NAMES,
+    )
+    return replace(episode, **changes)
 
 
 def rewrite(path: Path, change: Change = lambda topic, index, message: message, *, with_metadata: bool = True) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -42,16 +41,8 @@ def write_one_of_each(folder: Path) -> dict[str, Source]:
         "angle_unit": "rad",
         "views": {"observation.images.head": "head"},
     }
-    writers: dict[str, Callable[[Path, np.random.Generator], Source]] = {
-        "agibot_world": _agibot_world,
-        "robotwin": _robotwin,
-        "robomind": _robomind,
-        "agibot_gesim": _agibot_gesim,
-        "enerverse_ac": _enerverse_ac,
-        "unitree_h5": _unitree_h5,
-        "video_folder": _video_folder,
-    }
-    for name, write in writers.items():
+    for write in (_agibot_world, _robotwin, _robomind, _agibot_gesim, _enerverse_ac, _unitree_h5, _video_folder):
+        name = write.__name__.lstrip("_")
         sources[name] = {"path": str(folder / name), **write(folder / name, random)}
     return sources
 
