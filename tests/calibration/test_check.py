@@ -123,7 +123,7 @@ def test_recordings_are_read_in_a_process_with_limits_first(project_root: Path) 
 
 def made_up() -> check_report.CalibrationCheck:
     """Three verdicts, with names that would break a page that does not escape them."""
-    none = Explanation(RecordedConventions(), -80.0, {"hand_eye right_wrist": np.nan})
+    none = Explanation(RecordedConventions(), np.nan, {})
     best = Explanation(RecordedConventions(camera_axes="opengl"), -1.0, {})
     broken = Diagnosis(episode_id="b", verdict="explained", best=best, ranked=(best, none), notes=("a note",))
     fine = Diagnosis(episode_id="a", verdict="consistent", best=none, ranked=(none,))
@@ -148,8 +148,11 @@ def test_the_page_escapes_what_it_shows_and_json_holds_only_its_own_numbers() ->
     assert {"    line one", "    line two", "    line three"} <= set(text.splitlines())
     assert max(map(len, text.splitlines())) < 250
     content = json.loads(json.dumps(check_report.as_json(made_up()), allow_nan=False))
-    assert content["episodes"][1]["ranked"][0]["reading"] == "camera_axes: opengl"
-    assert content["episodes"][1]["ranked"][1]["evidence"] == {"hand_eye right_wrist": None}
+    assert [content["episodes"][1][name] for name in ("mistake", "score", "score_as_recorded")] == [
+        "camera_axes",
+        -1,
+        None,
+    ]
     assert content["sources"][0]["config_lines"] == ["line three"]
 
 
@@ -190,13 +193,12 @@ def test_the_repaired_side_draws_each_image_with_its_own_tools(episode, lags, mo
         return frame
 
     monkeypatch.setattr(check_report, "draw_overlay", record)
+    monkeypatch.setattr(check_report, "TILE_HEIGHT", 60)
     wrong = corrupt(episode, conventions)
-    check_report.diagnosis_picture(
-        diagnosis_of(conventions), wrong, {"right_wrist": late}, None, moments=4, tile_height=60
-    )
+    check_report.diagnosis_picture(diagnosis_of(conventions), wrong, {"right_wrist": late}, None)
     healthy = check_report.recorded_tracks(episode, "right_wrist", None)
-    assert len(drawn) == 8
-    assert all(np.allclose(poses, shown(healthy, number), atol=1e-6) for number, poses in drawn[4:])
+    assert len(drawn) == 6
+    assert all(np.allclose(poses, shown(healthy, number), atol=1e-6) for number, poses in drawn[3:])
     number, poses = drawn[0]  # as recorded they do not belong together
     assert not np.allclose(poses, shown(healthy, number), atol=1e-3)
 

@@ -68,8 +68,9 @@ LARGEST_STEP = np.array([0.12] * 3 + [0.15] * 3 + [0.1, 1.0])
 SHARED_MESHES, SHARED_CAPSULES, SHARED_HAND, SHARED_WRIST = 0.4, 8.0, 24.0, 0.5
 """Variance that more episodes do not reduce, in variances of one episode: with the robot's surface, with capsules along its
 links, with tools alone, and of a wrist view (flow of a close scene). From healthy recordings of other worlds, docs/calibration.md."""
-DEVIATIONS_ALONE, DEVIATIONS_TOGETHER = 6.0, 3.5
-"""Standard deviations from zero of a significant error, of one episode and of a source."""
+SQUARES_ALONE, SQUARES_TOGETHER = 56.796, 28.048
+"""Squared distance from zero of a significant error, of one episode and of a source: chi-square's of eight degrees of freedom
+that are as unlikely as 6 and 3.5 standard deviations of one normal variable."""
 ALIKE = 25.0
 """Kinds of error whose remaining squares are this near explain the pictures as well."""
 FOCAL_KNOWN = 10.0
@@ -167,13 +168,6 @@ class CameraError:
     def squares(self) -> float:
         """Squared distance from no error, in standard deviations."""
         return float(self.estimate @ self.posterior @ self.estimate)
-
-    @property
-    def deviations(self) -> float:
-        """Number of standard deviations of a normal variable that is as unlikely as this estimate without an error."""
-        from scipy.special import chdtrc, ndtri  # scipy.stats takes a second to import, this a third
-
-        return 0.0 - float(ndtri(max(float(chdtrc(PARAMETERS, self.squares)), 1e-300) / 2))
 
     @property
     def named(self) -> tuple[str, ...]:
@@ -661,8 +655,8 @@ def combine(episodes: Sequence[Sequence[CameraError]]) -> tuple[CameraError, ...
 
 def significant(errors: Sequence[CameraError], *, together: bool = False) -> tuple[CameraError, ...]:
     """The cameras that are certainly off; `together`: the errors are those of a source, not of one episode."""
-    limit = DEVIATIONS_TOGETHER if together else DEVIATIONS_ALONE
-    return tuple(error for error in errors if error.deviations > limit)
+    limit = SQUARES_TOGETHER if together else SQUARES_ALONE
+    return tuple(error for error in errors if error.squares > limit)
 
 
 def corrected_camera(camera: CameraTrack, error: CameraError) -> CameraTrack:

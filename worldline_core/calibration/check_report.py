@@ -51,7 +51,7 @@ TONES = {
     "too_little_evidence": "",
     "consistent": "good",
 }
-COLUMNS = ("Episode", "Verdict", "Best explanation", "Score", "As recorded")
+COLUMNS = ("Episode", "Verdict", "Best explanation")
 TILE_HEIGHT, MIN_WIDTH, MOMENTS = 256, 760, 3
 SIGMA_PX_REF = 18.0
 """Wide enough to be seen at tile size, narrow enough to leave the gripper visible."""
@@ -84,9 +84,9 @@ class EpisodeCheck:
         """Cells of COLUMNS."""
         found = self.diagnosis
         if found is None:
-            return (self.episode_id, self.verdict, str(self.reason), "", "")
-        scores = f"{found.best.score:.1f}", f"{found.as_recorded.score:.1f}"
-        return (self.episode_id, verdict_text(found), found.best.mistake, *scores)
+            why = textwrap.shorten(f"{self.reason}: {self.detail}", 160, placeholder=" ...")
+            return (self.episode_id, self.verdict, why)
+        return (self.episode_id, verdict_text(found), found.best.mistake)
 
 
 @dataclass(frozen=True)
@@ -136,14 +136,7 @@ def table_text(check: CalibrationCheck) -> str:
     """The table of episodes, the conclusion over each source, and the lines that repair it."""
     rows = [tuple(name.lower() for name in COLUMNS), *(episode.row for episode in check.episodes)]
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    lines = []
-    for episode, row in zip((None, *check.episodes), rows, strict=True):
-        cells = [cell.ljust(w) if i < 3 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))]
-        if episode is not None and episode.diagnosis is None:
-            # The reason of an unreadable episode takes the place of its scores.
-            cells[2:] = [textwrap.shorten(f"{episode.reason}: {episode.detail}", 160, placeholder=" ...")]
-        lines.append("  ".join(cells).rstrip())
-    lines.insert(1, "  ".join("-" * width for width in widths))
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
     return "\n".join([*lines, "", *conclusion_lines(check)])
 
 
@@ -190,13 +183,12 @@ def _single_episodes(check: CalibrationCheck) -> list[str]:
 
 def source_headline(found: SourceDiagnosis) -> str:
     """The conclusion over a source in one line."""
-    score, said = f"score as recorded {found.as_recorded.score:.1f}", verdict_text(found)
+    said = verdict_text(found)
     if found.verdict == "mixed":
         said += ": its episodes were not written the same way, no line is right for all of them"
     elif found.verdict == "explained":
         said += f" by {found.best.mistake if found.best.other is None else found.best.text}"
-        score = f"score {found.best.score:.1f}, as recorded {found.as_recorded.score:.1f}"
-    return f"source {found.source}, {found.num_episodes} episodes together: {said} ({score})"
+    return f"source {found.source}, {found.num_episodes} episodes together: {said}"
 
 
 def votes_text(found: SourceDiagnosis) -> str:
@@ -227,9 +219,6 @@ def _conclusion_json(found: Conclusion) -> dict[str, Any]:
         "mistake": found.best.mistake,
         "score": found.best.score,
         "score_as_recorded": found.as_recorded.score,
-        "ranked": [
-            {"mistake": e.mistake, "reading": e.text, "score": e.score, "evidence": e.evidence} for e in found.ranked
-        ],
         "notes": found.notes,
         "nearest": found.nearest,
         "camera_errors": [
@@ -245,7 +234,6 @@ def page(check: CalibrationCheck) -> str:
     """The page: conclusions first, then a table, then a picture of each episode, the worst first."""
     order = list(MEANINGS)
     episodes = sorted(check.episodes, key=lambda episode: (order.index(episode.verdict), episode.episode_id))
-    caption = "Log-likelihood scores: 0 is as a healthy recording, lower is worse."
     return render(
         "calibration/check_page.html",
         title="Calibration check",
@@ -257,7 +245,7 @@ def page(check: CalibrationCheck) -> str:
         headline=source_headline,
         votes=votes_text,
         camera_errors=_camera_errors,
-        table=Table(COLUMNS, [_page_row(episode) for episode in episodes], numeric=(3, 4), caption=caption),
+        table=Table(COLUMNS, [_page_row(episode) for episode in episodes]),
     )
 
 
@@ -286,9 +274,6 @@ def diagnosis_picture(
     recorded: Episode,
     frames: Mapping[str, Frames],
     kinematics: ArmKinematics | None,
-    *,
-    moments: int = MOMENTS,
-    tile_height: int = TILE_HEIGHT,
 ) -> Picture:
     """One picture per episode: left as recorded, right as repaired, the same frames on both sides.
 
@@ -316,28 +301,27 @@ def diagnosis_picture(
         after = before if repaired is None else recorded_tracks(repaired, view, kinematics, offset)
         count, lag = min(len(frames[view]), before.num_frames), first + conventions.image_lag(view)
         if repaired is None:
-            chosen = evenly_spaced(count, 2 * moments)
+            chosen = evenly_spaced(count, 2 * MOMENTS)
         else:
             # Image m belongs to state m as recorded, and to state m - lag of the repaired episode.
-            chosen = differing_moments(before, after, lag, count, moments)
+            chosen = differing_moments(before, after, lag, count, MOMENTS)
         if not chosen:
             continue
         arms = before.arms
         shown = {n: image for n, image in enumerate(islice(frames[view], max(chosen) + 1)) if n in chosen}
-        left.append(SheetRow(words(view), _drawn(shown, before, view, 0, tile_height)))
+        left.append(SheetRow(words(view), _drawn(shown, before, view, 0)))
         if repaired is not None:
-            right.append(SheetRow(words(view), _drawn(shown, after, view, lag, tile_height)))
+            right.append(SheetRow(words(view), _drawn(shown, after, view, lag)))
     if not left:
         expected = "a calibrated view with images"
         raise DataError("Nothing to draw", where=f"episode {recorded.episode_id}", expected=expected)
-    sheets = [contact_sheet(left, tile_height=tile_height, title="as recorded", min_width=MIN_WIDTH)]
+    sheets = [contact_sheet(left, tile_height=TILE_HEIGHT, title="as recorded", min_width=MIN_WIDTH)]
     if right:
         title = f"repaired: {diagnosis.best.text if diagnosis.best.departures else verdict_text(diagnosis)}"
-        sheets.append(contact_sheet(right, tile_height=tile_height, title=title, min_width=MIN_WIDTH))
+        sheets.append(contact_sheet(right, tile_height=TILE_HEIGHT, title=title, min_width=MIN_WIDTH))
     body = np.concatenate(sheets, axis=1)
     width = body.shape[1]
-    scores = f"score {diagnosis.best.score:.1f}, as recorded {diagnosis.as_recorded.score:.1f} (0 is healthy)"
-    heading = f"{verdict_text(diagnosis)} {diagnosis.best.mistake if diagnosis.best.departures else ''}: {scores}"
+    heading = f"{verdict_text(diagnosis)} {diagnosis.best.mistake if diagnosis.best.departures else ''}"
     return np.concatenate([
         text_strip(f"{recorded.episode_id}  ·  {recorded.embodiment}", width, 34, size_px=21, ink=INK),
         text_strip(heading, width, 24, size_px=15, ink=MUTED),
@@ -396,13 +380,11 @@ def differing_moments(first: EpisodeTracks, second: EpisodeTracks, shift: int, c
     return [common[int(part[np.argmax(score[part])])] for part in parts]
 
 
-def _drawn(
-    images: Mapping[int, np.ndarray], tracks: EpisodeTracks, view: str, lag: int, tile_height: int
-) -> np.ndarray:
+def _drawn(images: Mapping[int, np.ndarray], tracks: EpisodeTracks, view: str, lag: int) -> np.ndarray:
     """Tiles of images by number."""
     style = OverlayStyle(SIGMA_PX_REF, heat=0.5, outline=view == HEAD_VIEW)
     tiles = []
     for n, image in images.items():
-        tile = draw_overlay(image, tracks, n - lag, view, tile_height=tile_height, style=style)
+        tile = draw_overlay(image, tracks, n - lag, view, tile_height=TILE_HEIGHT, style=style)
         tiles.append(draw_tag(tile, f"frame {n}", size_px=11))
     return np.stack(tiles)

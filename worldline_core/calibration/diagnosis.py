@@ -5,7 +5,7 @@ The episodes of a source were written the same way, so their scores are added up
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -62,7 +62,7 @@ class Explanation:
     Attributes:
         score: log-likelihood of all evidence; 0 is as in a healthy recording, lower is worse. Differences between readings
             of one episode are meaningful, and add up over episodes.
-        evidence: the terms of the score by name ("hand-eye left_wrist", ...); each at most 0.
+        evidence: the terms of an episode's score by name ("hand-eye left_wrist", ...); each at most 0.
         other: (name, value) of a mistake without a convention: ("embodiment", the robot that fits),
             ("wrist_extrinsics", "exchanged"), ("wrist_videos", "exchanged").
     """
@@ -116,7 +116,7 @@ class Conclusion:
             unexplained (bad as recorded, and in every reading), too_little_evidence; of a source also mixed (its episodes
             contradict each other).
         best: the reading to believe; the recording as written unless the verdict is explained.
-        ranked: all readings that were tried, best score first.
+        ranked: all readings that were tried, best score first; of a source the one as written.
         notes: limits of the evidence, and other facts for a person.
         nearest: without an explanation, the best readings and what is still wrong under each.
         camera_errors: the error of each camera under `best` whose pictures show it; `off`: the significant ones.
@@ -259,7 +259,6 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
         return SourceDiagnosis(verdict="too_little_evidence", notes=notes, source=source, num_episodes=0, votes={})
     readings = _source_readings(listed)
     as_recorded = _summed([d.as_recorded for d in listed], sum(d.as_recorded.score for d in listed))
-    ranked = sorted([as_recorded, *(r.summed(as_recorded.score) for r in readings)], key=lambda e: -e.score)
     sound = [r for r in readings if r.wins and r.contradicting <= CONTRADICTING_SHARE * count]
     sound = sorted(sound, key=lambda r: r.regret(sound))
     rivals = [r for r in sound[1:] if r.fits_like(sound[0], sound)]
@@ -274,7 +273,7 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
     found = SourceDiagnosis(
         verdict=verdict,
         best=best,
-        ranked=tuple(ranked),
+        ranked=(as_recorded,),
         notes=tuple(dict.fromkeys(note for d in listed for note in d.notes)),
         nearest=_nearest(readings, count) if verdict == "unexplained" else (),
         source=source,
@@ -389,12 +388,8 @@ def _source_readings(listed: list[Diagnosis]) -> list[_SourceReading]:
 
 def _summed(members: list[Explanation], score: float) -> Explanation:
     """The common reading of several episodes."""
-    evidence: dict[str, float] = defaultdict(float)
-    for member in members:
-        for name, value in member.evidence.items():
-            evidence[name] += value
     conventions = Counter(member.conventions for member in members).most_common(1)[0][0]
     if conventions.tool_offset_z_m:
         median = float(np.median([member.conventions.tool_offset_z_m for member in members]))
         conventions = conventions.model_copy(update={"tool_offset_z_m": round(median, 4)})
-    return Explanation(conventions, score, dict(evidence), members[0].other)
+    return Explanation(conventions, score, {}, members[0].other)
