@@ -148,8 +148,7 @@ def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
         r"<th[^>]*>quick</th><td[^>]*>3</td><td[^>]*>0\.75</td>\s*<td[^>]*>0\.50</td>",  # a policy's rates, the best first
         r"0\.91</span><span[^>]*>\[0\.70, 0\.97\]",
         r"<td[^>]*>10</td><td[^>]*>2</td>\s*<td[^>]*><span[^>]*>0\.61</span><span[^>]*>\[0\.50, 0\.72\]",
-        "Not available for videos of Stage II \\(this run\\): too few wrong verdicts",
-        "farther from the training recordings than 95",
+        "too few wrong verdicts",
     ):
         assert re.search(cells, found["decisions"]), cells
     for points in re.findall(r'<polyline points="([^"]*)"', found["decisions"]):
@@ -157,7 +156,6 @@ def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
         assert x == sorted(x)  # from few candidates to many
     assert "median of 3 on held-out recordings" in found["videos"]
     assert "truncated_video" in found["data"]
-    assert "None of the 2 test scenes is among the 1 scenes of training and validation." in found["data"]
 
 
 def test_missing_parts_are_said_to_be_missing(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
