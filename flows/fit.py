@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from prefect import flow
@@ -11,6 +12,7 @@ from tasks.estimate_cameras import estimate_cameras
 from tasks.execution.prefect_artifacts import run_chain
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
 from worldline_core.calibration.estimate.estimate_config import CAMERAS, EstimateConfig
+from worldline_core.evaluation.recordings import HEAD
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 
 
@@ -33,4 +35,5 @@ def with_cameras(settings: PipelineConfig, cameras: Path) -> PipelineConfig:
     source = settings.curate.sources[0].model_copy(update={"calibration": str(cameras)})
     curate = settings.curate.model_copy(update={"sources": (source,)})
     drawn = settings.render_actions or PipelineConfig.load("tiny").render_actions
-    return settings.model_copy(update={"curate": curate, "render_actions": drawn})
+    segmenter = settings.train_segmenter if HEAD in json.loads(cameras.read_text())["views"] else None
+    return settings.model_copy(update={"curate": curate, "render_actions": drawn, "train_segmenter": segmenter})

@@ -5,10 +5,11 @@ from tasks.execution.artifact_task import ArtifactTask
 train_segmenter = ArtifactTask(
     name="train_segmenter",
     summary="train the small robot segmenter of the embedded default",
-    version=3,
+    version=4,
     function="worldline_core.evaluation.segmenters.learned:train_segmenter",
     config="worldline_core.evaluation.evaluation_config:SegmenterConfig",
     inputs=("episodes",),
+    optional_inputs=("tracks",),
 )
 
 if __name__ == "__main__":

@@ -274,7 +274,7 @@ def test_a_calibration_file_lets_controls_be_drawn(tmp_path: Path, wrist: bool) 
     (tmp_path / "raw/README.md").write_text("---\nlicense: apache-2.0\n---\nlicense: nonsense\n")
     found, path = init(tmp_path)
     config = PipelineConfig.load(None, path)
-    assert found.cameras == ("some" if wrist else "all")
+    assert (found.cameras, found.head_camera) == ("some" if wrist else "all", True)
     assert config.render_actions is not None
     assert config.train_stage2.native_size == (6 if wrist else None)  # the view without a camera takes the vectors
     assert config.curate.sources[0].license == "Apache-2.0"

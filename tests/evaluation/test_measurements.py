@@ -1,5 +1,7 @@
 """What is found in pictures: coloured things, in crisp and in faded ones, and the robot by each segmenter."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -28,6 +30,7 @@ from worldline_core.evaluation.segmenters.coloured_things import (
     named_things,
     own_colour,
 )
+from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
 from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter, Sam3Segmenter, open_segmenter
 from worldline_core.rehearsal.outside_models import write_sam3
 from worldline_core.store.artifact_files import digest_folder
@@ -123,7 +126,7 @@ def training(recordings, monkeypatch):
     return {"episodes": recordings.inputs["episodes"]}
 
 
-def test_killed_training_continues_to_the_same_bytes(training, tmp_path, monkeypatch, killed_after):
+def test_killed_training_continues_to_the_same_bytes(recordings, training, tmp_path, monkeypatch, killed_after):
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     result = learned.train_segmenter(CONFIG, training, whole)
     assert result["videos"] == result["kept"] == 4
@@ -135,8 +138,33 @@ def test_killed_training_continues_to_the_same_bytes(training, tmp_path, monkeyp
     masks = learned.LearnedSegmenter.load(whole).segment(np.zeros((2, 30, 50, 3), np.uint8))
     assert (masks.shape, masks.dtype) == ((2, 30, 50), bool)
     monkeypatch.setattr(EpisodeSet, "robot_masks", lambda self, index, view: None)
-    with pytest.raises(DataError, match="exact robot masks"):
+    with pytest.raises(DataError, match="has robot masks"):
         learned.train_segmenter(CONFIG, training, tmp_path / "without")
+    kinematic = CONFIG.model_copy(update={"labels": "kinematic"})
+    assert (
+        learned.train_segmenter(kinematic, training | {"tracks": recordings.inputs["tracks"]}, tmp_path / "k")["kept"]
+        == 4
+    )
+
+
+@pytest.mark.parametrize("size", [(48, 72), (192, 288)])
+def test_kinematic_masks_end_where_the_robots_colours_end(size):
+    """A dark link of 2 cm within a capsule of 10 cm, one metre before the camera."""
+    height, width = size
+    f = 1.5 * height
+    K = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]])
+    ends = np.broadcast_to(np.array([[0, -0.2, 1], [0, 0.2, 1]]), (2, 1, 2, 3))
+    tracks = SimpleNamespace(
+        views=("head", "right_wrist"), camera_motion=("static", "absent"), capsules=ends, capsule_radii=np.array([0.1]),
+        K=np.stack([K, K]), T_base_camera=np.broadcast_to(np.eye(4), (2, 2, 4, 4)), image_size=size,
+    )  # fmt: skip
+    frames = np.random.default_rng(0).integers(150, 170, (2, height, width, 3), dtype=np.uint8)
+    true = np.zeros((height, width), bool)
+    true[round(height * 0.2) : round(height * 0.8), round(width / 2 - 0.04 * f) : round(width / 2 + 0.04 * f)] = True
+    frames[:, true] = 40
+    masks = kinematic_masks(tracks, "head", np.arange(2), frames)
+    assert (masks & true).sum() / (masks | true).sum() > 0.85
+    assert kinematic_masks(tracks, "right_wrist", np.arange(2), frames) is None
 
 
 def test_the_network_learns_a_mask():

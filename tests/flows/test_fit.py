@@ -64,12 +64,15 @@ def test_minutes_are_shared_out_and_a_gpu_does_all_of_the_work(own: Path, preset
 def test_cameras_are_estimated_where_a_robot_is_known_and_no_file_is_named(own: Path, here: Path) -> None:
     config = PipelineConfig.load(None, own)
     assert EstimateConfig.of(config.curate, {}) is not None
-    found = with_cameras(config, here / "cameras.json")
-    assert found.render_actions is not None and config.render_actions is None
-    assert EstimateConfig.of(found.curate, {}) is None
     camera = {"width": 64, "height": 48, "K": [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], "T": np.eye(4).tolist()}
+    (here / "cameras.json").write_text(json.dumps({"views": {"right_wrist": {}}}))
+    assert with_cameras(config, here / "cameras.json").train_segmenter is None
     views = {"head": camera | {"maps": "camera_to_base", "axes": "opencv"}}
     (here / "cameras.json").write_text(json.dumps({"views": views}))
+    found = with_cameras(config, here / "cameras.json")
+    assert found.render_actions is not None and config.render_actions is None
+    assert found.train_segmenter is not None and found.train_segmenter.labels == "kinematic"
+    assert EstimateConfig.of(found.curate, {}) is None
     source = open_source(found.curate.sources[0], here / "raw")
     assert list(source.load(source.episode_ids()[0]).episode.cameras) == ["head"]
     assert here / "cameras.json" in found.curate.weights_read().values()  # its content counts in the cache key

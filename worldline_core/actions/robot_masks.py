@@ -2,8 +2,7 @@
 
 Robot parts (links, gripper branches, end-effectors) are capsules between the origins of consecutive links, from
 forward kinematics. A capsule is drawn into a view as the hull of the discs that its two end spheres project to. The
-mask of a latent frame is the union over its RGB frames and a few neighbours, dilated on the latent grid. The masks
-are used in training only.
+mask of a latent frame is the union over its RGB frames and a few neighbours, dilated on the latent grid.
 
 Axis legend: b clips, n RGB frames, t latent frames, v views, s capsules, h and w rows and columns.
 """

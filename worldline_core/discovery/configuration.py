@@ -115,7 +115,7 @@ def _stages(found: Discovery) -> list[str]:
     if found.cameras == "all" and described:
         return lines
     if found.cameras == "some" and described:
-        drawn = []
+        drawn = [] if found.head_camera else ["train_segmenter: null"]
         text = (
             "Controls are drawn into the views that have a camera; in the others the joints themselves drive the model."
         )

@@ -37,7 +37,7 @@ class Discovery:
         fps: of the recordings.
         state_size: columns of the state; None of videos without states.
         episodes: those that can be read, where that is known without reading them; `frames`: of half of them, or more.
-        cameras: how many of these views have one.
+        cameras: how many of these views have one; `head_camera`: the head has.
         trains: False of recordings that are for evaluation only.
         notes: what the user should know, and no value says.
     """
@@ -52,6 +52,7 @@ class Discovery:
     episodes: int | None = None
     frames: int | None = None
     cameras: Literal["all", "some", "none"] = "none"
+    head_camera: bool = False
     trains: bool = True
     notes: list[str] = field(default_factory=list)
 
@@ -64,9 +65,10 @@ class Discovery:
         self.evidence[place] = evidence
 
     def count_cameras(self, *known: Container[str]) -> None:
-        """Set ``cameras`` from the views with a camera, of each episode looked at."""
+        """Set ``cameras`` and ``head_camera`` from the views with a camera, of each episode looked at."""
         have = [view in each for each in known for view in self.views]
         self.cameras = "all" if have and all(have) else "some" if any(have) else "none"
+        self.head_camera = all("head" in each for each in known)
 
     @property
     def questions(self) -> list[Question]:

@@ -41,6 +41,10 @@ SegmenterName = Literal["learned", "colour", "sam3"]
 class SegmenterConfig(StrictModel):
     """Size and training of the learned segmenter."""
 
+    labels: Literal["exact", "kinematic"] = Field(
+        default="exact",
+        description="masks to learn: exact ones; kinematic: also of episodes without, where the head camera is known",
+    )
     widths: tuple[int, ...] = Field(
         default=(8, 24, 48, 96), min_length=2, description="channels, finest resolution first; multiples of 8"
     )

@@ -56,7 +56,7 @@ the truth; and for robots that no segmenter knows the distance of the predicted 
 class ReportConfig(StrictModel):
     """``tile_height``: of one video in a side-by-side video, pixels."""
 
-    tile_height: int = Field(256, ge=32, le=1080)
+    tile_height: int = Field(default=256, ge=32, le=1080)
 
 
 class Method(NamedTuple):

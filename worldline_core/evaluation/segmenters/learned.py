@@ -1,4 +1,5 @@
-"""The learned segmenter, a small U-Net on single frames, and the step train_segmenter, which fits it to exact masks of head views.
+"""The learned segmenter, a small U-Net on single frames, and the step train_segmenter, which fits it to masks of head views: exact
+ones, or kinematic ones where a recording has none.
 
 It sees neither points nor other frames: what it marks in a predicted video is what that video shows. Training frames are augmented to
 look like unseen scenes and like predicted frames: a predicted frame has passed a lossy tokenizer and an imperfect model, is blurred and
@@ -23,12 +24,14 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frames_to_unit
 from worldline_core.evaluation.recordings import HEAD
+from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
 from worldline_core.geometry.cameras import ImageTransform
 from worldline_core.model.checkpoint import check_fit, fill, read_weights
 from worldline_core.store.artifact_files import read_json, read_json_lines
@@ -113,7 +116,7 @@ class LearnedSegmenter:
     @property
     def description(self) -> str:
         count = sum(parameter.numel() for parameter in self.network.parameters())
-        return f"U-Net on single frames, {count / 1e6:.2f} M parameters, trained on exact masks of training recordings"
+        return f"U-Net on single frames, {count / 1e6:.2f} M parameters, trained on masks of training recordings"
 
     @torch.no_grad()
     def segment(self, video: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
@@ -172,7 +175,7 @@ def save_segmenter(folder: Path, widths: tuple[int, ...], state: Mapping[str, Te
 
 @dataclass(frozen=True)
 class MaskedVideo:
-    """Head frames, uint8 (n, h, w, 3), and their exact robot masks, bool (n, h, w)."""
+    """Head frames, uint8 (n, h, w, 3), and their robot masks, bool (n, h, w)."""
 
     name: str
     frames: np.ndarray
@@ -224,17 +227,19 @@ def mask_batch(videos: Sequence[MaskedVideo], config: SegmenterConfig, index: in
 def train_segmenter(config: SegmenterConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Train on the head views of the training split; evaluate_video shows the accuracy on others.
 
-    Inputs: episodes. Output: model.safetensors, segmenter.json, metrics.jsonl (the loss of every step).
+    Inputs: episodes, and tracks for kinematic labels. Output: model.safetensors, segmenter.json, metrics.jsonl (the loss
+    of every step).
 
-    Raises: DataError when no training episode has exact masks.
+    Raises: DataError when no training episode has masks.
     """
     episodes = EpisodeSet.open(inputs["episodes"])
+    tracks = ActionTracks.open(inputs["tracks"]) if config.labels == "kinematic" else None
     rows = episodes.select(split="train")
-    videos = [video for row in rows if (video := _load(episodes, row, config.frame_stride, config.image_size))]
+    videos = [video for row in rows if (video := _load(episodes, tracks, row, config.frame_stride, config.image_size))]
     if not videos:
         raise DataError(
-            "No training episode has exact robot masks", where=episodes.root,
-            next_step="use the shipped recordings, record with masks, or use the colour segmenter",
+            "No training episode has robot masks, or a head camera to draw the robot with", where=episodes.root,
+            next_step="estimate the head camera (worldline calibrate estimate), or set train_segmenter to null",
         )  # fmt: skip
     torch.manual_seed(config.seed)
     network = UNet(config.widths)
@@ -254,23 +259,33 @@ def train_segmenter(config: SegmenterConfig, inputs: Mapping[str, Path], output:
     return {
         "found": len(episodes),
         "kept": len(videos),
-        "left_out": {"in other splits": len(episodes) - len(rows), "without exact masks": len(rows) - len(videos)},
+        "left_out": {"in other splits": len(episodes) - len(rows), "without masks": len(rows) - len(videos)},
         "videos": len(videos),
         "steps": config.steps,
         "final_loss": float(np.mean(losses[-50:])),
     }
 
 
-def _load(episodes: EpisodeSet, index: int, stride: int, size: tuple[int, int] | None) -> MaskedVideo | None:
-    """Every ``stride``-th head frame of a row and its exact masks, or None where it has no masks."""
-    masks = episodes.robot_masks(index, HEAD)
-    if masks is None:
+def _load(
+    episodes: EpisodeSet, tracks: ActionTracks | None, index: int, stride: int, size: tuple[int, int] | None
+) -> MaskedVideo | None:
+    """Every ``stride``-th head frame of a row and its masks, or None where it has none."""
+    row = episodes.rows[index]
+    if HEAD not in row.views:
         return None
     recorded = VideoFrames(episodes.clip(index, HEAD), stride)
+    masks = episodes.robot_masks(index, HEAD)
+    if masks is not None:
+        masks = masks[::stride]
+    elif tracks is not None and row.episode_id in tracks:
+        chosen = np.arange(len(recorded)) * stride
+        masks = kinematic_masks(tracks.tracks(row.episode_id), HEAD, chosen, np.stack(list(recorded)))
+    if masks is None:
+        return None
     resized = ImageTransform.of((recorded.shape[1], recorded.shape[2])).fitted(size)
     frames = np.stack([resized.frames(frame[None])[0] for frame in recorded])
-    fitted = np.stack([resized.masks(mask[None])[0] for mask in masks[::stride]])
-    return MaskedVideo(episodes.rows[index].episode_id, frames, fitted)
+    fitted = np.stack([resized.masks(mask[None])[0] for mask in masks])
+    return MaskedVideo(row.episode_id, frames, fitted)
 
 
 def augment(

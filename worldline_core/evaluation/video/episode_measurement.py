@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.actions.robot_masks import project_capsules
 from worldline_core.actions.tool_error import end_effector_error
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -31,6 +30,7 @@ from worldline_core.evaluation.segmenters.coloured_things import (
     own_colour,
     thing_share,
 )
+from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.evaluation.video.metrics_on_request import SceneFrames, ToolFinder
 from worldline_core.model.lpips import LPIPS
@@ -236,29 +236,12 @@ class EpisodeMeasurement:
             true.add_object(frames, moved)
             name, mask = "exact", robot
             if mask is None:
-                name, mask = "kinematic", self._kinematic_masks(begin, frames, stride)
+                index = np.arange(begin, begin + len(frames)) * stride
+                name, mask = "kinematic", kinematic_masks(tracks.tracks(self.episode_id), HEAD, index, frames)
             if mask is not None:
                 accuracy = {f"robot_iou_{name}{suffix}": frame_iou(mask, own) for suffix, own in masks.items()}
                 true.add(**{name: _null_if_nan(values) for name, values in accuracy.items()})
             yield _Piece(frames, own_points, masks, first, robot, moved)
-
-    def _kinematic_masks(self, begin: int, frames: np.ndarray, stride: int) -> np.ndarray | None:
-        """Masks (n, h, w) of the robot's capsules in the head view, frames `begin` and on; None without its camera."""
-        if self.tracks is None:
-            return None
-        tracks = self.tracks.tracks(self.episode_id)
-        view = tracks.views.index(HEAD)
-        if tracks.camera_motion[view] == "absent":
-            return None
-        index = np.arange(begin, begin + len(frames)) * stride
-        capsules, radii, K, poses = (
-            torch.from_numpy(np.asarray(values, dtype=np.float64))[None]
-            for values in (
-                tracks.capsules[index], tracks.capsule_radii, tracks.K[[view]], tracks.T_base_camera[index][:, [view]]
-            )
-        )  # fmt: skip
-        height, width = frames.shape[1:3]
-        return project_capsules(capsules, radii, K, poses, tracks.image_size, (height, width))[0, 0].numpy()
 
     def _add_full_frame(self, video: _Video, predicted: np.ndarray, true: np.ndarray, where: str) -> None:
         if predicted.shape != true.shape:
