@@ -159,9 +159,7 @@ class Hdf5File:
         for arm in places:
             joints = self.columns(arm.joints, length, "length_mismatch", track)
             length = len(joints)
-            key = arm.joints.dataset.format(track=track)
-            with self._reading(key):
-                fill = self._dataset(key).fillvalue
+            fill = self._dataset(arm.joints.dataset.format(track=track)).fillvalue
             own = np.array([bool((row != fill).any()) for row in joints])
             written = written | own if blocks else own
             blocks.append(joints)
@@ -284,6 +282,7 @@ class Hdf5File:
                 found = node.id.get_num_chunks()
             if node.size and found < wanted:
                 raise self._rejected("unreadable", "Dataset was not written", key, f"{wanted} chunks", f"{found}")
+            _ = node.dtype, node.fillvalue  # a damaged description shows itself here
             return node
 
     def _rejected(self, reason: Reason, what: str, key: str, expected: object, got: object) -> RejectedInputError:
