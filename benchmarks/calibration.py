@@ -424,21 +424,19 @@ def measure_estimates(sets: Iterator[tuple[str, ArmKinematics, Recorded]], spoil
                 )  # fmt: skip
             print(f"    {name}: {time.process_time() - start:.0f} s of CPU", flush=True)
 
-    print_table(
-        (
-            "set",
-            "view",
-            "verdict",
-            "tool error, % of the width",
-            "95 %",
-            "deg",
-            "mm",
-            "% focal",
-            "frames",
-            "agreement, reason",
-        ),
-        rows(),
+    columns = (
+        "set",
+        "view",
+        "verdict",
+        "tool error, % of the width",
+        "95 %",
+        "deg",
+        "mm",
+        "% focal",
+        "frames",
+        "agreement, reason",
     )
+    print_table(columns, rows())
     for kind, values in ratios.items():
         worst = f"{np.quantile(values, 0.95):.2f}"
         print(f"{kind}: {held[kind]} of {len(values)} intervals hold; 95 % of the errors are within {worst} intervals")

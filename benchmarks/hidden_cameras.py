@@ -9,6 +9,7 @@ own focal length), and wrist cameras mounted some centimetres and degrees from w
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -60,15 +61,20 @@ class HiddenCameras(EpisodeRecorder):
         self.scene.model.cam_quat[head] = [w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s]
 
 
+def drawn_jobs(body: str, episodes: int, seed: int) -> Iterator[Job]:
+    """Recordings of all tasks in turn."""
+    families = [task for task in TASKS if task != "carry" or len(BODIES[body].arms) == 2]
+    for number in range(episodes):
+        entropy = (7000 + seed, BODIES[body].stream, SPLIT_STREAM["test"], number)
+        yield Job(f"{body}-{number:02d}", body, "test", families[number % len(families)], entropy)
+
+
 def record(body: str, output: Path, episodes: int, seed: int) -> None:
     """Write a set, as `read_set` reads it."""
     recorder = HiddenCameras(body, seed)
-    families = [task for task in TASKS if task != "carry" or len(BODIES[body].arms) == 2]
     arrays: dict[str, np.ndarray] = {}
     views: list[str] = []
-    for number in range(episodes):
-        entropy = (7000 + seed, BODIES[body].stream, SPLIT_STREAM["test"], number)
-        job = Job(f"{body}-{number:02d}", body, "test", families[number % len(families)], entropy)
+    for number, job in enumerate(drawn_jobs(body, episodes, seed)):
         found = recorder.record(job, NUM_FRAMES)
         views = list(found.frames)
         arrays[f"{number}/state"], arrays[f"{number}/action"] = found.episode.state, found.episode.action
