@@ -72,8 +72,8 @@ def prepare_models(c: PipelineConfig, data: Inputs) -> Inputs:
     models: Inputs = {**c.model_folders()}
     if c.train_tokenizer is not None:
         models["tokenizer"] = train_tokenizer.submit(c.train_tokenizer, episodes=data["episodes"])
-    if c.train_segmenter is not None and ("tracks" in data or c.train_segmenter.labels == "exact"):
-        models["segmenter"] = train_segmenter.submit(c.train_segmenter, **data)
+    if c.train_segmenter is not None and (masked := c.masks_of(data)):
+        models["segmenter"] = train_segmenter.submit(c.train_segmenter, **masked)
     return models
 
 

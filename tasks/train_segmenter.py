@@ -1,10 +1,10 @@
-"""`train_segmenter`: train the small robot segmenter of the embedded default."""
+"""`train_segmenter`: train the small robot segmenter."""
 
 from tasks.execution.artifact_task import ArtifactTask
 
 train_segmenter = ArtifactTask(
     name="train_segmenter",
-    summary="train the small robot segmenter of the embedded default",
+    summary="train the small robot segmenter",
     version=4,
     function="worldline_core.evaluation.segmenters.learned:train_segmenter",
     config="worldline_core.evaluation.evaluation_config:SegmenterConfig",

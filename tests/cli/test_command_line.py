@@ -27,7 +27,7 @@ print(sorted({'torch', 'prefect', 'lerobot', 'diffusers', 'transformers', 'cv2',
 
 
 def test_recordings_configurations_and_their_mistakes_are_read_without_torch_and_prefect(project_root: Path) -> None:
-    """A process that only curates, or only reads what it is told, is spared seconds."""
+    """Curation and the parsing of commands start seconds faster without these modules."""
     mistakes = {
         "did you mean 'tiny'": ["--preset", "tinny"],
         "unknown key; did you mean 'steps'": ["--set", "train_stage2.trainer.stepz=1"],

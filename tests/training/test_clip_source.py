@@ -126,7 +126,7 @@ def test_bad_requests_and_bad_values_are_named(world, tmp_path):
         for clip, views, message in (
             (dataclasses.replace(whole, start=4), VIEWS, r"at most 17 of 17[\s\S]*frames 4\.\.20"),
             (Clip("episode-000", 0, 5, 2), VIEWS, r"strides \(1,\)[\s\S]*frames 0\.\.8 by 2"),
-            (Clip("nobody", 0, 5, 1), VIEWS, "nobody"),
+            (Clip("unknown", 0, 5, 1), VIEWS, "unknown"),
             (Clip("episode-000", 0, 5, 1), ("top",), "top"),
         ):
             with pytest.raises(ArtifactError, match=message):

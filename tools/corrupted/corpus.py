@@ -18,7 +18,7 @@ LAYOUTS = (lerobot_v21, droid_annotation, mcap)
 
 
 Outcome = tuple[str, str]
-"""Where a recording ended (curate, filter, kept), and the reason code ("" for kept)."""
+"""Stage that left a recording out (curate, filter) or kept, and the reason code ("" for kept)."""
 
 
 def write_corpus(folder: Path, *, healthy: int, each: int, seed: int) -> tuple[list[Label], CurateConfig]:

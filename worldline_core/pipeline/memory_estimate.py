@@ -123,7 +123,7 @@ class Sources:
     def looking(
         self, by: Literal["tokenizer", "teacher"], frames: int, precision: Literal["bf16", "fp32"], views: int = 1
     ) -> Held:
-        """What the tokenizer takes to encode a view of a clip, or the relational teacher to look at all."""
+        """Memory that the tokenizer needs to encode one view of a clip, or the relational teacher to encode all of them."""
         with FakeTensorMode(), torch.no_grad(), autocast(TrainerConfig(steps=1, precision=precision)):
             look = teacher_outline(self.teacher)[1] if by == "teacher" else tokenizer_outline(self.tokenizer).encode
             return traced(lambda: look(torch.empty(views, 3, frames, *self.image_size)))

@@ -170,6 +170,12 @@ class PipelineConfig(StrictModel):
             return {"tokenizer": made["tokenizer"]}
         return {"latents": made["encode_latents"]}
 
+    def masks_of[T](self, data: Mapping[str, T]) -> dict[str, T]:
+        """The inputs of train_segmenter; none where it learns kinematic masks and nothing is drawn."""
+        kinematic = self.train_segmenter is not None and self.train_segmenter.labels == "kinematic"
+        names = ("episodes", "tracks") if kinematic else ("episodes",)
+        return {name: data[name] for name in names} if set(names) <= data.keys() else {}
+
     def rollouts_in_order(self) -> list[tuple[str, RolloutRun]]:
         """Names and settings of the rollouts, first those that wait for no training: Prefect starts tasks in this order."""
         return sorted(self.rollouts.items(), key=lambda item: item[1].checkpoint in ("stage1", "stage2", "causal"))

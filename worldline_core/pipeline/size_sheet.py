@@ -22,7 +22,7 @@ from worldline_core.shipped import project_path
 from worldline_core.training.clip_config import FrameInput
 
 Row = tuple[Estimate, str]
-"""What a training takes, and the setting with which it would fit; empty where it does."""
+"""Memory of a training, and the setting with which it would fit; empty if it fits as it is."""
 
 
 class SizeSheet(StrictModel):

@@ -318,7 +318,7 @@ def _intervals(
 
 
 def _places(own: Sequence[Equations], shown: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Where each episode alone puts the robot in the picture (e, 2), beside where all do [% of the width], and covariances (e, 2, 2).
+    """Places of the robot in the picture by each episode alone (e, 2), relative to that by all [% of the width], and covariances (e, 2, 2).
 
     Args:
         own: its equations at the camera of all. shown: displacement in the picture (2, 8) by each parameter.

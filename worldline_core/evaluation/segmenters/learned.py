@@ -273,19 +273,23 @@ def _load(
     row = episodes.rows[index]
     if HEAD not in row.views:
         return None
+    exact = episodes.robot_masks(index, HEAD)
+    drawn = tracks.tracks(row.episode_id) if exact is None and tracks is not None and row.episode_id in tracks else None
     recorded = VideoFrames(episodes.clip(index, HEAD), stride)
-    masks = episodes.robot_masks(index, HEAD)
-    if masks is not None:
-        masks = masks[::stride]
-    elif tracks is not None and row.episode_id in tracks:
-        chosen = np.arange(len(recorded)) * stride
-        masks = kinematic_masks(tracks.tracks(row.episode_id), HEAD, chosen, np.stack(list(recorded)))
-    if masks is None:
-        return None
     resized = ImageTransform.of((recorded.shape[1], recorded.shape[2])).fitted(size)
-    frames = np.stack([resized.frames(frame[None])[0] for frame in recorded])
-    fitted = np.stack([resized.masks(mask[None])[0] for mask in masks])
-    return MaskedVideo(row.episode_id, frames, fitted)
+    known = None if exact is None else exact[::stride]
+    frames, masks = [], []
+    for start, part in zip(itertools.count(0, _BATCH), itertools.batched(recorded, _BATCH), strict=False):
+        piece, places = np.stack(part), np.arange(start, start + len(part))
+        if known is not None:
+            own = np.stack(list(known[start : start + len(part)]))
+        else:
+            own = None if drawn is None else kinematic_masks(drawn, HEAD, places * stride, piece)
+        if own is None:
+            return None
+        frames.append(resized.frames(piece))
+        masks.append(resized.masks(own))
+    return MaskedVideo(row.episode_id, np.concatenate(frames), np.concatenate(masks))
 
 
 def augment(
