@@ -4,8 +4,9 @@
     python benchmarks/speed.py ../before [--turns 3] [--blocks 8] [--threads 1]
 
 Each tree computes in a process of its own with its own code and the same weights. Kinds: a block of `worldline play` (inverse
-kinematics, pictures and JPEG with it), a step of `worldline serve`, a block of a rollout, and a step of eight Gymnasium
-environments. Ratios are of processor and wall time, a median and the range of the turns. Pictures are compared over two blocks, where a
+kinematics, pictures and JPEG with it; commands come at the model's rate, and its wall time is from the last command of a block to its
+pictures), a step of `worldline serve`, a block of a rollout, and a step of eight Gymnasium environments. Ratios are of processor and wall
+time, a median and the range of the turns. Pictures are compared over two blocks, where a
 rollout begins anew at its own picture.
 """
 
@@ -38,6 +39,9 @@ ROBOT, EPISODE, ENVIRONMENTS = "ur5e_silver", "ur5e_silver-test-s1-00000", 8
 class Tree:
     """The model of one tree; only names are used that every tree has."""
 
+    waited: float
+    """Seconds between the last commands of blocks and their pictures, of the last `play`."""
+
     def __init__(self) -> None:
         from worldline_core.environment.environment import WorldLineVectorEnv
         from worldline_core.rollout.worldline import WorldLine
@@ -52,7 +56,8 @@ class Tree:
         self.loop = asyncio.new_event_loop()
 
     def play(self, blocks: int) -> int:
-        """Blocks driven by hand: ticks of every frame until the block's pictures are sent."""
+        """Blocks driven by hand, with ticks at the model's rate, until the block's pictures are sent."""
+        self.waited = 0.0
 
         async def driven() -> None:
             sent: asyncio.Queue[str | bytes] = asyncio.Queue()
@@ -69,11 +74,14 @@ class Tree:
             await page.receive(json.dumps({"type": "start", "episode": EPISODE}))
             await pictures()
             for number in range(blocks):
+                tick = json.dumps({"type": "tick", "arms": [{"move": [0.1 * (-1) ** number, 0, 0]}] * 2})
+                begin = 0.0
                 for _ in range(self.block):
-                    await page.receive(
-                        json.dumps({"type": "tick", "arms": [{"move": [0.1 * (-1) ** number, 0, 0]}] * 2})
-                    )
+                    await asyncio.sleep(1 / self.world.contract.fps)
+                    begin = time.perf_counter()
+                    await page.receive(tick)
                 await pictures()
+                self.waited += time.perf_counter() - begin
             await page.close()
 
         self._run(driven())
@@ -151,7 +159,8 @@ def work(threads: int) -> None:
             continue
         processor, wall = time.process_time(), time.perf_counter()
         done = getattr(tree, kind)(int(value))
-        print(json.dumps([(time.process_time() - processor) / done, (time.perf_counter() - wall) / done]), flush=True)
+        seconds = tree.waited if kind == "play" else time.perf_counter() - wall
+        print(json.dumps([(time.process_time() - processor) / done, seconds / done]), flush=True)
 
 
 def main() -> None:
@@ -193,7 +202,10 @@ def main() -> None:
                 f"{name} x {np.median(r):.2f} ({r.min():.2f}-{r.max():.2f})"
                 for name, r in zip(("processor", "wall"), ratios.T, strict=True)
             )
-            print(f"{kind:13s}{tree.name:12s}{1e3 * np.median(times[:, 0]):8.1f} ms, {', '.join(text)}", flush=True)
+            print(
+                f"{kind:13s}{tree.name:12s}{1e3 * np.median(times[:, 0]):8.1f} ms, {', '.join(text)}",
+                flush=True,
+            )
     with tempfile.TemporaryDirectory() as folder:
         found = []
         for number, process in enumerate(processes):

@@ -22,6 +22,7 @@ from worldline_core import WorldLine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import UnavailableError
 from worldline_core.pictures import jpeg_bytes
+from worldline_core.rollout.simulation import Simulation
 from worldline_core.serving import play_session
 from worldline_core.serving.client import SimulatorClient
 from worldline_core.serving.play_session import PlaySession
@@ -298,13 +299,13 @@ def test_driving_branches_a_policy_and_saving(serving: Callable, tmp_path: Path)
     assert episode.conventions["started_at"] == EPISODE
 
 
-def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(
-    small_world: WorldLine, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(play_session, "KEPT_EVERY", 4)
-    monkeypatch.setattr(play_session, "KEPT_LAST", 2)
-    config = ServeConfig.model_validate({"episodes": shipped / "recordings", "output": tmp_path})
-    host = SessionHost(small_world, config)
+Driven = tuple[PlaySession, Callable[..., Any], list[dict[str, Any]], list[bytes]]
+
+
+@contextmanager
+def in_this_process(world: WorldLine, shipped: Path, output: Path) -> Iterator[Driven]:
+    """A session without a server: itself, a function that tells it a message, and what it sent."""
+    host = SessionHost(world, ServeConfig.model_validate({"episodes": shipped / "recordings", "output": output}))
     sent: list[dict[str, Any]] = []
     pictures: list[bytes] = []
 
@@ -315,34 +316,81 @@ def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(
             content = head.decode()
         sent.append(json.loads(content))
 
-    async def drive() -> None:
-        session = PlaySession(host, send)
+    session = PlaySession(host, send)
 
-        async def tell(**message: object) -> None:
-            await session.receive(json.dumps(message))
+    async def tell(**message: object) -> None:
+        await session.receive(json.dumps(message))
+
+    yield session, tell, sent, pictures
+    host.shut_down()
+    assert not [message for message in sent if message["type"] == "error"]
+
+
+def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(
+    small_world: WorldLine, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(play_session, "KEPT_EVERY", 4)
+    monkeypatch.setattr(play_session, "KEPT_LAST", 2)
+    with in_this_process(small_world, shipped, tmp_path) as (session, tell, sent, pictures):
 
         async def block() -> None:
             for _ in range(4):
                 await tell(type="tick", arms=[{}, {"move": [0, 0, 1]}])
             await session._settled()
 
-        await tell(type="start", episode=EPISODE)
-        for _ in range(9):
-            await block()
-        assert sorted(session._kept) == [0, 4, 7, 8, 9]
-        for _ in range(2):  # from a simulation that is computed again, then from the one that is kept now
-            await tell(type="go", node=2)
-            await block()
-        assert pictures[-1] == pictures[-2]
-        first = jpeg_bytes(next(iter(session._frames(session._nodes[3], "head"))), 93)
-        assert first == pictures[3][: len(first)]
-        await tell(type="save")
-        await session.close()
+        async def drive() -> None:
+            await tell(type="start", episode=EPISODE)
+            for _ in range(9):
+                await block()
+            assert sorted(session._kept) == [0, 4, 7, 8, 9]
+            for _ in range(2):  # from a simulation that is computed again, then from the one that is kept now
+                await tell(type="go", node=2)
+                await block()
+            assert pictures[-1] == pictures[-2]
+            first = jpeg_bytes(next(iter(session._frames(session._nodes[3], "head"))), 93)
+            assert first == pictures[3][: len(first)]
+            await tell(type="save")
+            await session.close()
 
-    asyncio.run(drive())
-    host.shut_down()
-    assert sent[-1]["frames"] == 13
-    assert not [message for message in sent if message["type"] == "error"]
+        asyncio.run(drive())
+        assert sent[-1]["frames"] == 13
+
+
+def test_a_block_is_computed_ahead_where_nobody_waits_for_it(
+    small_world: WorldLine, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wishes that go on, that change at the last tick, and that change after a way back."""
+    up, away = [{}, {"move": [0, 0, 1]}], [{}, {"move": [0, 1, 0]}]
+    steps: list[Simulation] = []
+    step = Simulation.step
+    monkeypatch.setattr(Simulation, "step", lambda self, rows: steps.append(self) or step(self, rows))
+
+    def driven(*, alone: bool) -> tuple[list[int], list[bytes]]:
+        counts: list[int] = []
+        with in_this_process(small_world, shipped, tmp_path) as (session, tell, _, pictures):
+
+            async def drive() -> None:
+                if not alone:
+                    session._host.admit("somebody else")
+                await tell(type="start", episode=EPISODE)
+                for node, wishes in ((None, [up] * 4), (None, [up] * 3 + [away]), (1, [away] * 4)):
+                    if node is not None:
+                        await tell(type="go", node=node)
+                    steps.clear()
+                    for arms in wishes:
+                        await tell(type="tick", arms=arms)
+                        while alone and session._ahead is not None and not session._ahead.made.done():
+                            await asyncio.sleep(0.01)
+                    await session._settled()
+                    counts.append(len(steps))
+                await session.close()
+
+            asyncio.run(drive())
+        return counts, pictures
+
+    ahead, by_request = driven(alone=True), driven(alone=False)
+    assert ahead[0] == [1, 2, 1] and by_request[0] == [1, 1, 1]
+    assert ahead[1] == by_request[1]
 
 
 def test_somebody_at_the_page_takes_the_room_of_a_session(serving: Callable) -> None:

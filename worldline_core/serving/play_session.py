@@ -1,7 +1,8 @@
 """One person at the page: ticks of wishes in, blocks of pictures out, with a tree of moments to go back to.
 
 Every tick is one frame at the model's rate. When as many commands are there as a block takes, the block is predicted while the
-next ticks come in; one block may wait, then ticks are refused until the pictures catch up. Every block is a node of a tree: to go back is
+next ticks come in; one block may wait, then ticks are refused until the pictures catch up. While nothing else is computed, the next
+block is computed ahead for wishes that go on as they are, and used if they did. Every block is a node of a tree: to go back is
 to choose a node, and whatever follows there is a branch of its own.
 
 Of a long session little stays in memory: pictures go to a temporary file, and only some nodes keep their simulation; others are
@@ -15,12 +16,12 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -112,6 +113,36 @@ class Node:
     driver: str
 
 
+class Block(NamedTuple):
+    """What is computed of a block.
+
+    Attributes:
+        hands: after each of the commands that were not there yet.
+        simulation: after the block.
+    """
+
+    rows: np.ndarray
+    hands: Sequence[Teleoperation]
+    simulation: Simulation
+    frames: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """The next block, computed before its commands are there, for wishes that go on as they are."""
+
+    arms: tuple[ArmInput, ...]
+    made: asyncio.Future[Block]
+
+    def hand_after(self, arms: tuple[ArmInput, ...], rows: Sequence[np.ndarray]) -> Teleoperation | None:
+        """The hand after these wishes, which follow these commands; None where it is not known."""
+        if not self.made.done() or self.made.cancelled() or self.made.exception() or arms != self.arms:
+            return None
+        block = self.made.result()
+        place = len(rows) - len(block.rows) + len(block.hands)
+        return block.hands[place].copy() if np.array_equal(block.rows[: len(rows)], rows) else None
+
+
 class PlaySession:
     """One connection of the page.
 
@@ -131,6 +162,8 @@ class PlaySession:
         self._current, self._seed = 0, 0
         self._pending: list[np.ndarray] = []
         self._working: asyncio.Task[None] | None = None
+        self._ahead: Ahead | None = None
+        self._seconds = 0.0  # that a block takes
         self._policies: dict[str, OpenpiPolicy] = {}
 
     async def greet(self) -> None:
@@ -165,7 +198,7 @@ class PlaySession:
             if not 0 <= message.node < len(self._nodes):
                 raise DataError("No such moment", expected=f"0..{len(self._nodes) - 1}", got=message.node)
             self._current = message.node
-            self._pending.clear()
+            self._forget_commands()
             self._hand.take_over(self._nodes[message.node].commands[-1])
             await self._send_marks(self._hand)
         else:
@@ -187,7 +220,7 @@ class PlaySession:
         self._file.truncate(0)
         await self._add(None, simulation, simulation.commands[0], first, "recording")
         self._seed, self._hand = seed, hand
-        self._pending.clear()
+        self._forget_commands()
         arms = [arm.name for arm in kinematics.embodiment.arms]
         await self._send(json.dumps({
             "type": "started", "episode": message.episode, "embodiment": row.embodiment, "arms": arms,
@@ -203,10 +236,45 @@ class PlaySession:
             await self._send(json.dumps({"type": "behind"}))
             return
         # Milliseconds of inverse kinematics and projection: beside the worker, which may be at a block.
-        self._pending.append(await asyncio.to_thread(hand.tick, message.arms))
+        ahead = self._ahead
+        known = None if ahead is None or not self._pending else ahead.hand_after(message.arms, self._pending)
+        if known is None:
+            await asyncio.to_thread(hand.tick, message.arms)
+        else:
+            self._hand = hand = known
+        self._pending.append(hand.command)
         await self._send_marks(hand)
         if len(self._pending) >= size and self._working is None:
             self._work(self._predict(self._taken(size), BY_HAND))
+        elif self._working is None:
+            self._compute_ahead(hand, message.arms, size)
+
+    def _compute_ahead(self, hand: Teleoperation, arms: tuple[ArmInput, ...], size: int) -> None:
+        """Compute the block of the commands that are there and of these wishes for the rest, unless it is being computed, or somebody
+        would wait for it.
+        """
+        ahead, parent, left = self._ahead, self._current, size - len(self._pending)
+        late = self._seconds > left / self._kept[0].fps
+        if late or self._host.shared or (ahead is not None and (ahead.arms == arms or not ahead.made.done())):
+            return
+        given, now = list(self._pending), hand.copy()
+
+        def computed() -> Block:
+            hands: list[Teleoperation] = []
+            for _ in range(left):
+                now.tick(arms)
+                hands.append(now.copy())
+            rows = np.stack([*given, *(each.command for each in hands)])
+            simulation = self._reached(parent)
+            return Block(rows, hands, simulation, simulation.step(rows[None])[0])
+
+        made = asyncio.ensure_future(self._host.compute(computed))
+        made.add_done_callback(lambda done: done.cancelled() or done.exception())  # raised again where it is waited for
+        self._ahead = Ahead(arms, made)
+
+    def _forget_commands(self) -> None:
+        self._pending.clear()
+        self._ahead = None
 
     def _taken(self, size: int) -> np.ndarray:
         rows = np.stack(self._pending[:size])
@@ -253,7 +321,12 @@ class PlaySession:
             simulation = self._reached(parent)
             return simulation, simulation.step(rows[None])[0]
 
-        simulation, frames = await self._host.compute(predict)
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and np.array_equal((made := await ahead.made).rows, rows):
+            simulation, frames = made.simulation, made.frames
+        else:
+            simulation, frames = await self._host.compute(predict)
+            self._seconds = time.monotonic() - begin
         seconds = time.monotonic() - begin
         await self._add(parent, simulation, rows, frames, driver)
         tracks = simulation.tracks[0]
@@ -325,7 +398,7 @@ class PlaySession:
             raise DataError(
                 "No such policy", expected=list(self._host.config.policies) or "policies in the settings", got=name
             )
-        self._pending.clear()
+        self._forget_commands()
         current = self._current
         simulation = await self._host.compute(lambda: self._reached(current))
         observation: dict[str, Any] = {

@@ -261,6 +261,11 @@ class SessionHost:
             self._check_room(player, 1)
             self._players.add(player)
 
+    @property
+    def shared(self) -> bool:
+        """Returns whether there are several sessions or players, so that computing ahead for one would make others wait."""
+        return len(self._running) + len(self._players) > 1
+
     def dismiss(self, player: object) -> None:
         """Free the room of a player."""
         self._players.discard(player)

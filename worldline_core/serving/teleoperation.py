@@ -7,6 +7,7 @@ which inverse kinematics follows within the joint limits; a pose that cannot be 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Annotated, Any
 
 import numpy as np
@@ -124,6 +125,10 @@ class Teleoperation:
         self._wanted = np.where(lost[:, None, None], self._poses(), wanted) if lost.any() else wanted
         self._seen = self._tracks(self.command[None])
         return self.command.copy()
+
+    def copy(self) -> Teleoperation:
+        """Another one from here on."""
+        return copy(self)
 
     def _towards(self, arm: int, goal: Goal) -> np.ndarray:
         """Step [m] of a tool towards the point of its own depth that a view shows at a pixel."""
