@@ -177,10 +177,11 @@ def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, s
         page.key("keyUp", "e")
         page.until("window.play.blocks >= 1 && window.play.shown >= 8")
         there = np.array(page.value("window.play.position"))
-        assert abs(there[1, 2] - begin[1, 2] - 0.08) < 0.05
+        assert 0.07 < there[1, 2] - begin[1, 2] < 0.2  # a busy machine sees the key go up late
         assert np.abs(there[0] - begin[0]).max() < 1e-3  # the other arm was left alone
         page.value("document.querySelector('#save').click()")
         saved = page.until("window.play.saved")
+        assert np.allclose(page.value("window.play.position"), there, atol=1e-3)  # and then stays
         page.value("document.getElementById('back').click()")
         assert len(page.value("window.play.latency")) >= 1
         page.value("go(0); untaken = 80; run(true)")
