@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import os
 import ssl
 import threading
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, InvalidStateError
-from contextlib import suppress
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -32,24 +30,18 @@ def exchange(
 ) -> tuple[int, bytes]:
     """Status and body of the answer to a POST (without ``body``: a GET); reading stops soon after ``max_bytes``.
 
-    Redirects are not followed, so that keys and pictures reach no other address than the trusted one.
+    Redirects are not followed, so that keys and pictures reach no other address than the trusted one. The deadline is
+    that of the whole exchange, name resolution included.
 
-    Args:
-        timeout_s: of the whole exchange, name resolution included.
-
-    Raises:
-        UnreachableError: nothing listens there.
-        IncompleteResponseError: the answer broke off or took too long.
+    Raises: UnreachableError; IncompleteResponseError where the answer broke off or took too long.
     """
 
     async def answered() -> tuple[int, bytes]:
         answer = bytearray()
-        client = httpx.AsyncClient(timeout=timeout_s, verify=_machine_certificates())
-        method = "GET" if body is None else "POST"
         async with (
             asyncio.timeout(timeout_s),
-            client,
-            client.stream(method, url, headers=dict(headers), content=body) as response,
+            httpx.AsyncClient(timeout=timeout_s, verify=ssl.create_default_context()) as client,
+            client.stream("GET" if body is None else "POST", url, headers=dict(headers), content=body) as response,
         ):
             async for piece in response.aiter_raw():
                 answer += piece
@@ -59,20 +51,17 @@ def exchange(
 
     try:
         urlsplit(url).port  # noqa: B018  (raises for a port above 65535)
-    except ValueError as error:
-        raise UnreachableError(str(error)) from error
-    try:
         # Half a second to end by itself; only the resolution of a name cannot be cancelled.
         return within(timeout_s + 0.5, lambda: asyncio.run(answered()))
-    except (httpx.ConnectError, httpx.UnsupportedProtocol, httpx.ProxyError, httpx.InvalidURL) as error:
-        raise UnreachableError(f"{type(error).__name__}: {error}") from error
     except TimeoutError:
         raise IncompleteResponseError(f"TimeoutError: no whole answer within {timeout_s:g} s") from None
-    except (httpx.HTTPError, OSError, UnicodeError) as error:  # UnicodeError: a host name
+    except (httpx.ConnectError, httpx.UnsupportedProtocol, httpx.ProxyError, httpx.InvalidURL, ValueError) as error:
+        raise UnreachableError(f"{type(error).__name__}: {error}") from error
+    except (httpx.HTTPError, OSError) as error:
         raise IncompleteResponseError(f"{type(error).__name__}: {error}") from error
 
 
-def within[T](seconds: float, call: Callable[[], T], *, discard: Callable[[T], None] = lambda late: None) -> T:
+def within[T](seconds: float, call: Callable[[], T], *, discard: Callable[[T], object] = lambda late: None) -> T:
     """Returns the result of a call in a thread of its own, which is abandoned when the time is up; ``discard`` gets a late result.
 
     Raises: TimeoutError.
@@ -81,23 +70,22 @@ def within[T](seconds: float, call: Callable[[], T], *, discard: Callable[[T], N
 
     def run() -> None:
         try:
-            result = call()
+            future.set_result(call())
         except BaseException as error:  # noqa: BLE001  (raised again where the result is waited for)
-            with suppress(InvalidStateError):
-                future.set_exception(error)
-            return
-        try:
-            future.set_result(result)
-        except InvalidStateError:
-            discard(result)
+            future.set_exception(error)
 
     threading.Thread(target=run, name="bounded call", daemon=True).start()
     try:
         return future.result(seconds)
     except TimeoutError:
-        if future.cancel():
-            raise
-        return future.result()  # done at the last moment, or a time-out of its own
+        future.add_done_callback(lambda late: late.exception() or discard(late.result()))
+        raise
+
+
+def hub_access() -> dict[str, Any]:
+    """Address and token of the hub, from the environment alone."""
+    # False: without a token the client would look for one that some other program stored.
+    return {"endpoint": os.environ.get("HF_ENDPOINT"), "token": os.environ.get("HF_TOKEN") or False}
 
 
 def hub_snapshot(repo_id: str, patterns: list[str], *, what: str, **options: Any) -> Path:
@@ -106,29 +94,14 @@ def hub_snapshot(repo_id: str, patterns: list[str], *, what: str, **options: Any
     Raises: UnavailableError: the hub does not give it.
     """
     from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
     try:
-        found = snapshot_download(
-            repo_id,
-            allow_patterns=patterns,
-            endpoint=os.environ.get("HF_ENDPOINT"),
-            # False: without a token the client would look for one that some other program stored.
-            token=os.environ.get("HF_TOKEN") or False,
-            **options,
-        )
-    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, httpx.HTTPError, OSError, ValueError) as error:
-        text = str(error).strip().splitlines()
+        return Path(snapshot_download(repo_id, allow_patterns=patterns, **hub_access(), **options))
+    except (httpx.HTTPError, OSError, ValueError) as error:  # which the client's own errors are
         raise UnavailableError(
             f"The hub does not give this {what}",
             where=repo_id,
             expected="a folder of that name here, or the repository on the hub or in its local cache",
-            got=f"{type(error).__name__}: {text[0] if text else ''}"[:300],
+            got=f"{type(error).__name__}: {next(iter(str(error).strip().splitlines()), '')}"[:300],
             next_step="check the name, the network and HF_TOKEN; offline, download it elsewhere and give its folder",
         ) from error
-    return Path(found)
-
-
-@functools.cache
-def _machine_certificates() -> ssl.SSLContext:
-    return ssl.create_default_context()

@@ -6,18 +6,17 @@ one commit; elsewhere the list is written last. Credentials come from the enviro
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from itertools import batched
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, cast
 
 import httpx
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
 from pydantic import Field, ValidationError
 from upath import UPath
 
@@ -27,22 +26,20 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
+from worldline_core.http_exchange import hub_access
 from worldline_core.store.artifact_files import (
     MANIFEST_NAME,
     VOLATILE_FOLDER,
     digest_file,
     folder_files,
-    read_manifest,
     verify_artifact,
 )
-from worldline_core.store.remote import AnyPath, file_system, first_line, list_files, parse_location, with_retries
+from worldline_core.store.remote import AnyPath, file_system, first_line, list_files, parse_location
 from worldline_core.store.store import folder_lock
 
 FILE_LIST = "worldline_files.json"
 MAX_LIST_BYTES = 64 << 20
 _FILES_AT_ONCE = 8
-_BATCH_FILES = 32
-_PIECE_BYTES = 1 << 20
 _HUB_LOCATION = re.compile(r"hf://datasets/(?P<id>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?/?")
 
 
@@ -51,6 +48,10 @@ class PublishedFile(StrictModel):
 
     size: int = Field(ge=0)
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+    def fits(self, path: Path) -> bool:
+        """Returns whether this is the file at a path."""
+        return path.is_file() and path.stat().st_size == self.size and digest_file(path) == self.sha256
 
 
 class FileList(StrictModel):
@@ -75,23 +76,20 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
 
     Raises: DataError when the folder is no set, or its licences do not allow it; ArtifactError when the set is damaged or
         not self-contained, the location holds something else or has another visibility, or the store refuses;
-        ConfigError for an unknown location; UnavailableError without a token; UnreachableInputError when the store does
-        not answer.
+        ConfigError for an unknown location; UnavailableError without a token.
     """
     verify_artifact(folder)
     sources = set_files(folder)
-    _check_may_publish(folder, public=public, allow_restricted=allow_restricted)
-    digests = read_manifest(folder).get("files", {})  # which were just compared with the files
-    files = {
-        name: PublishedFile(size=path.stat().st_size, sha256=digests.get(name, {}).get("sha256") or digest_file(path))
-        for name, path in sorted(sources.items())
-    }
+    if not allow_restricted:
+        _check_may_publish(folder, public=public)
+    sizes = {name: path.stat().st_size for name, path in sorted(sources.items())}
+    files = {name: PublishedFile(size=size, sha256=digest_file(sources[name])) for name, size in sizes.items()}
     _check_names(files, folder)
     contents = FileList(files=files)
-    sending = sources | _card_files(folder, files)
-    hub = _repository(where, writing=True)
+    sending: dict[str, Path] = sources if "README.md" in files else {**sources, **_card_files(folder)}
     with _client_errors(where, "push"):
-        location = _location(where) if hub is None else hub.prepare(public=public)
+        hub = _Repository(where) if where.startswith("hf://") else None
+        location = hub.prepare(public=public) if hub else _location(where)
         present = _sizes(location)
         foreign = sorted(present.keys() - sending.keys() - {".gitattributes"})
         if FILE_LIST not in present and foreign:
@@ -104,11 +102,7 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
             )
         earlier = _read_list(location, present).files if FILE_LIST in present else {}
         gone = sorted((earlier.keys() - files.keys()) & present.keys())
-        listed = contents.model_dump_json(indent=1).encode()
-        if hub is None:
-            _send(location, sending, gone, listed)
-        else:
-            hub.commit(sending, gone, listed)
+        (hub.commit if hub else partial(_send, location))(sending, gone, contents.model_dump_json(indent=1).encode())
     return contents
 
 
@@ -120,27 +114,25 @@ def pull(where: str, folder: Path) -> FileList:
     """
     if folder.exists():
         raise ArtifactError("Folder exists already", where=folder, next_step="pull into a new folder")
-    unfinished, hub = folder.with_name(f"{folder.name}.partial"), _repository(where, writing=False)
+    unfinished = folder.with_name(f"{folder.name}.partial")
     with folder_lock(unfinished):
         if folder.exists():
             raise ArtifactError("Another command has pulled into this folder", where=folder)
         with _client_errors(where, "pull"):
-            location = _location(where) if hub is None else hub.pinned()
+            location = _Repository(where).pinned() if where.startswith("hf://") else _location(where)
             present = _sizes(location)
             if FILE_LIST not in present:
                 raise ArtifactError("No finished EpisodeSet is published here", where=where, expected=FILE_LIST)
             contents = _read_list(location, present)
             _check_names(contents.files, where)
             _raise_mismatch([name for name, file in contents.files.items() if present.get(name) != file.size], where)
-            for path in folder_files(unfinished, everything=True):  # of an earlier, interrupted pull
-                name = path.relative_to(unfinished)
-                if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
+            for path in folder_files(unfinished):  # of an earlier, interrupted pull
+                if path.relative_to(unfinished).as_posix() not in contents.files:
                     path.unlink()
+            missing = [name for name, file in contents.files.items() if not file.fits(unfinished / name)]
             with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-                fetched = pool.map(
-                    lambda name: _fetch(location, name, contents.files[name], unfinished), contents.files
-                )
-                _raise_mismatch([name for name, whole in zip(contents.files, fetched, strict=True) if not whole], where)
+                list(pool.map(lambda name: _fetch(location / name, unfinished / name), missing))
+            _raise_mismatch([name for name in missing if not contents.files[name].fits(unfinished / name)], where)
         set_files(unfinished)  # a set that refers to folders beside it would read what others put there
         verify_artifact(unfinished)
         unfinished.rename(folder)
@@ -159,38 +151,32 @@ def set_files(folder: Path) -> dict[str, Path]:
             "The set refers to datasets of another artifact",
             where=folder,
             expected="datasets inside of the folder",
-            got=", ".join(linked[:3]),
+            got=_shortened(linked),
             next_step=f"make it whole first: worldline export {folder} --format lerobot --output FOLDER",
         )
-    files = {path.relative_to(folder).as_posix(): path for path in folder_files(folder)}
-    manifest = folder / MANIFEST_NAME
-    return files | ({MANIFEST_NAME: manifest} if manifest.is_file() else {})
+    paths = [*folder_files(folder), *(folder.glob(MANIFEST_NAME))]
+    return {path.relative_to(folder).as_posix(): path for path in paths}
 
 
-def _card_files(folder: Path, taken: Iterable[str]) -> dict[str, Path]:
-    """The dataset card, unless the set has a README.md of its own."""
+def _card_files(folder: Path) -> dict[str, Path]:
     from worldline_core.report.data import write_card
 
-    if "README.md" in taken:
-        return {}
     output = folder / VOLATILE_FOLDER / "card"
     return {path.relative_to(output).as_posix(): path for path in write_card(folder, output)}
 
 
-def _check_may_publish(folder: Path, *, public: bool, allow_restricted: bool) -> None:
+def _check_may_publish(folder: Path, *, public: bool) -> None:
     """Raises: DataError for sources whose licence forbids redistribution or, in a public place, does not mention it, and
     for recordings meant for evaluation only.
     """
-    if allow_restricted:
-        return
     sources = read_source_table(folder)
-    forbidden = [f"{source.label} ({source.license})" for source in sources if source.redistribution == "no"]
-    unknown = [f"{source.label} ({source.license})" for source in sources if source.redistribution == "unknown"]
+    named = {
+        kind: [f"{s.label} ({s.license})" for s in sources if s.redistribution == kind] for kind in ("no", "unknown")
+    }
+    unknown = named["unknown"] if sources else ["all"]
     evaluation = sorted({row.source for row in EpisodeSet.open(folder).rows if _evaluation_only(row)})
-    if not sources:
-        unknown = ["all"]
     for what, names in (
-        ("Sources forbid redistribution", forbidden),
+        ("Sources forbid redistribution", named["no"]),
         ("Sources are for evaluation only", evaluation),
         ("Sources do not state whether redistribution is allowed", unknown if public else []),
     ):
@@ -210,19 +196,14 @@ def _evaluation_only(row: EpisodeRow) -> bool:
     return marked or says_droid(row.source, row.embodiment)
 
 
-def _check_names(names: Mapping[str, object], where: object) -> None:
-    """Raises: ArtifactError for a name that leads out of the folder, to a file of this module's, or below another file."""
+def _check_names(names: Iterable[str], where: object) -> None:
+    """Raises: ArtifactError for a name that leads out of the folder, or to a file of this module's."""
     for name in names:
-        pure = PurePosixPath(name)
-        plain = name.isprintable() and "\\" not in name and pure.as_posix() == name and not pure.is_absolute()
-        taken = pure.parts[:1] in ((), (VOLATILE_FOLDER,), (FILE_LIST,)) or any(str(p) in names for p in pure.parents)
-        if not plain or taken or ".." in pure.parts:
-            raise ArtifactError(
-                "A file name of the set is unsafe or taken",
-                where=where,
-                expected="relative names of printable characters",
-                got=repr(name),
-            )
+        path = PurePosixPath(name)
+        plain = name.isprintable() and "\\" not in name and path.as_posix() == name and not path.is_absolute()
+        if not plain or ".." in path.parts or path.parts[:1] in ((), (VOLATILE_FOLDER,), (FILE_LIST,)):
+            what, expected = "A file name of the set is unsafe or taken", "relative names of printable characters"
+            raise ArtifactError(what, where=where, expected=expected, got=repr(name))
 
 
 def _shortened(items: list[str]) -> str:
@@ -242,10 +223,7 @@ def _raise_mismatch(wrong: list[str], where: str) -> None:
 
 @contextmanager
 def _client_errors(where: str, verb: str) -> Iterator[None]:
-    """Turn errors of a store's client into one that names the next step.
-
-    Clients take the types in a server's answers as given: other ones end in errors of values, types and keys.
-    """
+    """Turn errors of a store's client, also those by odd answers of a server, into one that names the next step."""
     try:
         yield
     except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, httpx.HTTPError) as error:
@@ -273,126 +251,74 @@ def _sizes(location: AnyPath) -> dict[str, int]:
 
 
 def _read_list(location: AnyPath, present: Mapping[str, int]) -> FileList:
-    """The list of files at a location."""
     source = location / FILE_LIST
     if present[FILE_LIST] > MAX_LIST_BYTES:
         raise ArtifactError("List of files is too large", where=source, expected=f"at most {MAX_LIST_BYTES} bytes")
-    content = with_retries(lambda: b"".join(_pieces(source, present[FILE_LIST])), str(source))
     try:
-        return FileList.model_validate_json(content)
+        return FileList.model_validate_json(file_system(source).cat_file(str(source)))
     except ValidationError as error:
         got = error.errors(include_url=False)[0]["msg"]
         raise ArtifactError("List of files is damaged or of another version", where=source, got=got) from error
 
 
-def _pieces(source: AnyPath, size: int) -> Iterator[bytes]:
-    """The content of a file, until one byte more than it should have: a server may send without end."""
-    # Of the hub's files only block size 0 is read as a stream; others are requested by range, which a server may ignore.
-    options = {"block_size": 0} if str(source).startswith("hf://") else {}
-    left = size + 1
-    with file_system(source).open(str(source), "rb", **options) as stream:
-        while left and (piece := stream.read(min(_PIECE_BYTES, left))):
-            left -= len(piece)
-            yield piece
-
-
-def _fetch(location: AnyPath, name: str, file: PublishedFile, folder: Path) -> bool:
-    """Copy a file below a folder of this machine, unless it is there; returns whether it has its size and digest."""
-    target = folder / name
-    if target.is_file() and target.stat().st_size == file.size and digest_file(target) == file.sha256:
-        return True
+def _fetch(source: AnyPath, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
-
-    def copy() -> str:
-        digest = hashlib.sha256()
-        with target.open("wb") as stream:
-            for piece in _pieces(location / name, file.size):
-                digest.update(piece)
-                stream.write(piece)
-        return digest.hexdigest()
-
-    return with_retries(copy, str(location / name)) == file.sha256
+    file_system(source).get_file(str(source), str(target))
 
 
 def _send(location: AnyPath, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
     """Send files, remove those that are gone, and write the list of what is there."""
-    fs, where = file_system(location), str(location)
-    for batch in batched(sources.items(), _BATCH_FILES):
-        paths, places = [str(path) for _, path in batch], [str(location / name) for name, _ in batch]
-        with_retries(lambda paths=paths, places=places: fs.put(paths, places), where)
+    fs = file_system(location)
+    fs.put([str(path) for path in sources.values()], [str(location / name) for name in sources])
     for name in gone:
-        with_retries(lambda name=name: fs.rm_file(str(location / name)), where)
-    with_retries(lambda: fs.pipe_file(str(location / FILE_LIST), listed), where)
+        fs.rm_file(str(location / name))
+    fs.pipe_file(str(location / FILE_LIST), listed)
 
 
 class _Repository:
-    """A dataset repository of the hub, made when it does not exist, changed by one commit."""
+    """A dataset repository of the hub, changed by one commit."""
 
-    def __init__(self, where: str, repo_id: str, revision: str | None, *, writing: bool) -> None:
-        from huggingface_hub import HfApi
-
-        token = os.environ.get("HF_TOKEN")
-        if writing and not token:
-            raise UnavailableError(
-                "Pushing to the hub needs a token",
-                expected="the environment variable HF_TOKEN",
-                next_step="make a token with write access and export HF_TOKEN",
-            )
-        # False: without a token the client would look for one that some other program stored.
-        self._client: dict[str, Any] = {"endpoint": os.environ.get("HF_ENDPOINT"), "token": token or False}
-        self._api = HfApi(**self._client)
-        self._repo: dict[str, Any] = {"repo_id": repo_id, "repo_type": "dataset"}
-        self._revision = revision
-        self._where = where
+    def __init__(self, where: str) -> None:
+        match = _HUB_LOCATION.fullmatch(where)
+        if match is None:
+            raise ConfigError("Not a place on the hub", expected="hf://datasets/ORG/NAME[@REVISION]", got=where)
+        self._where, self._revision = where, match["revision"]
+        self._repo: dict[str, Any] = {"repo_id": match["id"], "repo_type": "dataset"}
+        self._api = HfApi(**hub_access())
 
     def prepare(self, *, public: bool) -> AnyPath:
         """Make the repository where it does not exist, and return its newest commit.
 
         Raises: ArtifactError when it exists with another visibility: private data must not become public.
         """
+        if not self._api.token:
+            step = "make a token with write access and export HF_TOKEN"
+            raise UnavailableError("Pushing to the hub needs a token", where=self._where, next_step=step)
         self._api.create_repo(**self._repo, private=not public, exist_ok=True)
-        private = bool(self._api.repo_info(**self._repo).private)
-        if private == public:
+        if bool(self._api.repo_info(**self._repo).private) == public:
+            names = ("private", "public")
             raise ArtifactError(
                 "Repository has another visibility than asked for",
                 where=self._where,
-                expected="public" if public else "private",
-                got="private" if private else "public",
+                expected=names[public],
+                got=names[not public],
                 next_step="push to another repository, or " + ("leave out --public" if public else "add --public"),
             )
         if self._revision is not None:
-            self._api.create_branch(self._repo["repo_id"], branch=self._revision, repo_type="dataset", exist_ok=True)
+            self._api.create_branch(**self._repo, branch=self._revision, exist_ok=True)
         return self.pinned()
 
     def pinned(self) -> AnyPath:
         """The newest commit of the revision."""
-        commit = self._api.repo_info(**self._repo, revision=self._revision).sha
-        if not re.fullmatch("[0-9a-f]{40}", str(commit)):
+        commit = str(self._api.repo_info(**self._repo, revision=self._revision).sha)
+        if not re.fullmatch("[0-9a-f]{40}", commit):
             raise ValueError(f"the repository's commit is {commit!r}")
         name = f"hf://datasets/{self._repo['repo_id']}@{commit}"
-        return cast("AnyPath", UPath(name, **self._client, skip_instance_cache=True))
+        return cast("AnyPath", UPath(name, **hub_access(), skip_instance_cache=True))
 
     def commit(self, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
-        """Send files, remove those that are gone, and write the list of what is there."""
-        from huggingface_hub import CommitOperationAdd, CommitOperationDelete
-
-        self._api.create_commit(
-            **self._repo,
-            revision=self._revision,
-            operations=[
-                *(CommitOperationDelete(name) for name in gone),
-                *(CommitOperationAdd(name, path) for name, path in sources.items()),  # the client sends what differs
-                CommitOperationAdd(FILE_LIST, listed),
-            ],
-            commit_message="Upload EpisodeSet",
-        )
-
-
-def _repository(where: str, *, writing: bool) -> _Repository | None:
-    """The hub's repository that a location names, or None for a location elsewhere."""
-    if not where.startswith("hf://"):
-        return None
-    match = _HUB_LOCATION.fullmatch(where)
-    if match is None:
-        raise ConfigError("Not a place on the hub", expected="hf://datasets/ORG/NAME[@REVISION]", got=where)
-    return _Repository(where, match["id"], match["revision"], writing=writing)
+        """As `_send`; the client sends what differs."""
+        added = [CommitOperationAdd(name, path) for name, path in sources.items()]
+        operations = [*map(CommitOperationDelete, gone), *added, CommitOperationAdd(FILE_LIST, listed)]
+        message = "Upload EpisodeSet"
+        self._api.create_commit(**self._repo, revision=self._revision, operations=operations, commit_message=message)

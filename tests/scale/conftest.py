@@ -3,7 +3,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -39,14 +38,6 @@ def store_server() -> Iterator[object]:
 
 @pytest.fixture
 def store(store_server: object) -> Iterator[object]:
-    remote._cache_of.cache_clear()
+    remote.process_cache.cache_clear()
     yield store_server
     store_server.misbehave = lambda method, path: None  # type: ignore[attr-defined]
-
-
-@pytest.fixture
-def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stores are asked again at once, by our own patience alone: s3fs waits two seconds before it gives up."""
-    monkeypatch.setattr(remote, "PAUSES", (0.01, 0.02, 0.04, 0.08))
-    if find_spec("s3fs") is not None:
-        monkeypatch.setattr("s3fs.S3FileSystem.retries", 1)

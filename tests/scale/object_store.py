@@ -15,7 +15,7 @@ CREDENTIALS = {
     "AWS_SECRET_ACCESS_KEY": "testing",
     "AWS_DEFAULT_REGION": "us-east-1",
     "AWS_EC2_METADATA_DISABLED": "true",
-    "AWS_MAX_ATTEMPTS": "1",  # the library's own patience is not what is tested
+    "AWS_MAX_ATTEMPTS": "3",
 }
 
 

@@ -10,8 +10,8 @@ from dataclasses import replace
 from importlib.util import find_spec
 from itertools import batched
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
-from unittest.mock import Mock
 
 import pytest
 from number_work import NumberFileWork, NumberWork, attempts
@@ -34,8 +34,7 @@ from worldline_core.scale.mapping import (
     ends_the_run,
     map_episodes,
 )
-from worldline_core.store import remote
-from worldline_core.store.remote import UnreachableInputError, is_transient, with_retries
+from worldline_core.store.remote import UnreachableInputError, is_transient
 
 
 def run(folder: Path, values: Sequence[int], size: int, kind: str, **settings: Any) -> None:
@@ -141,11 +140,11 @@ def test_a_shard_that_cannot_be_finished_is_an_error(tmp_path: Path) -> None:
 
 
 class ClientError(Exception):
-    """As botocore's: the status is in the response."""
+    """As the hub's: the status is in the response."""
 
     def __init__(self, status: int) -> None:
         super().__init__(f"status {status}")
-        self.response = {"ResponseMetadata": {"HTTPStatusCode": status}}
+        self.response = SimpleNamespace(status_code=status)
 
 
 class ClientPayloadError(Exception):
@@ -185,22 +184,6 @@ def test_a_readers_own_words_do_not_hide_the_network() -> None:
     error = RejectedInputError("unreadable", "Parquet file cannot be read")
     error.__cause__ = OSError(errno.ESTALE, "stale file handle")
     assert is_transient(error)
-
-
-def test_attempts_are_counted_and_bad_data_gets_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    waited: list[float] = []
-    monkeypatch.setattr(remote.time, "sleep", waited.append)
-    read = Mock(side_effect=[ConnectionResetError()] * 3 + ["read"])
-    assert with_retries(read, "a file") == "read"
-    assert waited == [0.2, 0.4, 0.8]
-    for error, expected, match, calls in (
-        (ConnectionResetError(), UnreachableInputError, "A store could not be reached", 1 + len(remote.PAUSES)),
-        (ValueError("bad"), ValueError, "bad", 1),
-    ):
-        read = Mock(side_effect=error)
-        with pytest.raises(expected, match=match):
-            with_retries(read, "a file")
-        assert read.call_count == calls
 
 
 def rows(*statuses: Literal["kept", "quarantined"]) -> list[InputRow]:

@@ -16,7 +16,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -27,7 +26,7 @@ from worldline_core.errors import ArtifactError, ConfigError, DataError, Unavail
 from worldline_core.progress import Progress
 from worldline_core.scale.account import InputRow, crash_evidence, portable_message, write_shard_account
 from worldline_core.store.artifact_files import VerifyMode
-from worldline_core.store.remote import UnreachableInputError, first_line, is_transient, with_retries
+from worldline_core.store.remote import UnreachableInputError, first_line, is_transient
 from worldline_core.store.store import clear_store_errors, disk_full
 
 logger = logging.getLogger(__name__)
@@ -303,11 +302,16 @@ class RunnerConfig(StrictModel):
 
 def try_shard(shard: Shard[Any], pauses: Sequence[float]) -> Exception | None:
     """Do a shard, again after each of `pauses` seconds while its input cannot be reached; returns what it ends with."""
-    try:
-        with clear_store_errors(shard.work.output):
-            with_retries(partial(do_shard, shard), shard.label, pauses)
-    except Exception as error:  # noqa: BLE001 - returned to `map_episodes`, which decides whether it ends the run
-        return error
+    for pause in (*pauses, None):
+        try:
+            with clear_store_errors(shard.work.output):
+                do_shard(shard)
+            break
+        except Exception as error:  # noqa: BLE001 - returned to `map_episodes`, which decides whether it ends the run
+            if pause is None or not is_transient(error):
+                return error
+            logger.warning("%s: %s; trying again in %.1f s", shard.label, first_line(error), pause)
+            time.sleep(pause)
     return None
 
 

@@ -18,6 +18,8 @@ import time
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
+from multiprocessing.util import get_temp_dir
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pydantic import Field
@@ -89,6 +91,9 @@ class _Reader:
     def __init__(self) -> None:
         self.used = False
         self.environment = _environment()
+        self._folder = TemporaryDirectory(
+            prefix="worldline-reader-", dir=get_temp_dir()
+        )  # for its copies of remote files
         self._connection, there = Pipe()
         with there:
             # Not multiprocessing: that imports the program's main module again, and allows no children of daemons.
@@ -102,7 +107,7 @@ class _Reader:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[there.fileno()],
-                env={**self.environment, **dict.fromkeys(_THREADS, "1")},
+                env={**self.environment, **dict.fromkeys(_THREADS, "1"), "TMPDIR": self._folder.name},
             )
         try:
             self._connection.recv_bytes()
@@ -152,6 +157,7 @@ class _Reader:
         self._process.kill()
         self._process.wait()
         self._connection.close()
+        self._folder.cleanup()
 
 
 # Appending and popping are atomic: threads need no lock. A forked process has no readers of its own.

@@ -186,7 +186,7 @@ def is_file(path: AnyPath) -> bool:
     """
     if isinstance(path, Path):
         return path.is_file()
-    return process_cache().has(path) or _remote_kind(path) == "file"
+    return _remote_kind(path) == "file"
 
 
 def exists(path: AnyPath) -> bool:
