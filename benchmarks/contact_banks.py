@@ -17,8 +17,8 @@ import numpy as np
 
 from worldline_core.errors import DataError
 from worldline_core.evaluation.planning.evaluate_planning import rule_choosers, tree_scores_by_shortcut
-from worldline_core.evaluation.planning.shortcuts import BankFacts, Reach, named_places
 from worldline_core.evaluation.scores import bootstrap_mean
+from worldline_core.evaluation.shortcuts import BankFacts, Reach, named_places
 from worldline_core.recorder.attempts import BankSpec, RecordBanksConfig
 from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.looks import scenes

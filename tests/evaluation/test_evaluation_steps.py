@@ -173,6 +173,9 @@ def test_policy_accuracy_against_recorded_outcomes(recordings, tmp_path):
     assert summary["methods"]["copy"]["test/lift"]["confusion"] == {
         "true_success": 0, "false_success": 0, "true_failure": 2, "false_failure": 2,
     }  # fmt: skip
+    over = summary["methods"]["good"]["all"]["over_shortcut"]
+    best = max(found["all"]["mean"] for found in summary["shortcuts"].values())
+    assert summary["shortcuts"][over["shortcut"]]["all"]["mean"] == best == 1.0 - over["gain"]["mean"]
     evidence = pq.read_table(tmp_path / "decisions.parquet")["evidence"][0].as_py()
     assert "head_view_confirms_target_displacement" in json.loads(evidence)[0]
 

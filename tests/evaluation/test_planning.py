@@ -1,6 +1,7 @@
 """Choosing among predicted videos, what commands alone would choose, and planning in closed loop on the shipped causal model."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from tests.rollout.conftest import ROBOT
 from worldline_core import WorldLine
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.evaluation.planning import shortcuts
+from worldline_core.evaluation import shortcuts
 from worldline_core.evaluation.planning.bracket import (
     CandidateScore,
     CandidateVideo,
@@ -208,7 +209,40 @@ def test_trees_learn_from_other_banks_alone():
     flipped = shortcuts.tree_scores(features, outcomes | {"bank_03": ~outcomes["bank_03"]})
     assert np.array_equal(flipped["bank_03"], scores["bank_03"])
     assert not np.array_equal(flipped["bank_04"], scores["bank_04"])
+    for end in (False, True):
+        alike = {name: np.full(24, end) for name in features}
+        assert set(shortcuts.tree_scores(features, alike)["bank_00"]) == {float(end)}
     assert shortcuts.tree_scores({"alone": features["bank_00"]}, outcomes | {"alone": outcomes["bank_00"]}) == {}
+
+
+def test_verdicts_without_video_are_learned_from_other_starts_of_the_task(monkeypatch):
+    generator = np.random.default_rng(5)
+    misses = {f"bank_{n:02d}": generator.uniform(0.0, 0.1, 6) for n in range(12)}
+    made = {
+        bank: facts("lift the red cube", near(*[(miss, 0, 0) for miss in own]), np.repeat(RISEN, 6, axis=0))
+        for bank, own in misses.items()
+    }
+    monkeypatch.setattr(shortcuts, "bank_facts", lambda episodes, tracks, rows: made[rows[0].bank])
+
+    def verdicts(flipped=()):
+        rows = [
+            SimpleNamespace(episode_id=f"{bank}-{n}", bank=bank, outcome=("failure", "success")[(miss < 0.05) != (bank in flipped)])
+            for bank, own in misses.items()
+            for n, miss in enumerate(own)
+        ]  # fmt: skip
+        tasks = {row.episode_id: "other" if row.bank == "bank_11" else "lift" for row in rows}
+        found = shortcuts.verdicts_without_video(None, None, rows, tasks)["hand_rule"]
+        right = {row.episode_id: found[row.episode_id] == (row.outcome == "success") for row in rows}
+        return found, right
+
+    found, right = verdicts()
+    assert np.mean([right[name] for name in right if not name.startswith("bank_11")]) > 0.9
+    assert not any(found[f"bank_11-{n}"] for n in range(6))  # no other start of its task
+    own = [f"bank_03-{n}" for n in range(6)]
+    by_others = verdicts(flipped=("bank_03",))[0]
+    assert [by_others[name] for name in own] == [found[name] for name in own]
+    by_own = verdicts(flipped=misses.keys() - {"bank_03"})[0]
+    assert [by_own[name] for name in own] != [found[name] for name in own]
 
 
 @pytest.fixture(scope="module")

@@ -174,7 +174,13 @@ def write_policy_scores(folder: Path) -> None:
         "judge": "measured", "shorter_than_recording": {}, "policies": {"shipped_stage2": {"all": ranked}},
         "trust": {"training_recordings": 55, "settings": settings, "methods": methods},
     }  # fmt: skip
-    write_json_atomic(folder / "summary.json", summarise_decisions(rows, resamples=200, seed=0) | more)
+    write_json_atomic(
+        folder / "summary.json",
+        summarise_decisions(
+            rows, {"trees_commands": {f"e{n}": (n % 2 == 0) == (n < 8) for n in range(10)}}, resamples=200, seed=0
+        )
+        | more,
+    )
 
 
 def write_planning_scores(folder: Path) -> None:

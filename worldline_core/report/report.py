@@ -187,30 +187,37 @@ def planning_figure(context: ReportContext) -> Figure | None:
     values = summary["methods"][order[0].name]
     found, most = most_candidates(values), max(values["budgets"], key=int)
     success = {"count": len(summary["banks"]), **found["success"]}
-    measured = share_interval(success)
-    over = found["over_shortcut"]
-    reference = float(summary["shortcuts"][over["shortcut"]][most]["mean"])
-    # The bootstrap of the gain sees as little of a choice that never failed as that of the success.
-    bounds = over["gain"] if measured is success else {key: measured[key] - reference for key in ("low", "high")}
     what = f"of plans succeed, chosen among {most} by their predicted videos"
-    beside = f"the best rule without video ({words(over['shortcut'])})"
     ceiling = summary["methods"].get(TRUE_METHOD)
     where = order[0].long_label + by_recorded_videos(ceiling and most_candidates(ceiling)["success"])
-    return Figure(what, measured, "banks", beside, reference, (bounds["low"], bounds["high"]), where)
+    return beside_shortcut(what, success, "banks", found["over_shortcut"], summary["shortcuts"], most, where)
 
 
 def policy_figure(context: ReportContext) -> Figure | None:
-    """Outcomes judged from predicted videos beside guessing, which is right in half of the cases."""
-    methods = (context.summary("evaluate_policy") or {}).get("methods", {})
-    accuracy = {name: share_interval(values["all"]["accuracy"]) for name, values in methods.items()}
+    """Outcomes judged from predicted videos beside the best shortcut, which sees no video."""
+    summary = context.summary("evaluate_policy") or {}
+    methods = summary.get("methods", {})
     order = predicting(methods)
     first = next((m for m in order if m.kind == "stage2"), order[0] if order else None)
     if first is None:
         return None
-    found, what = accuracy[first.name], "of outcomes judged from predicted videos are right"
-    bounds = found["low"] - 0.5, found["high"] - 0.5
-    where = first.long_label + by_recorded_videos(accuracy.get(TRUE_METHOD))
-    return Figure(what, found, "recordings", "guessing", 0.5, bounds, where)
+    found, ceiling = methods[first.name]["all"], methods.get(TRUE_METHOD)
+    what = "of outcomes judged from predicted videos are right"
+    where = first.long_label + by_recorded_videos(ceiling and share_interval(ceiling["all"]["accuracy"]))
+    over, known = found["over_shortcut"], summary["shortcuts"]
+    return beside_shortcut(what, found["accuracy"], "recordings", over, known, "all", where)
+
+
+def beside_shortcut(
+    what: str, share: JsonObject, of: str, over: JsonObject, shortcuts: JsonObject, column: str, where: str
+) -> Figure:
+    """A share of successes beside that of the best shortcut."""
+    measured = share_interval(share)
+    reference = float(shortcuts[over["shortcut"]][column]["mean"])
+    # The bootstrap of the gain sees as little of what never failed as that of the share.
+    bounds = over["gain"] if measured is share else {key: measured[key] - reference for key in ("low", "high")}
+    beside = f"the best rule without video ({words(over['shortcut'])})"
+    return Figure(what, measured, of, beside, reference, (bounds["low"], bounds["high"]), where)
 
 
 def by_recorded_videos(measured: JsonObject | None) -> str:

@@ -33,14 +33,6 @@ from worldline_core.evaluation.planning.bracket import (
     shown_order,
     shown_video,
 )
-from worldline_core.evaluation.planning.shortcuts import (
-    FEATURES,
-    RULES,
-    BankFacts,
-    bank_facts,
-    medoid,
-    tree_scores,
-)
 from worldline_core.evaluation.recordings import open_rollouts, open_tracks, trajectory_of
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
@@ -53,6 +45,14 @@ from worldline_core.evaluation.scores import (
     write_table,
 )
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
+from worldline_core.evaluation.shortcuts import (
+    FEATURES,
+    RULES,
+    BankFacts,
+    bank_facts,
+    medoid,
+    tree_scores,
+)
 from worldline_core.evaluation.vlm import open_vlm
 from worldline_core.progress import with_progress
 from worldline_core.rollout.rollout_set import RolloutSet

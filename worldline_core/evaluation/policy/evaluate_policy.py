@@ -2,7 +2,8 @@
 
 As many successes as failures are judged in every split and task family: of every method those that it predicted, first of all those
 that all methods predicted. The recorded videos are judged too (method ``true``): that accuracy is the judge's own ceiling. Accuracy
-is pooled per seed and averaged over seeds, by split and task family, with intervals.
+is pooled per seed and averaged over seeds, by split and task family, with intervals. Shortcuts, which see no video
+(`evaluation.shortcuts`), give verdicts on the same attempts: what a model knows counts over the best of them.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from worldline_core.evaluation.scores import (
     write_table,
 )
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
+from worldline_core.evaluation.shortcuts import verdicts_without_video
 from worldline_core.evaluation.vlm import open_vlm
 from worldline_core.progress import with_progress
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -104,7 +106,10 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     counts = _count(config, rows, chosen, verdicts, inputs["episodes"])
 
     resampling = {"resamples": config.resamples, "seed": config.seed}
-    summary = summarise_decisions(verdicts, **resampling)
+    judged_rows = [row for row in chosen if row.episode_id in {verdict["episode_id"] for verdict in verdicts}]
+    tasks = {verdict["episode_id"]: verdict["task"] for verdict in verdicts}
+    shortcuts = verdicts_without_video(episodes, tracks, judged_rows, tasks)
+    summary = summarise_decisions(verdicts, shortcuts, **resampling)
     summary |= {"judge": judge.name, "interval": "95 % bootstrap over trajectories"}
     summary["shorter_than_recording"] = dict(too_short)
     if config.compare_policies:
@@ -209,16 +214,26 @@ def _correctness(row: Mapping[str, Any]) -> Score:
     )  # fmt: skip
 
 
-def summarise_decisions(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) -> dict[str, Any]:
+def summarise_decisions(
+    rows: Sequence[Mapping[str, Any]], shortcuts: Mapping[str, Mapping[str, bool]], *, resamples: int, seed: int
+) -> dict[str, Any]:
     """Accuracy of every method and group, and differences between methods.
 
     Args:
         rows: verdicts with method, episode_id, seed, split, task_family, outcome, predicted, answers, malformed_answers.
+        shortcuts: success by shortcut and episode, without any video.
 
     Returns:
-        {"trajectories", "methods": {method: {group: {"accuracy": interval, "seeds": {...}, "confusion": {...}}}},
-         "differences": [...]}; groups are "all", each split, each family, and split/family.
+        {"trajectories", "methods": {method: {group: {"accuracy": interval, "seeds": {...}, "confusion": {...}, "over_shortcut": {"shortcut",
+        "gain": interval}}}}, "shortcuts": {shortcut: {group: interval}}, "differences": [...]}; groups are "all", each split, each family,
+        and split/family; a gain is over the shortcut that is right most often there, recording by recording.
     """
+    outcomes = {row["episode_id"]: row["outcome"] == "success" for row in rows}
+    correct = {
+        name: {episode: float(own[episode] == end) for episode, end in outcomes.items()}
+        for name, own in shortcuts.items()
+    }
+    by_group: dict[str, dict[str, Any]] = defaultdict(dict)
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
         names = (_ALL, row["split"], row["task_family"], f"{row['split']}/{row['task_family']}")
@@ -230,9 +245,18 @@ def summarise_decisions(rows: Sequence[Mapping[str, Any]], *, resamples: int, se
         for row in members:
             right = "true" if row["predicted"] == row["outcome"] else "false"
             confusion[f"{right}_{row['predicted']}"] += 1
-        accuracy = bootstrap_mean(list(_accuracy(members, "episode_id").values()), resamples=resamples, seed=seed)
+        own = _accuracy(members, "episode_id")
+        accuracy = bootstrap_mean(list(own.values()), resamples=resamples, seed=seed)
+        best = max(sorted(correct), key=lambda name: np.mean([correct[name][episode] for episode in own]))
+        gains = [value - correct[best][episode] for episode, value in own.items()]
+        gain = asdict(bootstrap_mean(gains, resamples=resamples, seed=seed))
+        if method == TRUE_METHOD:
+            for name, values in correct.items():
+                found = bootstrap_mean([values[episode] for episode in own], resamples=resamples, seed=seed)
+                by_group[name][group] = asdict(found)
         methods[method][group] = {
             "accuracy": asdict(accuracy),
+            "over_shortcut": {"shortcut": best, "gain": gain},
             "seeds": {str(name): value for name, value in _accuracy(members, "seed").items()},
             "confusion": confusion,
             **{name: sum(row[name] for row in members) for name in ("malformed_answers", "answers")},
@@ -241,6 +265,7 @@ def summarise_decisions(rows: Sequence[Mapping[str, Any]], *, resamples: int, se
     return {
         "trajectories": len({row["episode_id"] for row in rows}),
         "methods": dict(methods),
+        "shortcuts": dict(by_group),
         "differences": method_differences(by_method, "accuracy", resamples=resamples, seed=seed),
     }
 

@@ -1,7 +1,7 @@
-"""Shortcuts: choices among candidates without any predicted video, which a world model has to beat to be needed.
+"""Shortcuts: choices among candidates, and verdicts on attempts, without any predicted video, which a world model has to beat to be needed.
 
-They see what a planner has before it predicts anything: the commands of the candidates, where their tools come to be in the head view,
-and the first picture. Trees also know how the candidates of other banks ended.
+They see what there is before anything is predicted: the commands, where the tools come to be in the head view, and the first picture.
+Trees also know how the candidates of other banks ended, or attempts from other starts.
 
 Axis legend: c candidates of a bank, n frames, a arms, f features. Points are metres in the base frame.
 """
@@ -9,8 +9,10 @@ Axis legend: c candidates of a bank, n frames, a arms, f features. Points are me
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -224,29 +226,68 @@ FEATURES: Mapping[str, Callable[[BankFacts], np.ndarray | None]] = {
 
 
 def tree_scores(
-    features: Mapping[str, Float[np.ndarray, "c f"]], outcomes: Mapping[str, Bool[np.ndarray, " c"]]
+    features: Mapping[str, Float[np.ndarray, "c f"]],
+    outcomes: Mapping[str, Bool[np.ndarray, " c"]],
+    tasks: Mapping[str, str] | None = None,
 ) -> dict[str, Scores]:
     """Expected success of the candidates of each bank, by random trees grown on the banks of the other folds.
 
-    Banks that share robot and task may share a fold's trees; banks of other sizes of features (another robot) never do. A bank
-    without any other to learn from is left out.
+    Banks of other sizes of features (another robot), and of another of the `tasks`, never share a fold's trees. A bank without any other to
+    learn from is left out.
     """
     scores: dict[str, Scores] = {}
-    widths = {name: own.shape[1] for name, own in features.items()}
+    kinds = {name: (own.shape[1], tasks[name] if tasks else "") for name, own in features.items()}
     for fold in range(FOLDS):
         fold_names = sorted(features)[fold::FOLDS]
-        for width in sorted({widths[name] for name in fold_names}):
-            held_out = [name for name in fold_names if widths[name] == width]
-            known = sorted(name for name in features if name not in fold_names and widths[name] == width)
+        for kind in sorted({kinds[name] for name in fold_names}):
+            held_out = [name for name in fold_names if kinds[name] == kind]
+            known = sorted(name for name in features if name not in fold_names and kinds[name] == kind)
             if not known:
+                continue
+            x = np.concatenate([features[name] for name in known]).astype(np.float32)
+            y = np.concatenate([outcomes[name] for name in known]).astype(np.float32)
+            if (y == y[0]).all():  # which OpenCV's trees refuse
+                scores |= {name: np.full(len(features[name]), float(y[0])) for name in held_out}
                 continue
             trees = cv2.ml.RTrees.create()
             trees.setMaxDepth(_DEPTH)
             trees.setTermCriteria((cv2.TERM_CRITERIA_MAX_ITER, _TREES, 0.0))
             cv2.setRNGSeed(_SEED)
-            x = np.concatenate([features[name] for name in known]).astype(np.float32)
-            y = np.concatenate([outcomes[name] for name in known]).astype(np.float32)
             trees.train(x, cv2.ml.ROW_SAMPLE, y)
             for name in held_out:
                 scores[name] = trees.predict(features[name].astype(np.float32))[1][:, 0]
     return scores
+
+
+def verdicts_without_video(
+    episodes: EpisodeSet, tracks: ActionTracks | None, rows: Sequence[EpisodeRow], tasks: Mapping[str, str]
+) -> dict[str, dict[str, bool]]:
+    """Whether each attempt succeeds, by the shortcut's name: trees that saw attempts of its task from other starts, with commands, placed
+    paths, or the score of a rule alone. Without any to learn from, it fails.
+
+    Args:
+        rows: attempts that ended in success or failure. tasks: by episode.
+    """
+    starts: dict[str, list[EpisodeRow]] = defaultdict(list)
+    for row in rows:
+        starts[row.bank or row.episode_id].append(row)
+    facts = {start: bank_facts(episodes, tracks, own) for start, own in starts.items()}
+    ends = {start: np.array([row.outcome == "success" for row in own]) for start, own in starts.items()}
+    of_start = {start: tasks[own[0].episode_id] for start, own in starts.items()}
+    makers = {name: make for name, make in FEATURES.items() if make is not less_mean}
+    makers |= {name: partial(_as_feature, rule) for name, rule in RULES.items()}
+    found: dict[str, dict[str, bool]] = {}
+    for name, make in makers.items():
+        made = {start: made for start, own in facts.items() if (made := make(own)) is not None}
+        scores = tree_scores(made, ends, of_start)
+        found[name] = {
+            row.episode_id: start in scores and bool(scores[start][place] > 0.5)
+            for start, own in starts.items()
+            for place, row in enumerate(own)
+        }
+    return found
+
+
+def _as_feature(rule: Callable[[BankFacts], Scores | None], facts: BankFacts) -> Float[np.ndarray, "c 1"] | None:
+    scores = rule(facts)
+    return None if scores is None else np.maximum(scores, -10.0)[:, None]  # trees take finite numbers
