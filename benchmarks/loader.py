@@ -89,8 +89,8 @@ class RepeatedClips:
     def __init__(self, sampler: ClipSampler, steps: int) -> None:
         self.sampler, self.steps = sampler, steps
 
-    def clips(self, index: int, attempt: int = 0) -> ClipBatch:
-        return self.sampler.clips(index % self.steps, attempt)
+    def clips(self, index: int) -> ClipBatch:
+        return self.sampler.clips(index % self.steps)
 
 
 def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple[str, float, float, float]:

@@ -90,16 +90,6 @@ def test_single_view_steps_take_larger_batches(store):
     assert {(batch.views, len(batch.clips)) for batch in batches} == {(VIEWS, 4), (("head",), 12)}
 
 
-def test_further_attempts_draw_other_clips_of_the_same_kind(store):
-    config = ClipSampling(lengths=(5, 9), view_weights={"joint": 1.0, "head": 1.0})
-    sampler, other = (make(store, config, plan=BatchPlan(2, 2, rank, 2)) for rank in range(2))
-    drawn = [sampler.clips(3, attempt) for attempt in range(20)]
-    assert drawn == [make(store, config, plan=BatchPlan(2, 2, 0, 2)).clips(3, attempt) for attempt in range(20)]
-    assert len({(batch.views, batch.clips[0].num_frames) for batch in drawn}) == 1
-    assert len({batch.clips for batch in drawn}) == 20
-    assert all(batch.clips != other.clips(3, attempt).clips for attempt, batch in enumerate(drawn))
-
-
 def test_lengths_may_be_a_range_and_fit_the_tokenizer_and_the_recordings(store):
     assert ClipSampling.model_validate({"lengths": {"from": 33, "to": 129}}).lengths == tuple(range(33, 130, 4))
     for lengths, message in (
@@ -160,7 +150,6 @@ def test_batches_hold_clips_of_one_set_of_views(latents):
     for index in range(600):
         batch = sampler.clips(index)
         assert {latents.row(clip.episode_id).views for clip in batch.clips} == {batch.views}
-        assert sampler.clips(index, 1).views == batch.views
         drawn.update(clip.episode_id for clip in batch.clips)
     # Grouping changes nothing of how often an episode is drawn.
     assert min(drawn.values()) > 0.7 * 1200 / 6

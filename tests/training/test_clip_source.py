@@ -20,7 +20,7 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput, LatentInput
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler, latent_frame_count, longest_clip
-from worldline_core.training.clip_source import FrameSource, LatentRow, LatentStore, ResidentLatents, training_rows
+from worldline_core.training.clip_source import FrameSource, LatentRow, LatentStore, training_rows
 from worldline_core.training.encode_latents import (
     choose_layout,
     encode_clip,
@@ -72,7 +72,7 @@ def test_a_clip_of_the_store_equals_direct_encoding(tmp_path, tokenizer, clip_fr
     description = {"layout": layout, "start_step": start_step, "strides": [stride], "latent_shape": [3, 2, 2]}
     description |= {"image_size": [2, 2], "clip_frames": clip_frames}
     store = LatentStore(tmp_path, description, [row])
-    resident = ResidentLatents(store, "cpu")
+    resident = LatentStore(tmp_path, description, [row]).resident_on("cpu")
     checked = 0
     for start in range(0, 30, start_step):
         longest = longest_clip(row.num_frames, start, stride)
@@ -104,7 +104,7 @@ def test_clips_longer_than_those_encoded_are_refused_before_training(world):
 
 def test_resident_batches_are_those_of_the_store(world):
     store, tracks = LatentStore.open(world.latents), ActionTracks.open(world.tracks)
-    resident = ResidentLatents(store, "cpu")
+    resident = LatentStore.open(world.latents).resident_on("cpu")
     config = ClipSampling(lengths=(5, 9, 17), view_weights={"joint": 1.0, "left_wrist": 1.0})
     sampler = ClipSampler(store.rows, config, views=VIEWS, splits=["train"], start_step=4, batch_size=3, seed=0)
     for action_frames in (1, 4):
@@ -122,7 +122,7 @@ def test_bad_requests_and_bad_values_are_named(world, tmp_path):
     assert latent_frame_count(33) == 9
     with pytest.raises(DataError, match="32"):
         latent_frame_count(32)
-    for source in (LatentStore.open(root), ResidentLatents(LatentStore.open(root), "cpu")):
+    for source in (LatentStore.open(root), LatentStore.open(root).resident_on("cpu")):
         for clip, views, message in (
             (dataclasses.replace(whole, start=4), VIEWS, r"at most 17 of 17[\s\S]*frames 4\.\.20"),
             (Clip("episode-000", 0, 5, 2), VIEWS, r"strides \(1,\)[\s\S]*frames 0\.\.8 by 2"),

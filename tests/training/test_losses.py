@@ -10,7 +10,7 @@ from worldline_core.errors import DataError
 from worldline_core.model.layers import preconditioned_velocity
 from worldline_core.model.world_model_config import VIEWS
 from worldline_core.training import relational
-from worldline_core.training.clip_loader import Batch, ObjectWeights, object_weights
+from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.flow_matching import (
     FlowMatchingObjective,
@@ -19,6 +19,7 @@ from worldline_core.training.flow_matching import (
     sample_sigmas,
     velocity_target,
 )
+from worldline_core.training.object_weights import ObjectWeights, object_weights
 from worldline_core.training.training_config import LossWeighting, RelationalConfig, SigmaSampling
 
 

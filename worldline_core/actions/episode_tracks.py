@@ -106,6 +106,15 @@ class EpisodeTracks:
 
         Raises: DataError for a frame outside of the episode.
         """
+        index = self.index(frames)
+        return replace(
+            self,
+            **{name: getattr(self, name)[index] for name in (*SAMPLES, "T_base_tool", "T_base_camera", "capsules")},
+            native=None if self.native is None else self.native[index],
+        )
+
+    def index(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Frame numbers as an array; raises as `clip`."""
         index = np.asarray(frames, dtype=np.int64)
         if len(index) == 0 or index.min() < 0 or index.max() >= self.num_frames:
             raise DataError(
@@ -114,11 +123,7 @@ class EpisodeTracks:
                 expected=f"0..{self.num_frames - 1}",
                 got=f"{index.tolist()[:4]}...",
             )
-        return replace(
-            self,
-            **{name: getattr(self, name)[index] for name in (*SAMPLES, "T_base_tool", "T_base_camera", "capsules")},
-            native=None if self.native is None else self.native[index],
-        )
+        return index
 
 
 @dataclass(frozen=True)
@@ -150,14 +155,18 @@ def drawn_size(clips: Sequence[EpisodeTracks]) -> tuple[int, int]:
 
 
 def collate_tracks(
-    clips: Sequence[EpisodeTracks], views: Sequence[str] | None = None, native_size: int | None = None
+    clips: Sequence[EpisodeTracks],
+    views: Sequence[str] | None = None,
+    native_size: int | None = None,
+    frames: Sequence[Sequence[int]] | None = None,
 ) -> TrackBatch:
     """Stack clips of equal length, views in the given order (default: the views of the first clip).
 
     Args:
         native_size: of the control vectors; None: without them.
+        frames: those that are taken of each clip; None: all.
 
-    Raises: DataError when a clip lacks a view or has no vector of this size, or the clips differ in length or frame size.
+    Raises: DataError when a clip lacks a view, a frame or a vector of this size, or the clips differ in length or frame size.
     """
     if not clips:
         raise DataError("No action tracks to collate", expected="at least one clip", got="none")
@@ -165,26 +174,30 @@ def collate_tracks(
     num_arms = max(len(clip.arms) for clip in clips)
     columns: dict[str, list[np.ndarray]] = {name: [] for name in SAMPLES}
     if native_size is not None:
-        columns |= {"native": [_native(clip, order, native_size) for clip in clips], "camera": []}
-    for clip in clips:
+        columns |= {"native": [], "camera": []}
+    taken = [clip.index(range(clip.num_frames) if frames is None else frames[n]) for n, clip in enumerate(clips)]
+    for clip, index in zip(clips, taken, strict=True):
         missing = [view for view in order if view not in clip.views]
         other_size = clip.image_size != size and bool(clip.calibrated_views)
-        if missing or clip.num_frames != clips[0].num_frames or other_size:
+        if missing or len(index) != len(taken[0]) or other_size:
             raise DataError(
                 "Action tracks do not fit together in one batch",
                 where=f"episode {clip.episode_id}",
-                expected=f"views {order}, {clips[0].num_frames} frames of {size}",
-                got=f"views {clip.views}, {clip.num_frames} frames of {clip.image_size}",
+                expected=f"views {order}, {len(taken[0])} frames of {size}",
+                got=f"views {clip.views}, {len(index)} frames of {clip.image_size}",
             )
         if native_size is not None:
             known = np.array([view in clip.calibrated_views for view in order])
-            columns["camera"].append(np.tile(known, (clip.num_frames, 1)))
-        index = [clip.views.index(view) for view in order]
+            columns["native"].append(_native(clip, order, native_size)[index])
+            columns["camera"].append(np.tile(known, (len(index), 1)))
+        slots = [clip.views.index(view) for view in order]
         for name in SAMPLES:
-            values = getattr(clip, name)[:, index]
-            padding = [(0, 0)] * values.ndim
-            padding[2] = (0, num_arms - len(clip.arms))
-            columns[name].append(np.pad(values, padding))
+            values = getattr(clip, name)[index[:, None], slots]
+            if num_arms > len(clip.arms):
+                padding = [(0, 0)] * values.ndim
+                padding[2] = (0, num_arms - len(clip.arms))
+                values = np.pad(values, padding)
+            columns[name].append(values)
     return TrackBatch(**{name: torch.from_numpy(np.stack(column)) for name, column in columns.items()})
 
 

@@ -181,7 +181,7 @@ class DistillationRun:
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
         loader = copy(self.loader)
         loader.object_weights = weights_of(settings.weighting, self.episodes, self.source)
-        load = loader.batches(sampler, self.config.input, work)
+        load = loader.batches(sampler, self.config.input)
         return self._train(STEPS[0], settings.trainer, objective, load, info, self.start)
 
     def trajectory_regression(self) -> dict[str, float]:
@@ -268,7 +268,7 @@ class DistillationRun:
                 **settings.model_dump(mode="json"),
                 **config.model_dump(mode="json", include={"input", "clips"}),
             }
-            load = self.loader.batches(self._sampler(drawn, config.clips, ALONE), reading, folder)
+            load = self.loader.batches(self._sampler(drawn, config.clips, ALONE), reading)
             make = partial(trajectory_shard, config=config, teacher=teacher, loader=self.loader, load=load)
             write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
         if processes()[0] == 0:
@@ -340,7 +340,7 @@ class DistillationRun:
                 "tokenizer": self.source.description["tokenizer"],
                 "lpips": self.lpips,
                 "metrics": result.metrics,
-                **input_facts(config.input, self.source, self._work(STEPS[0]), self._work(TRAJECTORIES)),
+                **input_facts(config.input, self.source),
             },
         }
         if processes()[0] == 0:

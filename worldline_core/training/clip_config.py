@@ -72,21 +72,18 @@ class ClipSampling(StrictModel):
 
 
 class ReadingConfig(StrictModel):
-    """Reading of clips. It does not change what is trained on, except for skipped clips.
+    """Reading of clips.
 
     ``workers``: processes that read two micro-batches ahead each; 0 reads in the training process when a batch is needed.
-    ``on_unreadable``: "raise" stops at the first clip that cannot be read; "skip" takes another clip in its place and
-    names it in the log and in ``run/skipped_clips-*.jsonl``.
     """
 
     workers: int = Field(default=0, ge=0)
-    on_unreadable: Literal["raise", "skip"] = "raise"
 
 
 class LatentInput(ReadingConfig):
     """Latents cached by encode_latents.
 
-    ``resident``: keep the latents and action tracks of all episodes on the training device, for sets that fit there:
+    ``resident``: keep the latents of all episodes on the training device, for sets that fit there:
     a small model then never waits for reading.
     """
 

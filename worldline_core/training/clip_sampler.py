@@ -169,8 +169,8 @@ class ClipSampler:
         self.longest = max(kind.length for kind in self._kinds)
         """Frames of the longest clips that are drawn."""
 
-    def clips(self, index: int, attempt: int = 0) -> ClipBatch:
-        """The clips of this process's micro-step ``index``; further attempts draw others of its length, stride and views."""
+    def clips(self, index: int) -> ClipBatch:
+        """The clips of this process's micro-step ``index``."""
         index, part = self.plan.drawn(index)
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         kind = self._kinds[int(random.choice(len(self._kinds), p=self._kind_weights))]
@@ -181,8 +181,6 @@ class ClipSampler:
         size = self.batch_size * (1 if name in (JOINT, SUBSET) else self.single_view_factor)
         sets = self._sets(name, kind)
         views = sets[0] if len(sets) == 1 else sets[int(random.integers(len(sets)))]
-        if attempt:  # a stream of its own
-            random = np.random.Generator(np.random.Philox(key=[self.seed, index], counter=[0, 0, attempt, 1 + part]))
         return ClipBatch(self._draw(random, kind, size, part), views, primary=name == PRIMARY)
 
     def _drawn(self, kind: _Kind) -> dict[str, float]:

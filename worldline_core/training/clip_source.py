@@ -12,9 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import accumulate
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, Self, cast
 
 import numpy as np
 import torch
@@ -23,9 +22,8 @@ from jaxtyping import Float, Shaped, UInt8
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from worldline_core.actions.action_maps import control_frames
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
-from worldline_core.actions.episode_tracks import SAMPLES, ActionTracks, TrackBatch, collate_tracks
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import FrameDecoder
@@ -41,7 +39,7 @@ from worldline_core.model.tokenizers import (
 from worldline_core.progress import with_progress
 from worldline_core.store.artifact_files import read_json, read_rows
 from worldline_core.training.clip_config import ClipInput, FrameInput
-from worldline_core.training.clip_sampler import Clip, ClipRow, latent_frame_count, longest_clip
+from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipRow, latent_frame_count, longest_clip
 
 logger = logging.getLogger(__name__)
 
@@ -97,12 +95,20 @@ class ClipSource(ABC):
 
     @abstractmethod
     def read(self, clip: Clip, views: tuple[str, ...]) -> Shaped[Tensor, "v ..."]:
-        """Some views of a clip, in host memory.
+        """Some views of a clip.
 
         Raises:
             DataError: the clip is damaged; the message names it.
             ArtifactError: the clip does not belong to this source.
         """
+
+    def recorded_views(self, batch: ClipBatch, clip: Clip) -> tuple[str, ...]:
+        """The recorded views that fill a clip's slots: the task-facing one has a name of its own."""
+        return (self.row(clip.episode_id).primary_view,) if batch.primary else batch.views
+
+    def read_batch(self, batch: ClipBatch) -> Shaped[Tensor, "b v ..."]:
+        """All clips of a batch; raises as `read`."""
+        return torch.stack([self.read(clip, self.recorded_views(batch, clip)) for clip in batch.clips])
 
     @abstractmethod
     def latents(self, read: Shaped[Tensor, "b v ..."], device: str) -> Float[Tensor, "b v c t h w"]:
@@ -156,6 +162,7 @@ class LatentStore(ClipSource):
         self.clip_frames = description["clip_frames"]
         self._shard_of = {row.episode_id: row.shard for row in rows}
         self._shards: dict[str, Any] = {}
+        self._resident: dict[str, Tensor] = {}
 
     @classmethod
     def open(cls, root: Path) -> LatentStore:
@@ -180,21 +187,33 @@ class LatentStore(ClipSource):
         # Open shards stay in the process that opened them.
         return {**self.__dict__, "_shards": {}}
 
+    def resident_on(self, device: str) -> Self:
+        """This store, with all latents kept on one device in half precision."""
+        for row in with_progress(self.rows, "reading latents", "episode"):
+            with self._shard(row.episode_id) as shard:
+                for name in (name for name in shard.keys() if name.startswith(f"{row.episode_id}/")):  # noqa: SIM118
+                    self._resident[name] = shard.get_tensor(name).to(device, torch.float16)
+        self._shards.clear()
+        return self
+
     def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
-        """The clip's latents.
+        """Latents of one clip (float32), views in the given order.
 
         Raises:
-            ArtifactError: the clip or a view is not stored, or a shard is damaged.
+            ArtifactError: the clip does not fit the store, or its shard is damaged.
         """
-        selected = self.stored_views(clip, views)
-        with self.shard(clip.episode_id) as shard:
-            frames = [shard.get_slice(name)[:, :, first:stop] for name, first, stop in self.parts(clip)]
+        selected, parts = self._stored_views(clip, views), self._parts(clip)
+        if self._resident:
+            frames = [self._resident[name][:, :, first:stop] for name, first, stop in parts]
+        else:
+            with self._shard(clip.episode_id) as shard:
+                frames = [shard.get_slice(name)[:, :, first:stop] for name, first, stop in parts]
         return torch.cat(frames, dim=2)[selected].float()
 
     def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
         return read.to(device)
 
-    def parts(self, clip: Clip) -> list[tuple[str, int, int]]:
+    def _parts(self, clip: Clip) -> list[tuple[str, int, int]]:
         """Tensors that a clip's latent frames are in, in order: (name, first latent frame, stop)."""
         frames = latent_frame_count(clip.num_frames)
         if self.layout == "clips":
@@ -206,23 +225,23 @@ class LatentStore(ClipSource):
         offset, phase = divmod(clip.start + clip.stride, TEMPORAL_FACTOR * clip.stride)
         return [single, (group_key(clip.episode_id, clip.stride, phase), offset, offset + frames - 1)]
 
-    def stored_views(self, clip: Clip, views: tuple[str, ...]) -> list[int]:
+    def _stored_views(self, clip: Clip, views: tuple[str, ...]) -> list[int]:
         """Numbers of a clip's views among those that are stored; raises as `read` does."""
         row = self.row(clip.episode_id)
-        longest = min(longest_clip(row.num_frames, clip.start, clip.stride), self.clip_frames or row.num_frames)
-        fits = clip.start >= 0 and clip.start % self.start_step == 0 and clip.num_frames <= longest
-        if clip.stride not in self.strides or not fits or not set(views) <= set(row.views):
+        most = self.clip_frames or row.num_frames
+        fits = clip.start >= 0 and clip.num_frames <= min(longest_clip(row.num_frames, clip.start, clip.stride), most)
+        if clip.stride not in self.strides or not fits or clip.start % self.start_step or not {*views} <= {*row.views}:
             raise ArtifactError(
                 "The latents do not hold this clip.",
                 where=self.root,
-                expected=f"strides {self.strides}, a start divisible by {self.start_step}, at most "
-                f"{self.clip_frames or row.num_frames} of {row.num_frames} frames, views {row.views}",
+                expected=f"strides {self.strides}, a start divisible by {self.start_step}, at most {most} of "
+                f"{row.num_frames} frames, views {row.views}",
                 got=f"{clip}, views {views}",
             )
         return [row.views.index(view) for view in views]
 
     @contextmanager
-    def shard(self, episode_id: str) -> Iterator[Any]:
+    def _shard(self, episode_id: str) -> Iterator[Any]:
         """The open safetensors file that holds an episode; it stays open."""
         path = self.root / self._shard_of[episode_id]
         try:
@@ -236,69 +255,6 @@ class LatentStore(ClipSource):
                 got=error,
                 next_step="encode the latents again",
             ) from error
-
-
-class ResidentLatents(LatentStore):
-    """A store whose latents are all on one device, in half precision."""
-
-    def __init__(self, store: LatentStore, device: str) -> None:
-        super().__init__(store.root, store.description, store.rows)
-        self._tensors: dict[str, Tensor] = {}
-        for row in with_progress(self.rows, "reading latents", "episode"):
-            with store.shard(row.episode_id) as shard:
-                for name in (name for name in shard.keys() if name.startswith(f"{row.episode_id}/")):  # noqa: SIM118
-                    self._tensors[name] = shard.get_tensor(name).to(device, torch.float16)
-
-    def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
-        selected = self.stored_views(clip, views)
-        frames = [self._tensors[name][:, :, first:stop] for name, first, stop in self.parts(clip)]
-        return torch.cat(frames, dim=2)[selected].float()
-
-
-class ResidentTracks:
-    """Track samples of many episodes on one device.
-
-    Raises:
-        DataError: the episodes' frames have several sizes.
-    """
-
-    def __init__(
-        self,
-        tracks: ActionTracks,
-        episode_ids: Sequence[str],
-        views: tuple[str, ...],
-        device: str,
-        native_size: int | None,
-    ) -> None:
-        episodes = [tracks.tracks(episode_id) for episode_id in episode_ids]
-        sizes = {episode.image_size for episode in episodes if episode.calibrated_views}
-        if len(sizes) > 1:
-            raise DataError("Resident action tracks have frames of one size", where=tracks.root, got=sorted(sizes))
-        self.image_size = sizes.pop() if sizes else (1, 1)
-        self._first = dict(zip(episode_ids, accumulate((one.num_frames for one in episodes), initial=0), strict=False))
-        samples = [vars(collate_tracks([episode], views, native_size)) for episode in episodes]
-        arms = max(len(episode.arms) for episode in episodes)
-        self._samples = {
-            name: torch.cat([_padded(one[name][0], arms) if name in SAMPLES else one[name][0] for one in samples]).to(
-                device
-            )
-            for name in (name for name, values in samples[0].items() if values is not None)
-        }
-        self._views = views
-
-    def batch(self, clips: Sequence[Clip], per_latent_frame: int, views: Sequence[str]) -> TrackBatch:
-        """Samples of the control frames of clips of one length, as `collate_tracks` gives them."""
-        within = np.array(control_frames(clips[0].num_frames, per_latent_frame))
-        frames = [self._first[clip.episode_id] + clip.start + clip.stride * within for clip in clips]
-        numbers = torch.from_numpy(np.stack(frames)).to(self._samples["uv"].device)
-        chosen = [self._views.index(view) for view in views]
-        found = {name: values[numbers] for name, values in self._samples.items()}
-        return TrackBatch(**{k: values if k == "native" else values[:, :, chosen] for k, values in found.items()})
-
-
-def _padded(values: Tensor, arms: int) -> Tensor:
-    """``values`` (n v a ...) with more arms, which are never valid."""
-    return torch.cat([values, values.new_zeros((*values.shape[:2], arms - values.shape[2], *values.shape[3:]))], 2)
 
 
 class FrameSource(ClipSource):
@@ -364,7 +320,7 @@ class FrameSource(ClipSource):
                     where=where,
                     expected=error.expected,
                     got=error.got,
-                    next_step="repair or drop the episode, or set input.on_unreadable to skip",
+                    next_step="repair or drop the episode",
                 ) from error
         return torch.from_numpy(frames)
 
@@ -401,10 +357,9 @@ def load_views(
     views: list[LoadedView] = []
     for position in with_progress(positions, "reading episodes", "episode"):
         row = episodes.rows[position]
-        for view in row.views:
-            frames = VideoFrames(episodes.clip(position, view))
-            if len(frames) >= minimum:
-                views.append(LoadedView(f"{row.episode_id}/{view}", resized_video(frames, image_size)))
+        for view in row.views if row.video_frames >= minimum else ():
+            frames = resized_video(VideoFrames(episodes.clip(position, view)), image_size)
+            views.append(LoadedView(f"{row.episode_id}/{view}", frames))
     if not views:
         raise DataError("No episode is long enough to train on", where=episodes.root, expected=f">= {minimum} frames")
     return views
@@ -428,31 +383,30 @@ def training_rows(
     Raises:
         DataError: if none is left.
     """
-
     held = {row.episode_id: row for row in source.rows}
-    drawn = dict[str, tuple[str, ...]]()
+
+    def shown(episode_id: str) -> tuple[str, ...]:
+        kept = held[episode_id].views
+        if stage == 1 or tracks is None or vectors:
+            return kept
+        return tuple(view for view in kept if view in tracks.calibrated_views(episode_id))
 
     def left_out(row: EpisodeRow) -> str:
         """The reason why an episode is not trained on; empty where it is."""
+        fit = row.stage2_ok or (vectors and row.stage2_reason == "missing_calibration")
         if outcomes is not None and row.outcome not in outcomes:
             return f"outcome {row.outcome}"
-        if not (
-            row.stage1_ok if stage == 1 else row.stage2_ok or (vectors and row.stage2_reason == "missing_calibration")
-        ):
+        if not (row.stage1_ok if stage == 1 else fit):
             return (stage == 2 and row.stage2_reason) or f"not fit for Stage {stage}"
         if row.episode_id not in held:
             return f"split {row.split}: not among the clips"
         if stage == 2 and tracks is not None and row.episode_id not in tracks:
             return "no controls"
-        shown = held[row.episode_id].views
-        if stage == 2 and tracks is not None and not vectors:
-            cameras = tracks.calibrated_views(row.episode_id)
-            shown = tuple(view for view in shown if view in cameras)
-        drawn[row.episode_id] = shown
-        return "" if (row.primary_view in shown if stage == 1 else set(views) & set(shown)) else "none of the views"
+        wanted = {row.primary_view} if stage == 1 else {*views}
+        return "" if wanted & {*shown(row.episode_id)} else "none of the views"
 
     reasons = {row.episode_id: left_out(row) for row in episodes.rows}
-    rows = [replace(row, views=drawn[row.episode_id]) for row in source.rows if reasons.get(row.episode_id) == ""]
+    rows = [replace(row, views=shown(row.episode_id)) for row in source.rows if reasons.get(row.episode_id) == ""]
     counts = Counter(filter(None, reasons.values()))
     if not rows:
         raise DataError(
@@ -465,7 +419,7 @@ def training_rows(
         )
     if counts["no controls"]:
         logger.warning("%d episodes have no controls and are left out.", counts["no controls"])
-    if fewer := sum(drawn[row.episode_id] != held[row.episode_id].views for row in rows):
+    if fewer := sum(row.views != held[row.episode_id].views for row in rows):
         logger.warning(
             "Of %d episodes the views without a camera are left out: the model takes action maps alone "
             "(train_stage2.native_size).", fewer,
@@ -490,5 +444,5 @@ def open_source(reading: ClipInput, inputs: Mapping[str, Path], episodes: Episod
         )
     if not isinstance(reading, FrameInput):
         store = LatentStore.open(Path(inputs["latents"]))
-        return ResidentLatents(store, device) if reading.resident else store
+        return store.resident_on(device) if reading.resident else store
     return FrameSource(episodes, Path(inputs["tokenizer"]), reading, device=device)

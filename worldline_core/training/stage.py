@@ -17,14 +17,14 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.model.checkpoint import CheckpointInfo
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, NativeVectors
-from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training.action_following import ActionFollowing, ClipPredictor
 from worldline_core.training.adapters import add_adapters, save_trained, say_price
 from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput
-from worldline_core.training.clip_loader import Batch, ClipLoader, ObjectWeights
+from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 from worldline_core.training.clip_source import ClipSource, open_source, training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
+from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.optimizers import require_one_process
 from worldline_core.training.processes import BatchPlan, join_processes, place_model
 from worldline_core.training.trainer import ParameterGroup, Probe, TrainingResult, batch_plan, held_out_losses, train
@@ -173,7 +173,7 @@ class Stage:
             trainer,
             groups=groups,
             objective=objective,
-            load=loader.batches(self.sampler, config.input, self.output / "run"),
+            load=loader.batches(self.sampler, config.input),
             validate=self.held_out(loader).validation(trainer, objective),
             probe=probe,
             output=self.output,
@@ -221,7 +221,7 @@ class Stage:
                 "episodes": len(self.training_rows),
                 "sources": dict(sorted(Counter(row.source for row in self.training_rows).items())),
                 "metrics": result.metrics,
-                **input_facts(self.config.input, self.source, self.output / "run"),
+                **input_facts(self.config.input, self.source),
                 **facts,
             },
         }
@@ -243,16 +243,11 @@ def weights_of(weighting: LossWeighting, episodes: EpisodeSet, source: ClipSourc
     return ObjectWeights(episodes, (height, width), *weighting.things)
 
 
-def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str, Any]:
-    """Facts on how clips were read; skipped clips are counted from the folders ``runs``."""
-    facts: dict[str, Any] = {}
+def input_facts(reading: ClipInput, source: ClipSource) -> dict[str, Any]:
+    """Facts on how clips were read."""
     if isinstance(reading, FrameInput):
-        facts["input"] = {"kind": reading.kind, "decoder": source.description["decoder"]}
-    if reading.on_unreadable == "skip":
-        facts["skipped_clips"] = sum(
-            len(read_json_lines(path)) for run in runs for path in run.glob("skipped_clips-*.jsonl")
-        )
-    return facts
+        return {"input": {"kind": reading.kind, "decoder": source.description["decoder"]}}
+    return {}
 
 
 class MeasuredObjective(ClipPredictor, Protocol):
