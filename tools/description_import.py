@@ -24,7 +24,6 @@ import numpy as np
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment_report import bare_mjcf, bare_urdf
 from worldline_core.geometry.kinematic_tree import parse_xml
-from worldline_core.geometry.link_surfaces import spread
 from worldline_core.store.atomic import write_bytes_atomic
 
 ROUND_TRIP_TOLERANCE = 1e-9
@@ -128,35 +127,29 @@ def import_description(name: str, recipe: Recipe, wheels: Path, output: Path) ->
         f"<!-- Kinematics only, from {recipe.file} of {recipe.wheel.replace('_', '-')} {version} ({recipe.licence});\n"
         "     written by tools.description_import. -->\n"
     )
-    keep = {n if _known(source, n) else f"gripper/{n}" for n in recipe.keep}
-    text = head + kinematics_text(source, name, keep)
+    text = head + _kinematics_text(source, name, recipe)
     _compare(source, mujoco.MjModel.from_xml_string(text), recipe.file)
     path = output / f"{name}.xml"
     write_bytes_atomic(path, text.encode())
     return path
 
 
-def _spec(text: str, where: str) -> mujoco.MjSpec:
+def _spec(text: str, where: str) -> Any:
     """MuJoCo's specification of a model without meshes."""
     root = parse_xml(text, where)
-    return mujoco.MjSpec.from_string(
-        ET.tostring(bare_urdf(root) if root.tag == "robot" else bare_mjcf(root), "unicode")
-    )
+    bare = bare_urdf(root) if root.tag == "robot" else bare_mjcf(root)
+    return mujoco.MjSpec.from_string(ET.tostring(bare, "unicode"))
 
 
-def _known(model: Any, name: str) -> bool:
-    names = {model.body(b).name for b in range(model.nbody)} | {model.site(s).name for s in range(model.nsite)}
-    return name in names
-
-
-def kinematics_text(model: mujoco.MjModel, name: str, keep: set[str]) -> str:
-    """MJCF text of the kept bodies and sites of a compiled model, with some spheres on their surfaces.
+def _kinematics_text(model: Any, name: str, recipe: Recipe) -> str:
+    """MJCF text of the kept bodies and sites of a compiled model.
 
     Raises:
         DataError: the model has no body or site of a name to keep.
     """
     bodies = {model.body(b).name: b for b in range(model.nbody)}
     sites = {model.site(s).name: s for s in range(model.nsite)}
+    keep = {n if n in {*bodies, *sites} or recipe.gripper is None else f"gripper/{n}" for n in recipe.keep}
     unknown = sorted(keep - bodies.keys() - sites.keys())
     if unknown:
         raise DataError(
@@ -169,8 +162,7 @@ def kinematics_text(model: mujoco.MjModel, name: str, keep: set[str]) -> str:
             kept.add(body)
             body = int(model.body_parentid[body])
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "hinge", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
-    lines = [f'<mujoco model="{name}">', '  <compiler angle="radian" autolimits="true"/>']
-    lines += ['  <default><geom type="sphere" contype="0" conaffinity="0"/></default>', "  <worldbody>"]
+    lines = [f'<mujoco model="{name}">', '  <compiler angle="radian" autolimits="true"/>', "  <worldbody>"]
 
     def emit(body: int, depth: int) -> None:
         """Joints and sites of a body, then its children."""
@@ -182,11 +174,6 @@ def kinematics_text(model: mujoco.MjModel, name: str, keep: set[str]) -> str:
                 limits = f' range="{_numbers(model.jnt_range[joint])}"' if model.jnt_limited[joint] else ""
                 axis = _numbers(model.jnt_axis[joint])
                 lines.append(f'{pad}<joint name="{model.joint(joint).name}" type="{kind}"{pos} axis="{axis}"{limits}/>')
-        for points, radii in _surface(model, body):
-            lines.extend(
-                f'{pad}<geom pos="{_numbers(np.round(point, 4))}" size="{radius:.3g}"/>'
-                for point, radius in zip(points, radii, strict=True)
-            )
         lines.extend(
             f'{pad}<site name="{site}" pos="{_numbers(model.site_pos[s])}" quat="{_numbers(model.site_quat[s])}"/>'
             for site, s in sites.items()
@@ -205,48 +192,31 @@ def kinematics_text(model: mujoco.MjModel, name: str, keep: set[str]) -> str:
     return "\n".join([*lines, "  </worldbody>", "</mujoco>", ""])
 
 
-def _surface(model: mujoco.MjModel, body: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Spheres on the surface of a body's meshes, in the body's frame: where they are large, they are far apart."""
-    parts = []
-    for geom in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
-        mesh = model.geom_dataid[geom]
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-            start, turn = model.mesh_vertadr[mesh], np.zeros(9)
-            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            vertices = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].astype(np.float64)
-            parts.append(vertices @ turn.reshape(3, 3).T + model.geom_pos[geom])
-    return [spread(np.concatenate(parts))] if parts else []
-
-
 def _numbers(values: Any) -> str:
     # Adding zero makes -0 a 0.
     return " ".join(f"{float(v) + 0.0:.12g}" for v in np.asarray(values).reshape(-1))
 
 
-def _compare(source: mujoco.MjModel, written: mujoco.MjModel, where: str) -> None:
+def _compare(source: Any, written: Any, where: str) -> None:
     """Raises: DataError where a body or site of the written model is not where the source has it."""
     rng = np.random.default_rng(0)
     data, copy = mujoco.MjData(source), mujoco.MjData(written)
-    bodies = {source.body(b).name for b in range(source.nbody)} & {
-        written.body(b).name for b in range(1, written.nbody)
-    }
-    sites = [written.site(s).name for s in range(written.nsite)]
+    frames = [("body", written.body(b).name) for b in range(1, written.nbody)]
+    frames += [("site", written.site(s).name) for s in range(written.nsite)]
     worst = 0.0
     for _ in range(100):
         for joint in (written.joint(j).name for j in range(written.njnt)):
             data.joint(joint).qpos[0] = copy.joint(joint).qpos[0] = rng.uniform(-1, 1)
         mujoco.mj_kinematics(source, data)
         mujoco.mj_kinematics(written, copy)
-        pairs = [(data.body(name), copy.body(name)) for name in bodies]
-        for one, other in [*pairs, *((data.site(name), copy.site(name)) for name in sites)]:
+        for kind, name in frames:
+            one, other = getattr(data, kind)(name), getattr(copy, kind)(name)
             worst = max(worst, *np.abs(one.xpos - other.xpos), *np.abs(one.xmat - other.xmat))
     if not worst <= ROUND_TRIP_TOLERANCE:
         raise DataError(
-            "The written description has other poses than its source",
-            where=where,
-            expected=ROUND_TRIP_TOLERANCE,
+            "The written description has other poses than its source", where=where, expected=ROUND_TRIP_TOLERANCE,
             got=worst,
-        )
+        )  # fmt: skip
 
 
 def main() -> None:

@@ -270,15 +270,11 @@ def garbled(images: np.ndarray, _: None, random: Random) -> np.ndarray:
     if kind == "band":
         out[:, round(height * random.uniform(0.3, 0.65)) :] = 128
         return out
-    block = max(8, height // 8)
     for image in out:
-        for top in range(0, height, block):
-            for left in range(0, width, block):
-                if random.uniform() < 0.5:
-                    row, column = random.integers(0, height - block + 1), random.integers(0, width - block + 1)
-                    patch = images[random.integers(len(images)), row : row + block, column : column + block]
-                    place = image[top : top + block, left : left + block]
-                    place[:] = 255 - patch[: place.shape[0], : place.shape[1]]
+        cells = random.integers(0, 2, (8, 8 * width // height), np.uint8)
+        blocks = cv2.resize(cells, (width, height), interpolation=cv2.INTER_NEAREST) == 1
+        other = np.roll(images[random.integers(len(images))], random.integers(0, height, 2), (0, 1))
+        image[blocks] = 255 - other[blocks]
     return out
 
 
@@ -300,12 +296,11 @@ def blurred(images: np.ndarray, severity: tuple[float, bool], random: Random) ->
     if not shaken:
         return np.stack([cv2.GaussianBlur(image, (0, 0), radius_px) for image in images])
     size = 2 * max(1, round(1.5 * radius_px)) + 1
-    reach, out = (size - 1) / 2, []
+    line, out = np.zeros((size, size), np.float32), []
+    line[size // 2] = 1
     for image in images:
-        angle = random.uniform(0, np.pi)
-        kernel = np.zeros((size, size), np.float32)
-        for step in np.linspace(-reach, reach, 4 * size):
-            kernel[round(reach + step * np.sin(angle)), round(reach + step * np.cos(angle))] = 1
+        turn = cv2.getRotationMatrix2D((size // 2, size // 2), random.uniform(0, 180), 1)
+        kernel = cv2.warpAffine(line, turn, (size, size))
         out.append(cv2.filter2D(image, -1, kernel / kernel.sum()))
     return np.stack(out)
 
@@ -342,22 +337,20 @@ def _before_a_room(clip: Clip, drive: tuple[int, int], random: Random) -> Clip:
     images, masks = clip.frames[view], clip.masks[view]
     count, height, width = images.shape[:3]
     room = furnished_room(3 * height, 3 * width, random)
-    per_second, direction = float(random.uniform(0.05, 0.3)), random.uniform(0, 2 * np.pi)
-    forward = float(random.uniform(-1, 1)) if random.integers(2) else 0.0
-    frames = np.arange(count)
+    per_second, direction = random.uniform(0.05, 0.3), random.uniform(0, 2 * np.pi)
+    forward, frames = random.uniform(-1, 1) * random.integers(2), np.arange(count)
     speed = np.clip(np.minimum(frames - drive[0] + 1, drive[1] - frames) / 3, 0, 1) * (frames > drive[0])
     way = np.cumsum(speed) * per_second / 8 * width
     out = []
-    for i in range(count):
-        shift = way[i] * np.array([np.cos(direction), 0.4 * np.sin(direction)])
-        zoom = np.exp(forward * way[i] / width)
+    for image, mask, gone in zip(images, masks, way, strict=True):
+        shift = gone * np.array([np.cos(direction), 0.4 * np.sin(direction)])
+        zoom = np.exp(forward * gone / width)
         corner = np.array([width, height]) * (1.5 - 0.5 / zoom) + np.clip(shift, -0.9 * width, 0.9 * width)
-        place = np.array([[1 / zoom, 0, corner[0]], [0, 1 / zoom, corner[1]]], np.float64)
-        seen = cv2.warpAffine(
-            room, place, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REFLECT
-        )
-        robot = cv2.resize(masks[i].astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)[..., None]
-        out.append((robot * images[i] + (1 - robot) * seen).round().astype(np.uint8))
+        place = np.column_stack([np.eye(2) / zoom, corner])
+        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        seen = cv2.warpAffine(room, place, (width, height), flags=how, borderMode=cv2.BORDER_REFLECT)
+        robot = cv2.resize(mask.astype(np.float32), (width, height))[..., None]
+        out.append((robot * image + (1 - robot) * seen).round().astype(np.uint8))
     return _spoiled(clip, "", (0, count), np.stack(out), f"{per_second:.2f} widths a second, forward {forward:+.2f}")
 
 
@@ -371,11 +364,7 @@ def furnished_room(height: int, width: int, random: Random) -> np.ndarray:
         thing_h, thing_w = random.uniform(0.05, 0.3, 2) * height
         top, left = random.uniform(-0.1, 1, 2) * (height, width)
         colour = tuple(random.uniform(20, 235, 3).tolist())
-        box = (int(left), int(top)), (int(left + thing_w), int(top + thing_h))
-        if random.integers(2):
-            cv2.rectangle(room, *box, colour, -1)
-        else:
-            cv2.ellipse(room, (*box[0],), (int(thing_w / 2) + 1, int(thing_h / 2) + 1), 0, 0, 360, colour, -1)
+        cv2.rectangle(room, (int(left), int(top)), (int(left + thing_w), int(top + thing_h)), colour, -1)
     grain = cv2.resize(random.normal(0, 8, (height // 3, width // 3, 1)).astype(np.float32), (width, height))
     return np.clip(cv2.GaussianBlur(room, (0, 0), 0.7) + grain[..., None], 0, 255).astype(np.uint8)
 

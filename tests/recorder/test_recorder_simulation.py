@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
 
-from tools.kinematics_export import embodiment_yaml, kinematics_xml
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.embodiment_report import random_states
+from worldline_core.geometry.kinematic_tree import read_tree, tool_poses
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.recorder.controllers import Waypoint, sample_waypoints
 from worldline_core.recorder.looks import SCENES
+from worldline_core.recorder.rendering import OPENCV_AXES, wrist_camera_pose
 from worldline_core.recorder.scene import SceneModel, build_scene, sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder
-
-EMBODIMENTS = Path(__file__).resolve().parents[2] / "configs" / "embodiments"
 
 
 @pytest.fixture(scope="module", params=sorted(BODIES))
@@ -24,10 +23,21 @@ def scene(request: pytest.FixtureRequest) -> SceneModel:
     return build_scene(BODIES[request.param])
 
 
-def test_committed_descriptions_are_what_the_recorder_writes(scene: SceneModel) -> None:
-    name = scene.robot.name
-    assert (EMBODIMENTS / f"{name}.xml").read_text() == kinematics_xml(scene)
-    assert (EMBODIMENTS / f"{name}.yaml").read_text() == embodiment_yaml(scene)
+def test_committed_descriptions_have_the_poses_of_the_recorder(scene: SceneModel) -> None:
+    robot, data = load_embodiment(scene.robot.name), mujoco.MjData(scene.model)
+    states = random_states(robot, 5)
+    for state, tools in zip(states, tool_poses(robot, read_tree(robot), states), strict=True):
+        for arm in robot.arms:
+            for joint, value in zip(arm.joints, state[robot.joint_columns(arm)], strict=True):
+                data.joint(joint).qpos[0] = value
+        mujoco.mj_kinematics(scene.model, data)
+        for number, (arm, indices) in enumerate(zip(robot.arms, scene.arms, strict=True)):
+            np.testing.assert_allclose(tools[number, :3, 3], data.site_xpos[indices.tool_site], atol=1e-7)
+            rotation = data.site_xmat[indices.tool_site].reshape(3, 3)
+            np.testing.assert_allclose(tools[number, :3, :3], rotation, atol=1e-7)
+            mount, (translation, axes) = np.array(arm.wrist_camera.T_link_camera), wrist_camera_pose(scene, number)
+            np.testing.assert_allclose(mount[:3, 3], translation, atol=1e-7)
+            np.testing.assert_allclose(mount[:3, :3], axes @ OPENCV_AXES, atol=1e-7)
 
 
 def test_recorded_actions_alone_reproduce_the_motion() -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from tools.corrupted import droid_annotation, lerobot_v21, mcap
 from tools.corrupted.content import FPS, HEIGHT, NUM_FRAMES, WIDTH, gripper_motion, joint_motion, pictures
+from tools.corrupted.defects import Source
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.sources.hdf5 import require_h5py
@@ -19,7 +19,6 @@ from worldline_core.data.video.encoder import encode_video
 
 _LENGTH = 4
 _K = np.array([[80.0, 0, (WIDTH - 1) / 2], [0, 80.0, (HEIGHT - 1) / 2], [0, 0, 1]])
-Source = dict[str, Any]
 
 
 def write_one_of_each(folder: Path) -> dict[str, Source]:
@@ -167,12 +166,6 @@ def _unitree_h5(root: Path, random: np.random.Generator) -> Source:
             file[key] = np.hstack([joints, gripper_motion(random, _LENGTH)[:, None]])
     encode_video(root / "videos/stack/cam/0.mp4", pictures(random, _LENGTH), FPS, preset="ultrafast")
     (root / "stack.csv").write_text("videoid,data_dir,instruction\n0,stack/cam,stack the box\n")
-    with require_h5py().File(root / "episode_0.hdf5", "w") as file:
-        for key in ("observations/qpos", "action"):
-            joints = _Z1_REST + 0.3 * joint_motion(random, 6, _LENGTH)
-            file[key] = np.hstack([joints, gripper_motion(random, _LENGTH)[:, None]])
-        file["observations/images/cam"] = pictures(random, _LENGTH)
-        file["language_raw"] = "stack the box"
     return {
         "kind": "unitree_h5", "robot": "z1_single", "embodiment": "none", "fps": FPS, "views": {"head": "cam"},
         "gripper_state": gripper, "gripper_command": gripper,
