@@ -17,6 +17,7 @@ from pydantic import TypeAdapter
 
 h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
+from tests.data.test_source_worldarena import settings, write_track_2
 from tests.mcap.conftest import declared, robot
 from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.actions.action_tracks import MissingActionsError, compute_tracks
@@ -40,7 +41,7 @@ COMMANDED = {
     "mcap_topics", "unitree_h5",
 }  # fmt: skip
 NOT_COMMANDED = {"agibot_gesim", "enerverse_ac", "droid_annotation", "robomind", "robotwin", "video_folder"}
-"""Whose samples have commands, and whose say that they have none."""
+"""Whose samples have commands, and whose say that they have none. WorldArena's have commands alone."""
 PLACE = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0.3], [1, 0, 0, 2.0], [0, 0, 0, 1]])
 WAIST = {"idx01_waist_lift_joint": 0.11, "idx02_waist_pitch_joint": 0.3}
 
@@ -144,6 +145,8 @@ def sources(tmp_path_factory: pytest.TempPathFactory, agibot: ArmKinematics) -> 
     (folder / "mcap_topics").mkdir()
     robot().write(folder / "mcap_topics" / "a.mcap")
     written["mcap_topics"] = declared(folder / "mcap_topics")
+    write_track_2(folder / "worldarena")
+    written["worldarena"] = settings(folder / "worldarena")
     return {name: TypeAdapter(SourceConfig).validate_python(source) for name, source in written.items()}
 
 
@@ -159,7 +162,8 @@ def test_every_kind_is_here(sources: dict[str, Any]) -> None:
     union = get_args(get_args(SourceConfig)[0])
     kinds = {kind for each in union for kind in get_args(each.model_fields["kind"].annotation)}
     assert {config.kind for config in sources.values()} == kinds - {"recording"}  # an episode_set
-    assert sources.keys() == COMMANDED | NOT_COMMANDED
+    assert sources.keys() == COMMANDED | NOT_COMMANDED | {"worldarena"}
+    assert first_episode(sources["worldarena"]).commanded
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDED))

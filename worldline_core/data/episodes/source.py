@@ -25,7 +25,7 @@ from worldline_core.geometry.lens import Distortion, DistortionModel
 from worldline_core.untrusted_text import printable
 
 Masks = np.ndarray | MadeFrames
-EVALUATION_LAYOUTS = ("droid annotation", "robotwin")
+EVALUATION_LAYOUTS = ("droid annotation", "robotwin", "worldarena")
 """Layouts, as their readers note them in an episode's conventions, that never train or select a model."""
 EVALUATION_ONLY = "evaluation_only"
 """Noted in the conventions of episodes of other layouts that never do either."""

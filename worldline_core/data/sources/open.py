@@ -36,6 +36,7 @@ from worldline_core.data.sources.robomind import RobomindSource, RobomindSourceC
 from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
 from worldline_core.data.sources.unitree_h5 import UnitreeH5Source, UnitreeH5SourceConfig
 from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
+from worldline_core.data.sources.worldarena import WorldArenaSource, WorldArenaSourceConfig
 from worldline_core.data.video.clip import video_size
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import DataError
@@ -73,7 +74,8 @@ SourceConfig = Annotated[
     | RobomindSourceConfig
     | RobotwinSourceConfig
     | UnitreeH5SourceConfig
-    | VideoFolderSourceConfig,
+    | VideoFolderSourceConfig
+    | WorldArenaSourceConfig,
     Field(discriminator="kind"),
 ]
 
@@ -126,6 +128,7 @@ _READERS: dict[type, Callable[[Any, AnyPath], EpisodeSource]] = {
     RobotwinSourceConfig: RobotwinSource,
     UnitreeH5SourceConfig: UnitreeH5Source,
     VideoFolderSourceConfig: VideoFolderSource,
+    WorldArenaSourceConfig: WorldArenaSource,
 }
 
 
