@@ -5,6 +5,8 @@ import pyarrow.parquet as pq
 import pytest
 from pydantic import ValidationError
 
+from tests.data.curating import preset
+from tests.data.curating import run as curate
 from tests.rollout.conftest import recorded as make_frames
 from tests.rollout.conftest import write_recordings
 from worldline_core.data.episodes.episode import VIEWS
@@ -31,7 +33,7 @@ def episodes(tmp_path_factory):
 
 def encode(path, frames, fps=8):
     path.parent.mkdir(parents=True, exist_ok=True)
-    encode_video(path, frames, fps, crf=0, pixel_format="yuv444p")
+    encode_video(path, frames, fps, crf=0, preset="ultrafast", pixel_format="yuv444p")
 
 
 def close(found, wanted):
@@ -117,9 +119,9 @@ def test_templates_with_folders_seeds_and_other_names_of_views(videos, episodes)
     for episode in EPISODES:
         for seed in (1, 2):
             encode(folder / f"run7/{episode[8:]}/cam_high-{seed}.mp4", recorded(episode, "head"))
-    config = {"name": "*/{episode}/{view}-{seed}.mp4", "views": {"cam_high": "head"}, "episode_prefix": "robot_a-"}
+    config = {"name": "*/{episode}/{view}-{seed}.mp4", "views": {"cam_high": "head"}, "episode_id": "robot_a-{episode}"}
     with pytest.raises(DataError, match=r"unknown: run7/1/cam_high-1.mp4 \(no episode robot_a-1robot|no episode"):
-        run(folder, episodes, **{**config, "episode_prefix": "robot-"})
+        run(folder, episodes, **{**config, "episode_id": "robot-{episode}"})
     found, counts, _ = run(folder, episodes, **config)
     assert counts["views"] == ["head"]
     assert found.seeds("robot_a-1") == [1, 2]
@@ -134,7 +136,7 @@ def test_ctrl_world_s_pictures_of_two_rows_are_taken_apart(videos, episodes):
         picture = np.concatenate([np.concatenate(row, axis=2) for row in (shown, predicted)], axis=1)
         encode(folder / f"time_20251103_101500_traj_{episode[8:]}_0_5_lift_the_cube.mp4", picture, fps=4)
     config = {
-        "name": "Rollouts_replay/video/time_*_traj_{episode}_0_5_*.mp4", "episode_prefix": "robot_a-", "fps": 8,
+        "name": "Rollouts_replay/video/time_*_traj_{episode}_0_5_*.mp4", "episode_id": "robot_a-{episode}", "fps": 8,
         "tiles": [[None, None, None], list(VIEWS)],
     }  # fmt: skip
     found, counts, _ = run(videos.parent / "synthetic_traj", episodes, **config)
@@ -144,11 +146,47 @@ def test_ctrl_world_s_pictures_of_two_rows_are_taken_apart(videos, episodes):
         run(videos.parent / "synthetic_traj", episodes, **config | {"tiles": [["head", None, None], *[[None] * 3] * 4]})
 
 
+def test_oscar_s_outputs_are_compared_from_their_start_frames_on(tmp_path):
+    """As its README and its script say: recordings below assets, 81 frames of each from a frame of its own on."""
+    grey = np.arange(40, 212, 2, dtype=np.uint8)[:, None, None, None]
+    for name in ("rgb", "gripper_scenario"):
+        encode(tmp_path / f"assets/agibot_360/{name}.mp4", np.broadcast_to(grey, (86, 24, 32, 3)), fps=15)
+    encode(tmp_path / "outputs/agibot_360.mp4", np.broadcast_to(grey[5:], (81, 480, 640, 3)), fps=15)
+    _, curated = curate(tmp_path / "set", {**preset("oscar", tmp_path / "assets"), "image_size": [24, 32]})
+    assert [row.episode_id for row in curated.rows] == ["oscar-agibot_360-rgb"]
+    assert close(curated.frames(0, "head"), np.broadcast_to(grey[5:], (81, 24, 32, 3)))
+    _, counts, _ = run(tmp_path / "outputs", curated.root, layout="oscar", resize=True)
+    assert (counts["frames"], counts["files"]) == (81, {"matched": 1})
+    encode(tmp_path / "outputs/agibot_360.mp4", np.broadcast_to(grey[5:], (81, 32, 48, 3)), fps=15)
+    with pytest.raises(DataError, match=r"48 x 32 pixels, the layout has 640 x 480") as refused:
+        run(tmp_path / "outputs", curated.root, layout="oscar", resize=True)
+    assert "1 problems" in str(refused.value)
+
+
+def test_what_departs_from_a_layout_is_listed(episodes, tmp_path):
+    """Samples of Cosmos' framework by their names alone; WorldArena's videos by rate, length and size too."""
+    for episode in EPISODES:
+        encode(tmp_path / f"samples/{episode}/vision.mp4", recorded(episode, "head"))
+        encode(tmp_path / f"archive/fixed_scene_task_episode{episode[8:]}.mp4", recorded(episode, "head")[:-1])
+    found, _, _ = run(tmp_path / "samples", episodes, layout="sim_bimanual")
+    assert close(found.frames("robot_a-2", "head", 0), recorded("robot_a-2", "head"))
+    with pytest.raises(DataError, match="got: 6 problems") as refused:
+        run(tmp_path / "archive", episodes, layout="worldarena", episode_id="robot_a-{episode}")
+    for line in (
+        "episode1.mp4: 8 frames per second, the layout has 24",
+        f"episode1.mp4: {N - 1} frames, a video has {N} as its recording",
+        "episode2.mp4: 48 x 32 pixels, the layout has 640 x 480, or more in these proportions",
+    ):
+        assert f"fixed_scene_task_{line}" in str(refused.value)
+
+
 def test_configurations_that_name_no_episode_or_no_view_are_refused():
     for values, message in (
         ({"name": "{view}.mp4"}, "needed are"), ({"name": "{episode}.mp4"}, "needed are"),
         ({"name": "{episode}_{view}_{camera}.mp4"}, "needed are"), ({"views": {"top": "ceiling"}}, "each once"),
         ({"tiles": [["head", "head"]], "name": "{episode}.mp4"}, "each once"),
+        ({"views": {"": "head", "top": "left_wrist"}, "name": "{episode}.mp4"}, "needed are"),
+        ({"layout": "cosmos"}, "worldarena"), ({"layout": "oscar", "episode_id": "oscar"}, "pattern"),
     ):  # fmt: skip
         with pytest.raises(ValidationError, match=message):
             ImportRolloutsConfig.model_validate({"method": "m", **values})

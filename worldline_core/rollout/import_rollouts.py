@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from worldline_core.data.guards.source_paths import find_files, relative_name
 from worldline_core.data.video.clip import VideoClip, frame_times, read_clip, shown_size, video_size
 from worldline_core.errors import DataError
 from worldline_core.progress import with_progress
-from worldline_core.rollout.rollout_config import NAME_FIELD, ImportRolloutsConfig
+from worldline_core.rollout.rollout_config import LAYOUTS, NAME_FIELD, ImportRolloutsConfig, VideoLayout
 from worldline_core.rollout.rollout_set import RolloutSetWriter, video_path
 from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import atomic_path
@@ -100,7 +100,8 @@ def _account(config: ImportRolloutsConfig, folder: Path, episodes: EpisodeSet) -
             continue
         fields = found.groupdict()
         their_view, seed = fields.get("view") or "", int(fields.get("seed") or 0)
-        episode, view = config.episode_prefix + fields["episode"], config.names.get(their_view, their_view)
+        episode = config.episode_id.replace("{episode}", fields["episode"])
+        view = config.names.get(their_view, their_view)
         key, detail = (episode, view, seed), ""
         if episode not in known:
             detail = f"no episode {episode}"
@@ -148,7 +149,7 @@ def _refuse(config: ImportRolloutsConfig, folder: Path, files: Sequence[Imported
             where=folder,
             expected=f"{config.name}: {', '.join(config.shown)} of every episode of {config.splits}",
             got=f"{dict(counts)}\n    " + "\n    ".join(_some(lines)),
-            next_step="correct name, views or episode_prefix; or report what is missing or unknown: "
+            next_step="correct name, views or episode_id; or report what is missing or unknown: "
             "missing=report, unknown=report",
         )  # fmt: skip
 
@@ -164,6 +165,7 @@ def _check(
     lengths: dict[str, int] = {}
     per_prediction: dict[tuple[str, int], set[int]] = defaultdict(set)
     grid = (1, 1) if config.tiles is None else (len(config.tiles), len(config.tiles[0]))
+    layout = None if config.layout is None else LAYOUTS[config.layout]
     for file in matched:
         position = episodes.position(file.episode_id)
         row = episodes.rows[position]
@@ -173,6 +175,8 @@ def _check(
         per_prediction[file.episode_id, file.seed].add(count)
         if abs((config.fps or rate) / row.fps - 1) > _RATE_TOLERANCE:
             problems.append(f"{file.path}: {config.fps or rate:g} frames per second, the recording has {row.fps:g}")
+        if layout is not None:
+            problems += _departures(layout, file.path, rate, count, row.video_frames, (height, width))
         if not 2 <= count <= row.video_frames:
             problems.append(f"{file.path}: {count} frames, the recording has {row.video_frames}")
         if height % grid[0] or width % grid[1]:
@@ -194,6 +198,22 @@ def _check(
             "or bring pictures to size with resize=true",
         )
     return lengths
+
+
+def _departures(
+    layout: VideoLayout, name: str, rate: float, count: int, recorded: int, size: tuple[int, int]
+) -> Iterator[str]:
+    """What of a video is not as its layout has it."""
+    if layout.fps is not None and abs(rate / layout.fps - 1) > _RATE_TOLERANCE:
+        yield f"{name}: {rate:g} frames per second, the layout has {layout.fps:g}"
+    frames = recorded if layout.frames == "whole" else layout.frames
+    if frames is not None and count != frames:
+        what = "as its recording" if layout.frames == "whole" else "in this layout"
+        yield f"{name}: {count} frames, a video has {frames} {what}"
+    if layout.size is not None:
+        height, width = layout.size
+        if size[0] < height or size[0] * width != size[1] * height:
+            yield f"{name}: {size[1]} x {size[0]} pixels, the layout has {width} x {height}, or more in these proportions"
 
 
 def _recorded_size(episodes: EpisodeSet, position: int) -> tuple[int, int]:

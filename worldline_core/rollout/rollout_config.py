@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Self, cast
 
@@ -178,15 +179,51 @@ NAME_FIELD = re.compile(r"\{(\w+)\}|(\*)")
 """A field of a name template, or ``*`` for anything."""
 
 
+@dataclass(frozen=True)
+class VideoLayout:
+    """How a benchmark or another simulator writes its videos of one view.
+
+    Attributes:
+        name, episode_id: as of :class:`ImportRolloutsConfig`, where it says nothing else.
+        size: the least (H, W), and the proportions, of their pictures; None: any.
+        fps: their rate; None: any.
+        frames: how many each has; None: any; ``whole``: as many as its recording.
+    """
+
+    name: str
+    episode_id: str
+    size: tuple[int, int] | None = None
+    fps: float | None = None
+    frames: int | Literal["whole"] | None = None
+
+
+LAYOUTS: Mapping[str, VideoLayout] = {
+    # tsinghua-fib-lab/WorldArena, assets/README_submission.md: videos of action-driven models are as long as their trajectories.
+    # Names are episode<N>.mp4 or <task>_episode<N>.mp4: video_quality/README.md, embodied_task/worldarena_track2.
+    "worldarena": VideoLayout(
+        "*episode{episode}.mp4", "worldarena-fixed_scene_task-episode{episode}", (480, 640), 24.0, "whole"
+    ),
+    # wuzy2115/oscar, README.md ("Run inference") and scripts/run_inference.sh: outputs/<case>.mp4.
+    "oscar": VideoLayout("{episode}.mp4", "oscar-{episode}-rgb", (480, 640), None, 81),
+    # NVIDIA/cosmos-framework, docs/inference.md ("Outputs"): <sample_name>/vision.mp4. Its page on bimanual inference: the first
+    # frame and one for each action (900 actions, 901 frames), at the input's rate and proportions.
+    "sim_bimanual": VideoLayout("{episode}/vision.mp4", "{episode}"),
+}
+"""By name: WorldArena's track 1, OSCAR's cases, Cosmos3-Nano-Sim-Bimanual's samples; each with the source of these facts."""
+
+
 class ImportRolloutsConfig(StrictModel):
     """Names and content of the videos of a folder, and what may be missing.
 
     Attributes:
         method: name that the predictions carry in scores and reports.
+        layout: of whom the videos are: fills in ``name``, ``episode_id`` and ``views`` where they are not given, and what
+            videos are checked for (`LAYOUTS`).
         name: template of a file's path below the folder, with ``{episode}``, ``{view}``, ``{seed}``, and ``*`` for anything.
-        views: our view for each of the names that files or tiles use; default: our own names.
+        views: our view for each of the names that files or tiles use; default: our own names. ``{"": head}``: names say no
+            view, all videos are of this one.
         tiles: rows and columns of the views that one video shows side by side; null for a part that is none.
-        episode_prefix: what our episode ids have before theirs.
+        episode_id: our id of the episode that their names call ``{episode}``.
         splits: every episode of these splits is expected.
         fps: rate that the videos show, where their container says another.
         resize: bring pictures to the recordings' size instead of refusing another one.
@@ -195,20 +232,31 @@ class ImportRolloutsConfig(StrictModel):
     """
 
     method: str = Field(min_length=1)
+    layout: Literal["worldarena", "oscar", "sim_bimanual"] | None = None
     name: str = "{episode}_{view}.mp4"
     views: dict[str, str] | None = None
     tiles: tuple[tuple[str | None, ...], ...] | None = Field(default=None, min_length=1)
-    episode_prefix: str = ""
+    episode_id: str = Field(default="{episode}", pattern=r"^[^{}]*\{episode\}[^{}]*$")
     splits: tuple[str, ...] = ("test",)
     fps: float | None = Field(default=None, gt=0)
     resize: bool = False
     missing: Literal["refuse", "report"] = "refuse"
     unknown: Literal["refuse", "report"] = "refuse"
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_a_layout(cls, values: object) -> object:
+        if not isinstance(values, Mapping):
+            return values
+        given = cast("Mapping[str, object]", values)
+        layout = LAYOUTS.get(str(given.get("layout")))
+        usual = {} if layout is None else {"name": layout.name, "episode_id": layout.episode_id, "views": {"": "head"}}
+        return {**usual, **given}
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         fields = {field for field, _ in NAME_FIELD.findall(self.name) if field}
-        needed = {"episode"} if self.tiles is not None else {"episode", "view"}
+        needed = {"episode"} if self.tiles is not None or list(self.names) == [""] else {"episode", "view"}
         if not needed <= fields <= needed | {"seed"}:
             raise ValueError(f"name: {self.name} has the fields {sorted(fields)}; needed are {sorted(needed)}")
         if self.tiles is not None and (len({len(row) for row in self.tiles}) != 1 or not self.shown):

@@ -13,7 +13,7 @@ import csv
 import json
 from collections.abc import Iterable
 from pathlib import PurePosixPath
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -76,6 +76,10 @@ class VideoFolderSourceConfig(ForeignSourceConfig):
     captions: CaptionTable | None = Field(
         default=None, description="null: the text file beside each video, where there is one"
     )
+    starts: dict[str, Annotated[int, Field(ge=0)]] = Field(
+        default_factory=dict, description="first frame that is taken of a video, by its path in the folder; others: 0"
+    )
+    frames: int | None = Field(default=None, ge=2, description="how many frames are taken of each video; null: all")
 
 
 class VideoFolderSource(EpisodeFiles[VideoFolderSourceConfig]):
@@ -94,7 +98,17 @@ class VideoFolderSource(EpisodeFiles[VideoFolderSourceConfig]):
         times = frame_times(path)
         if not rate > 0:
             raise RejectedInputError("wrong_fps", "Video states no frame rate", where=str(path), got=rate)
-        nothing = np.zeros((len(times), 0))
+        start = config.starts.get(str(relative), 0)
+        stop = len(times) if config.frames is None else start + config.frames
+        if not start < stop <= len(times):
+            raise RejectedInputError(
+                "too_short",
+                "Video ends before the part that is taken",
+                where=str(path),
+                expected=f"frames {start} to {max(start, stop - 1)}",
+                got=f"{len(times)} frames",
+            )
+        nothing = np.zeros((stop - start, 0))
         episode = self.episode(
             episode_id,
             "-".join([config.label, *relative.parent.parts]),
@@ -103,12 +117,13 @@ class VideoFolderSource(EpisodeFiles[VideoFolderSourceConfig]):
             action=nothing,
             instruction=self._caption(relative),
             fps=rate,
-            timestamps=times,
+            timestamps=times[start:stop] - times[start],
             primary_view="head",
             state_kind="none",
             conventions={"file": printable(str(relative))},
         )
-        return LoadedEpisode(episode, ("head",), clips={"head": VideoClip.whole_file(path, len(times), rate)})
+        clip = VideoClip.whole_file(path, len(times), rate).cut(start, stop)
+        return LoadedEpisode(episode, ("head",), clips={"head": clip})
 
     def _caption(self, relative: PurePosixPath) -> str:
         if self._captions is not None:
