@@ -28,8 +28,8 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     export.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet, a RolloutSet or a checkpoint")
     export.add_argument(
         "--format", action="append", required=True, dest="formats",
-        choices=("lerobot", "mcap", "mcap-ros2", "rrd", "mp4", "worldarena", "model", "diffusers"),
-        help="repeatable; lerobot: EpisodeSets only, mp4 and worldarena: RolloutSets only; mcap: Foxglove's schemas;"
+        choices=("lerobot", "mcap", "mcap-ros2", "rrd", "mp4", "worldarena", "worldarena-archive", "model", "diffusers"),
+        help="repeatable; lerobot: EpisodeSets only, mp4 and worldarena (for its metrics, or as an archive to submit): RolloutSets only; mcap: Foxglove's schemas;"
         " model: a checkpoint with its tokenizer; diffusers: Cosmos3 as diffusers and vLLM-Omni run it, without controls",
     )  # fmt: skip
     export.add_argument("--output", type=Path, required=True, help="where the files go")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from itertools import islice
@@ -23,7 +24,7 @@ from worldline_core.data.episodes.view_recording import ViewImages
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.lerobot.dataset import LeRobotV3Dataset
 from worldline_core.data.mcap.exported import Encoding, write_episode_mcap, write_rollout_mcap
-from worldline_core.data.video.clip import check_video_header
+from worldline_core.data.video.clip import VideoClip, check_video_header, video_size
 from worldline_core.data.video.encoder import PixelFormat, encode_video
 from worldline_core.data.video.frames import MadeFrames, VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
@@ -45,7 +46,7 @@ MCAP_FORMATS: dict[str, tuple[Encoding, str]] = {"mcap": ("protobuf", ".mcap"), 
 """Encoding of the messages, and the files' suffix."""
 FORMATS = {
     "EpisodeSet": ("lerobot", *MCAP_FORMATS, "rrd"),
-    "RolloutSet": ("mp4", "rrd", *MCAP_FORMATS, "worldarena"),
+    "RolloutSet": ("mp4", "rrd", *MCAP_FORMATS, "worldarena", "worldarena-archive"),
     "Checkpoint": ("model", "diffusers"),
 }
 _CRF, _PRESET = 10, "veryfast"
@@ -69,8 +70,8 @@ def export(
     Args:
         formats: for an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
             artifact refers to another one's), `mcap`, `mcap-ros2` and `rrd` (one file per episode); for a RolloutSet
-            these without `lerobot`, `mp4` (truth beside prediction) and `worldarena` (`export_worldarena`); for a
-            checkpoint `model` (a folder with its tokenizer and card, to be published) and `diffusers` (`write_cosmos3`).
+            these without `lerobot`, `mp4` (truth beside prediction), `worldarena` (`export_worldarena`) and
+            `worldarena-archive` (`export_worldarena_archive`); for a checkpoint `model` (a folder with its tokenizer and card, to be published) and `diffusers` (`write_cosmos3`).
         episode_ids: the chosen episodes; default: all.
         outcome: only recordings of an EpisodeSet with this outcome (``success``: demonstrations to train a policy on).
         episodes: the EpisodeSet of predictions; default: the one that their manifest names.
@@ -215,6 +216,8 @@ def _export_rollouts(
         raise DataError("No prediction of this episode", where=artifact, got=", ".join(missing))
     if "worldarena" in formats:
         written += export_worldarena(rollouts, recorded, names, output)
+    if "worldarena-archive" in formats:
+        written += export_worldarena_archive(rollouts, recorded, names, output)
     for name in names:
         written += export_rollout({rollouts.method: rollouts}, recorded, tracks, name, output, formats)
     return written
@@ -352,3 +355,81 @@ def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequenc
         write_json_atomic(output / file, content)
         written.append(output / file)
     return written
+
+
+_ARCHIVED = re.compile(r"(?P<model>.+?)_(?:(?:test|val)(?:_[12])?|(?P<policy>(?:10|20|30|50|full)data))")
+_ARCHIVE_SIZE, _ARCHIVE_FPS, _TEXT_DRIVEN_FRAMES = (480, 640), 24, 121
+
+
+def export_worldarena_archive(
+    rollouts: RolloutSet, episodes: EpisodeSet, names: Sequence[str], output: Path
+) -> list[Path]:
+    """Write the head views of predictions (of the smallest seed) of WorldArena's own sets as one folder of the archive that it
+    takes; returns the files. The predictions' ``method`` is the folder's name, so that several calls fill one archive.
+
+    ```
+    <model>_eval/model_README.md                           written once, to be completed by hand
+    <model>_eval/<model>_test/episode<N>.mp4               track 1; _test_1 and _test_2 under two other instructions or actions
+    <model>_eval/<model>_10data/fixed_scene_task_episode<N>.mp4    track 2: of five policies, up to <model>_fulldata
+    ```
+
+    Sources (tsinghua-fib-lab/WorldArena): `assets/README_submission.md` (archive, README, 640 x 480 or more, 24 frames a second,
+    as long as the trajectory, or 121 frames where text drives), `submission_tree.txt` of `embodied_task/worldarena_track2`; for
+    the folders of track 1 the dataset's card. Its evaluation of policies takes names by a template; the names of track 1
+    are those of published archives.
+
+    Raises: DataError for another method, an episode of another set, and a video that is not as WorldArena asks.
+    """
+    found = _ARCHIVED.fullmatch(rollouts.method)
+    if found is None:
+        raise DataError(
+            "Predictions for WorldArena are named by its sets", where=rollouts.root, got=rollouts.method,
+            expected="MODEL_test, MODEL_test_1, MODEL_test_2; MODEL_10data to MODEL_fulldata",
+            next_step="roll out again with such a name as method",
+        )  # fmt: skip
+    model, task = safe_stem(found["model"]), "fixed_scene_task_" if found["policy"] else ""
+    root = output / f"{model}_eval"
+    videos: dict[Path, VideoClip] = {}
+    for name in sorted(names):
+        number = re.search(r"episode(\d+)$", name)
+        if number is None or HEAD not in rollouts.views(name):
+            raise DataError(
+                "Not a prediction of an episode of WorldArena", where=name, expected="...episode<N>, a head view",
+                got=", ".join(rollouts.views(name)), next_step="curate its set with kind: worldarena",
+            )  # fmt: skip
+        path = root / safe_stem(rollouts.method) / f"{task}episode{int(number[1])}.mp4"
+        if path in videos:
+            raise DataError("Two episodes of one number", where=name, expected=f"one {path.name}")
+        videos[path] = _archived_clip(rollouts, episodes, name, driven_by_policy=bool(task))
+    for path, clip in videos.items():
+        with atomic_path(path) as temporary:
+            encode_video(temporary, VideoFrames(clip), _ARCHIVE_FPS, crf=8, preset="veryfast", pixel_format="yuv420p")
+    about = root / "model_README.md"
+    if not about.exists():
+        lines = {
+            "Model name": model, "GitHub repository (optional)": "", "Driver type (action-driven or text-driven)": "",
+            "Action space (track 2: joint14 or endpose14)": "", "Release year": "", "Open source (yes or no)": "",
+            "Brief description (optional)": "", "Submitted video sets": "",
+        }  # fmt: skip
+        write_bytes_atomic(about, "".join(f"- **{name}**: {value}\n" for name, value in lines.items()).encode())
+    return [*videos, about]
+
+
+def _archived_clip(rollouts: RolloutSet, episodes: EpisodeSet, name: str, *, driven_by_policy: bool) -> VideoClip:
+    """The predicted head view. Raises: DataError for another size or length than WorldArena asks for."""
+    clip, (least_height, least_width) = rollouts.clip(name, HEAD), _ARCHIVE_SIZE
+    height, width, _ = video_size(check_video_header(clip.path))
+    if height < least_height or height * least_width != width * least_height:
+        raise DataError(
+            "Not the pictures that WorldArena asks for", where=name, got=f"{width} x {height}",
+            expected=f"{least_width} x {least_height}, or more in these proportions",
+            next_step="predict with a model of this size",
+        )  # fmt: skip
+    trajectory = episodes.rows[episodes.position(name)].num_frames
+    if not driven_by_policy and clip.num_frames not in (trajectory, _TEXT_DRIVEN_FRAMES):
+        raise DataError(
+            "Not the length that WorldArena asks for", where=name, got=f"{clip.num_frames} frames",
+            expected=f"{trajectory} (its trajectory), or {_TEXT_DRIVEN_FRAMES} where text drives",
+            next_step="roll out with num_frames: whole",
+        )  # fmt: skip
+    return clip
