@@ -116,7 +116,7 @@ def test_videos_are_compared_with_videos_without_action_tracks(recordings, evalu
     inputs = {name: path for name, path in recordings.inputs.items() if name not in ("tracks", "segmenter")}
     config = VideoEvaluationConfig(resamples=100, metrics=("hsd", "scene_consistency"))
     found, means = measure(inputs, tmp_path, config)
-    assert {name.partition("@")[0] for name in means["good"]} == {"psnr", "ssim"}
+    assert {name.partition("@")[0] for name in means["good"]} == {"psnr", "ssim", "sharpness"}
     assert means["good"]["psnr"] == summary_of(evaluated)["metrics"]["test"]["good"]["psnr"]
     for name in ("robot_iou", "end_effector_error_px", "hsd", "scene_consistency"):
         assert "have no action tracks" in found["unavailable"][name]
@@ -378,15 +378,15 @@ def measured(recordings, tmp_path_factory):
 def test_every_metric_of_the_registry_tells_good_videos_from_bad_ones_and_is_shown(measured, tmp_path):
     summary = summary_of(measured)
     good, copy = (summary["metrics"]["test"][method] for method in ("good", "copy"))
-    assert {metric_of(name).name for name in good} | {"lpips"} == set(METRICS)
+    assert {metric_of(name).name for name in good} | {"lpips", "invented_motion"} == set(METRICS)  # no thing stays here
     for name, metric in METRICS.items():
-        if name in ("lpips", "scene_consistency") or metric.needs == "changed_controls":
+        if name in ("lpips", "scene_consistency", "sharpness", "invented_motion") or metric.needs == "changed_controls":
             continue
         key = f"{name}@head" if f"{name}@head" in good else name
         better, worse = good[key]["mean"], copy[key]["mean"]
         assert (better < worse) == metric.lower_is_better, name
         assert abs(better - metric.perfect) <= abs(worse - metric.perfect), name
-    assert good["scene_consistency@head"]["mean"] > 0.95
+    assert min(good[name]["mean"] for name in ("scene_consistency@head", "sharpness@head")) > 0.95
     assert good["action_following[delayed]@head"]["mean"] > 0.6
     assert "counterfactual_direction[delayed]@head" in good
     assert {row["metric"] for row in summary["differences"]["test"]} >= {"hsd", "ndtw", "dyn", "scene_consistency"}

@@ -1,5 +1,6 @@
 """Formulas of metrics against other libraries, the intervals of their means, and paths of tools found in masks."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.evaluation.metrics import MAX_PSNR_DB, frame_iou, frames_to_unit, psnr, ssim
 from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
+from worldline_core.evaluation.video.background import Background, invented_motion, sharpness
 from worldline_core.evaluation.video.metrics_on_request import (
     ControlledPair,
     ToolFinder,
@@ -289,3 +291,55 @@ def test_changed_controls_begin_alike_and_then_differ_as_said(recorded):
             arm = next((i for i, name in enumerate(tracks.arms) if view == f"{name}_wrist"), None)
             if arm is not None and tracks.valid[:, column, arm].any():
                 np.testing.assert_allclose(mirrored.uv[:, column, arm], tracks.uv[:, column, arm], atol=0.05)
+
+
+@pytest.fixture
+def moving_robot():
+    """A grey robot that goes to the right before a coloured pattern with two things; its exact masks, and labels of the things."""
+    table = np.random.default_rng(1).integers(120, 256, (32, 48, 3), dtype=np.uint8)
+    labels, robot = np.zeros((8, 32, 48), np.uint8), np.zeros((8, 32, 48), bool)
+    labels[:, 2:6, 2:6], labels[:, 26:30, 40:44] = 1, 2
+    for n in range(8):
+        robot[n, 10:22, 4 * n : 4 * n + 12] = True
+    robot[:, 30:, :4] = True  # always there
+    frames = np.where(robot[..., None], 20, np.where(labels[..., None] > 0, (255, 0, 0), table)).astype(np.uint8)
+    return frames, robot, labels
+
+
+def test_the_background_shows_the_robot_and_every_cloud_around_it(moving_robot):
+    frames, robot, labels = moving_robot
+    background = Background.of(frames, robot, labels)  # an array, as a video's frames are asked for
+    assert not background.uncovered[30:, :4].any() and background.uncovered[10:22, :40].all()
+    assert not background.known[3, 3] and background.uncovered[3, 3]
+    assert background.robot_iou(robot, frames).min() > 0.7  # less one pixel around it
+    clouded = frames.copy()
+    clouded[:, 6:26, 20:44] = 90
+    assert background.robot_iou(robot, clouded).max() < 0.6
+    still = np.repeat(frames[:1], 8, axis=0)
+    assert background.robot_iou(robot, still)[-1] == 0.0
+    assert (
+        background.uncovered_iou(robot, np.repeat(robot[:1], 8, axis=0))[-1] == 0.0
+    )  # what is always covered is no merit
+
+
+def test_still_things_that_change_are_invented_motion(moving_robot):
+    frames, robot, labels = moving_robot
+    assert not invented_motion(labels, labels[0], robot, frames, frames[0]).any()
+    gone = frames.copy()
+    gone[4:, 24:32, 38:46] = 200
+    found = invented_motion(labels, labels[0], robot, gone, frames[0])
+    assert (found == [0, 0, 0, 0, 1, 1, 1, 1]).all()
+    away = np.where(labels == 2, 0, labels)  # in the recording it moves as well
+    away[0] = labels[0]
+    assert np.isnan(invented_motion(away, labels[0], robot, gone, frames[0])[1:]).all()
+
+
+def test_blurred_and_noisy_pictures_are_not_sharp(moving_robot):
+    frames = moving_robot[0]
+    blurred = np.stack([cv2.blur(frame, (3, 3)) for frame in frames])
+    noisy = np.clip(0.2 * frames.astype(float) + np.random.default_rng(2).normal(128, 60, frames.shape), 0, 255).astype(
+        np.uint8
+    )
+    assert sharpness(frames, frames).min() == 1.0
+    assert max(sharpness(frames, blurred).max(), sharpness(blurred, frames).max()) < 0.6
+    assert sharpness(blurred, noisy).max() < 0.6

@@ -73,8 +73,29 @@ _METRICS = (
         f"{_PAPER} “Robot-mask IoU”", perfect=1.0, margin=0.005,
     ),
     Metric(
+        "robot_iou_uncovered", "Robot IoU, uncovered",
+        "As the exact one, on pixels that the recording shows free of the robot at some time, without the given first frame.",
+        "this project", perfect=1.0, margin=0.01,
+    ),
+    Metric(
+        "robot_iou_difference", "Robot IoU, difference",
+        "IoU of what differs from the recording's own background in the predicted frame and the exact mask, on such pixels where never a"
+        " thing is; no network.",
+        "this project", perfect=1.0, margin=0.01,
+    ),
+    Metric(
         "object_iou_exact", "Object IoU, exact",
         "IoU of what the task moves, found by the colour that the instruction names, in the frames in which it has moved.",
+        "this project", perfect=1.0, margin=0.01,
+    ),
+    Metric(
+        "invented_motion", "Invented motion",
+        "Share of the pixels of things that stay where they are which the prediction shows changed.",
+        "this project", perfect=0.0, margin=0.01, lower_is_better=True,
+    ),
+    Metric(
+        "sharpness", "Sharpness",
+        "Edges of the predicted frame over those of the recorded one (mean absolute Laplacian), or the reciprocal above 1.",
         "this project", perfect=1.0, margin=0.01,
     ),
     Metric(

@@ -15,6 +15,7 @@ import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.actions.tool_error import end_effector_error
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames, pieces
@@ -32,6 +33,7 @@ from worldline_core.evaluation.segmenters.coloured_things import (
 )
 from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
+from worldline_core.evaluation.video.background import Background, invented_motion, sharpness
 from worldline_core.evaluation.video.metrics_on_request import SceneFrames, ToolFinder
 from worldline_core.model.lpips import LPIPS
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -53,6 +55,8 @@ class _Piece:
     Attributes:
         first: the video's first frame, and its mask by the first segmenter.
         moved: exact masks of the thing that the task moves (n, h, w), and in which frames it has moved (n,).
+        labels: of things (n, h, w), and of the first frame (h, w).
+        begin: number of the first of these frames.
     """
 
     frames: np.ndarray
@@ -61,13 +65,16 @@ class _Piece:
     first: tuple[np.ndarray, np.ndarray]
     exact: np.ndarray | None
     moved: tuple[np.ndarray, np.ndarray] | None
+    labels: tuple[np.ndarray, np.ndarray] | None
+    background: Background | None
+    begin: int
 
 
 class _Video:
     """One video while it is measured: segmenters that follow it from piece to piece, and its values so far."""
 
     def __init__(self, frames: VideoFrames, segmenters: Mapping[str, Segmenter], thing: ColouredThing | None) -> None:
-        self.pieces = pieces(frames, PIECE_FRAMES)
+        self.frames, self.pieces = frames, pieces(frames, PIECE_FRAMES)
         self.values: FrameValues = defaultdict(list)
         self.finder = ToolFinder()
         self.places: list[np.ndarray] = []
@@ -218,16 +225,20 @@ class EpisodeMeasurement:
             if images is not None:
                 _require_length(len(images), count, f"{name} of {self.episode_id}, view {HEAD}")
         points = tool_points(tracks, self.episode_id, count, stride)
+        background = None
+        if exact is not None and tracks.tracks(self.episode_id).camera_motion[VIEWS.index(HEAD)] == "static":
+            background = Background.of(true.frames, exact, labels)
         exact_pieces, label_pieces = (None if x is None else pieces(x, PIECE_FRAMES) for x in (exact, labels))
         first: tuple[np.ndarray, np.ndarray] | None = None
-        first_thing: np.ndarray | None = None
+        first_labels: np.ndarray | None = None
         for begin in range(0, count, PIECE_FRAMES):
             frames = next(true.pieces)[: count - begin]
-            own_points, moved = points[begin : begin + len(frames)], None
+            own_points, moved, labelled = points[begin : begin + len(frames)], None, None
             if label_pieces is not None:
-                thing = np.asarray(next(label_pieces)[: len(frames)] == 1)
-                first_thing = thing[:1].copy() if first_thing is None else first_thing
-                stays = frame_iou(thing, np.repeat(first_thing, len(thing), axis=0))
+                own_labels = np.asarray(next(label_pieces)[: len(frames)])
+                given = own_labels[0].copy() if first_labels is None else first_labels
+                labelled, thing, first_labels = (own_labels, given), own_labels == 1, given
+                stays = frame_iou(thing, np.repeat(given[None] == 1, len(thing), axis=0))
                 moved = thing, (stays < MOVED_IOU) & thing.any(axis=(1, 2))
             robot = None if exact_pieces is None else next(exact_pieces)[: len(frames)]
             masks = true.masks(frames, own_points)
@@ -240,8 +251,11 @@ class EpisodeMeasurement:
                 name, mask = "kinematic", kinematic_masks(tracks.tracks(self.episode_id), HEAD, index, frames)
             if mask is not None:
                 accuracy = {f"robot_iou_{name}{suffix}": frame_iou(mask, own) for suffix, own in masks.items()}
+                if background is not None and robot is not None:
+                    accuracy["robot_iou_difference"] = background.robot_iou(robot, frames)
+                    accuracy["robot_iou_difference"][: int(begin == 0)] = np.nan
                 true.add(**{name: _null_if_nan(values) for name, values in accuracy.items()})
-            yield _Piece(frames, own_points, masks, first, robot, moved)
+            yield _Piece(frames, own_points, masks, first, robot, moved, labelled, background, begin)
 
     def _add_full_frame(self, video: _Video, predicted: np.ndarray, true: np.ndarray, where: str) -> None:
         if predicted.shape != true.shape:
@@ -250,7 +264,7 @@ class EpisodeMeasurement:
                 next_step="write the predictions at the recording's frame size",
             )  # fmt: skip
         p, t = (frames_to_unit(torch.from_numpy(np.ascontiguousarray(frames))) for frames in (predicted, true))
-        video.add(psnr=psnr(p, t).tolist(), ssim=ssim(p, t).tolist())
+        video.add(psnr=psnr(p, t).tolist(), ssim=ssim(p, t).tolist(), sharpness=sharpness(true, predicted).tolist())
         if self.lpips is not None:
             video.add(lpips=self.lpips(p, t).tolist())
 
@@ -265,15 +279,30 @@ class EpisodeMeasurement:
             video.add(**{f"robot_iou{suffix}": _null_if_nan(frame_iou(true.masks[suffix][part], masks))})
             if true.exact is not None:
                 video.add(**{f"robot_iou_exact{suffix}": _null_if_nan(frame_iou(true.exact[part], masks))})
+        first = video.first = predicted[0].copy() if video.first is None else video.first
+        self._add_uncovered(video, predicted, found[""], true)
         video.add_object(predicted, None if true.moved is None else (true.moved[0][part], true.moved[1][part]))
         robots = true.masks[""][part]
         if self.finds_tools:
             video.places.append(video.finder.find(robots, found[""], points))
-        first = video.first = predicted[0].copy() if video.first is None else video.first
         scene = SceneFrames(true.frames[part], predicted, true.first[0], first, robots | found[""] | true.first[1])
         for name, metric in self.metrics.items():
             if metric.needs == "frames":
                 video.add(**{name: metric.load()(scene)})
+
+    def _add_uncovered(self, video: _Video, predicted: np.ndarray, masks: np.ndarray, true: _Piece) -> None:
+        """Metrics that need exact masks or labels, without the given first frame."""
+        part, given = slice(0, len(predicted)), int(true.begin == 0)
+        found: dict[str, np.ndarray] = {}
+        if true.background is not None and true.exact is not None:
+            found["robot_iou_uncovered"] = true.background.uncovered_iou(true.exact[part], masks)
+            found["robot_iou_difference"] = true.background.robot_iou(true.exact[part], predicted)
+        if true.labels is not None and video.first is not None:
+            labels, first_labels = true.labels
+            found["invented_motion"] = invented_motion(labels[part], first_labels, masks, predicted, video.first)
+        for name, values in found.items():
+            values[:given] = np.nan
+            video.add(**{name: _null_if_nan(values)})
 
 
 def _require_length(recorded: int, predicted: int, where: str) -> None:
