@@ -386,7 +386,7 @@ def test_every_metric_of_the_registry_tells_good_videos_from_bad_ones_and_is_sho
         better, worse = good[key]["mean"], copy[key]["mean"]
         assert (better < worse) == metric.lower_is_better, name
         assert abs(better - metric.perfect) <= abs(worse - metric.perfect), name
-    assert min(good[name]["mean"] for name in ("scene_consistency@head", "sharpness@head")) > 0.95
+    assert min(good[name]["mean"] for name in ("scene_consistency@head", "sharpness@head")) > 0.9
     assert good["action_following[delayed]@head"]["mean"] > 0.6
     assert "counterfactual_direction[delayed]@head" in good
     assert {row["metric"] for row in summary["differences"]["test"]} >= {"hsd", "ndtw", "dyn", "scene_consistency"}
