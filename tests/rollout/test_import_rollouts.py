@@ -152,7 +152,14 @@ def test_oscar_s_outputs_are_compared_from_their_start_frames_on(tmp_path):
     for name in ("rgb", "gripper_scenario"):
         encode(tmp_path / f"assets/agibot_360/{name}.mp4", np.broadcast_to(grey, (86, 24, 32, 3)), fps=15)
     encode(tmp_path / "outputs/agibot_360.mp4", np.broadcast_to(grey[5:], (81, 480, 640, 3)), fps=15)
-    _, curated = curate(tmp_path / "set", {**preset("oscar", tmp_path / "assets"), "image_size": [24, 32]})
+    source = {**preset("oscar", tmp_path / "assets"), "image_size": [24, 32]}
+    assert len(source["starts"]) == 14
+    with pytest.raises(DataError, match=r"(?s)Not a video of the folder.*agibot_465/rgb.mp4"):
+        curate(tmp_path / "set", source)
+    start = source["starts"]["agibot_360/rgb.mp4"]
+    with pytest.raises(DataError, match=r"too_short(?s:.*)expected: frames 6 to 86"):
+        curate(tmp_path / "set", source | {"starts": {"agibot_360/rgb.mp4": start + 1}})
+    _, curated = curate(tmp_path / "cases", source | {"starts": {"agibot_360/rgb.mp4": start}})
     assert [row.episode_id for row in curated.rows] == ["oscar-agibot_360-rgb"]
     assert close(curated.frames(0, "head"), np.broadcast_to(grey[5:], (81, 24, 32, 3)))
     _, counts, _ = run(tmp_path / "outputs", curated.root, layout="oscar", resize=True)

@@ -25,6 +25,7 @@ from worldline_core.data.guards.rejection import RejectedInputError, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, regular_file
 from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.video.clip import VideoClip, frame_times, video_size
+from worldline_core.errors import DataError
 from worldline_core.untrusted_text import printable
 
 
@@ -89,6 +90,11 @@ class VideoFolderSource(EpisodeFiles[VideoFolderSourceConfig]):
         self.looked_for = "files that end in " + ", ".join(config.suffixes)
         suffixes = {suffix.lower() for suffix in config.suffixes}
         super().__init__(config, root, [path for path in find_files(root, "*") if path.suffix.lower() in suffixes])
+        if absent := sorted(set(config.starts) - set(map(str, self.files.values()))):
+            raise DataError(
+                "Not a video of the folder", where=f"{root}, starts", got=", ".join(absent[:8]),
+                next_step="correct its path in the folder, or leave it out",
+            )  # fmt: skip
         table = config.captions
         self._captions = None if table is None else caption_table(inside(root, table.file), table.video, table.caption)
 
