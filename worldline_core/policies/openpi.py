@@ -7,11 +7,14 @@ closes with code 1011. There is no reset message.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
+from worldline_core.config import StrictModel
 from worldline_core.errors import DataError
 from worldline_core.policies.messages import MAX_MESSAGE_BYTES, MessageSocket
 
@@ -74,3 +77,54 @@ class OpenpiPolicy(MessageSocket):
             step, column = np.argwhere(~np.isfinite(actions))[0]
             raise DataError("An action is not finite", where=f"{self.url}, step {step}, column {column}")
         return {**reply, "actions": actions}
+
+    def chunk(self, observation: Mapping[str, Any], *, rows: int, columns: int) -> np.ndarray:
+        """Actions ``(at least rows, columns)``.
+
+        Raises:
+            UnavailableError, DataError: as :meth:`infer`; DataError also for fewer rows, or other columns.
+        """
+        actions: np.ndarray = self.infer(observation)["actions"]
+        if actions.shape[1] != columns or len(actions) < rows:
+            raise DataError(
+                "The policy's actions do not fit the robot", where=self.url,
+                expected=f"at least {rows} rows of {columns} columns", got=actions.shape,
+            )  # fmt: skip
+        return actions
+
+
+class PolicyConfig(StrictModel):
+    """An openpi policy server, and how it expects an observation.
+
+    Attributes:
+        url: ws://host:port.
+        api_key_variable: environment variable that holds its API key.
+        form: ``flat``: pictures (H, W, 3) beside the state; ``aloha``: pictures (3, H, W) in a map ``images``, as policies of
+            openpi's ALOHA and of RoboTwin take them.
+        image_keys: by view. A dot or a slash is part of the name.
+        deadline_s: for one chunk of actions.
+    """
+
+    url: str = Field(pattern=r"^wss?://")
+    api_key_variable: str | None = None
+    form: Literal["flat", "aloha"] = "flat"
+    image_keys: dict[str, str] = Field(
+        default_factory=lambda: {view: f"observation.images.{view}" for view in ("head", "left_wrist", "right_wrist")}
+    )
+    state_key: str = "observation.state"
+    prompt_key: str = "prompt"
+    deadline_s: float = Field(10.0, gt=0)
+
+    def connect(self) -> OpenpiPolicy:
+        """Raises: as `OpenpiPolicy`."""
+        key = None if self.api_key_variable is None else os.environ.get(self.api_key_variable)
+        return OpenpiPolicy(self.url, api_key=key, deadline_s=self.deadline_s)
+
+    def observation(self, pictures: Mapping[str, np.ndarray], state: np.ndarray, prompt: str) -> dict[str, Any]:
+        """What the policy is sent: pictures ``uint8 (H, W, 3)`` of the views that it names, a state ``(j)``, an instruction."""
+        images = {self.image_keys[view]: picture for view, picture in pictures.items() if view in self.image_keys}
+        if self.form == "aloha":
+            images = {
+                "images": {name: np.ascontiguousarray(image.transpose(2, 0, 1)) for name, image in images.items()}
+            }
+        return {**images, self.state_key: state.astype(np.float32), self.prompt_key: prompt}

@@ -401,28 +401,16 @@ class PlaySession:
         self._forget_commands()
         current = self._current
         simulation = await self._host.compute(lambda: self._reached(current))
-        observation: dict[str, Any] = {
-            policy.image_keys[view]: picture
-            for view, picture in simulation.pictures[0].items()
-            if view in policy.image_keys
-        }
-        observation[policy.state_key] = simulation.state[0].astype(np.float32)
-        observation[policy.prompt_key] = self._row.instruction
+        observation = policy.observation(simulation.pictures[0], simulation.state[0], self._row.instruction)
+        size, columns = simulation.frames_per_step, simulation.state.shape[1]
 
         def ask() -> np.ndarray:
             if name not in self._policies:
-                key = None if policy.api_key_variable is None else os.environ.get(policy.api_key_variable)
-                self._policies[name] = OpenpiPolicy(policy.url, api_key=key, deadline_s=policy.deadline_s)
-            return self._policies[name].infer(observation)["actions"]
+                self._policies[name] = policy.connect()
+            return self._policies[name].chunk(observation, rows=size, columns=columns)
 
-        size, columns = simulation.frames_per_step, simulation.state.shape[1]
         try:
             actions = await asyncio.to_thread(ask)
-            if actions.shape[1] != columns or len(actions) < size:
-                raise DataError(
-                    "The policy's actions do not fit the robot", where=name,
-                    expected=f"at least {size} rows of {columns} columns", got=actions.shape,
-                )  # fmt: skip
         except WorldLineError:
             if (broken := self._policies.pop(name, None)) is not None:
                 await asyncio.to_thread(broken.close)

@@ -8,31 +8,12 @@ from pathlib import Path
 from pydantic import Field
 
 from worldline_core.config import StrictModel
+from worldline_core.policies.openpi import PolicyConfig
 from worldline_core.shipped import SHIPPED
 
 PROTOCOL = 1
 """Version of the messages."""
 TOKEN_VARIABLE = "WORLDLINE_TOKEN"  # noqa: S105  # the variable's name
-
-
-class PolicyConfig(StrictModel):
-    """An openpi policy server, and under which names it expects an observation.
-
-    Attributes:
-        url: ws://host:port.
-        api_key_variable: environment variable that holds its API key.
-        image_keys: by view. A dot or a slash is part of the name.
-        deadline_s: for one chunk of actions.
-    """
-
-    url: str = Field(pattern=r"^wss?://")
-    api_key_variable: str | None = None
-    image_keys: dict[str, str] = Field(
-        default_factory=lambda: {view: f"observation.images.{view}" for view in ("head", "left_wrist", "right_wrist")}
-    )
-    state_key: str = "observation.state"
-    prompt_key: str = "prompt"
-    deadline_s: float = Field(10.0, gt=0)
 
 
 class ServeConfig(StrictModel):
