@@ -62,6 +62,10 @@ class RecordedStarts:
         fps: of the model's controls.
         needs_cameras: of every view; False: of a model that knows control vectors.
         embodiment, splits: of the recordings; None: all.
+
+    Attributes:
+        rows: recordings that are starts.
+        left_out: why, by the names of the others.
     """
 
     def __init__(
@@ -77,7 +81,7 @@ class RecordedStarts:
         verify_artifact(recordings, what="Set of recordings")
         self._episodes, self._view_sets = EpisodeSet.open(recordings), view_sets
         self._rows = {row.episode_id: row for row in self._episodes.rows}
-        self._left_out: dict[str, str] = {}
+        self.left_out: dict[str, str] = {}
         self.rows: list[EpisodeRow] = []
         self._needs_cameras = needs_cameras
         fit = {None, "missing_view", *(() if needs_cameras else ("missing_calibration",))}
@@ -96,7 +100,7 @@ class RecordedStarts:
                 self.rows.append(row)
                 banks |= {row.bank} if row.bank else set()
             else:
-                self._left_out[row.episode_id] = reason
+                self.left_out[row.episode_id] = reason
         self._start = lru_cache(maxsize=64)(self._read)
         self._before = lru_cache(maxsize=8)(self._read_before)
 
@@ -111,7 +115,7 @@ class RecordedStarts:
             recorded = ", ".join(sorted({row.embodiment for row in self._episodes.rows}))
             raise DataError(
                 "Starts are needed of one robot", where=self._episodes.root,
-                got=f"{', '.join(sorted(robots)) or 'none'}; left out: {dict(Counter(self._left_out.values()))}",
+                got=f"{', '.join(sorted(robots)) or 'none'}; left out: {dict(Counter(self.left_out.values()))}",
                 next_step=f"name an embodiment of the recordings ({recorded}), or give others",
             )  # fmt: skip
         return robots.pop()
@@ -156,7 +160,7 @@ class RecordedStarts:
         Raises: DataError when there is none that fits.
         """
         row = self._rows.get(episode_id) if isinstance(episode_id, str) else None
-        reason = self._left_out.get(episode_id) if row else None
+        reason = self.left_out.get(episode_id) if row else None
         if row is None or reason not in (None, _SAME_START):
             raise DataError(
                 "No recording of this name to start from", where=self._episodes.root,

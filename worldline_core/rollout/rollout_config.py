@@ -1,4 +1,4 @@
-"""Configurations of the rollout step and of the import of other simulators' videos; imports no torch."""
+"""Configurations of the rollout steps and of the import of other simulators' videos; imports no torch."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.model.world_model_config import FULL_STEPS, TextConfig
+from worldline_core.policies.openpi import PolicyConfig
 
 Controls = Literal["true", "zero", "shuffled", "mirrored", "delayed"]
 """The episode's own controls, none, those of another episode, or its own changed in a known way
@@ -173,6 +174,29 @@ class RolloutConfig(StrictModel):
         text = self.sampler.text if isinstance(self.sampler, TextToVideoConfig) else None
         decoder = self.sampler.decoder if isinstance(self.sampler, _ModelSampler) else None
         return ({} if text is None else text.files_read()) | ({} if decoder is None else {"decoder": decoder})
+
+
+class PolicyRolloutConfig(StrictModel):
+    """A policy that drives the simulator from recorded first frames on.
+
+    Attributes:
+        method: name of the predictions. The cache knows a policy by its address alone: name each one.
+        down_sample: take every so-many-th of the policy's actions, which come at its own rate.
+        length_scale: frames of a video for each ``down_sample``-th frame of the recording.
+        splits: recordings that are starts.
+        steps: Euler steps of the model; None: as it was trained.
+    """
+
+    method: str = Field(min_length=1)
+    policy: PolicyConfig
+    down_sample: int = Field(default=1, ge=1)
+    length_scale: float = Field(default=1.2, gt=0)
+    splits: tuple[str, ...] = ("test",)
+    seed: int = Field(default=42, ge=0)
+    steps: int | None = Field(default=None, ge=1)
+    crf: int = Field(default=8, ge=0, le=51)
+    bfloat16: bool = True
+    device: str = "cpu"
 
 
 NAME_FIELD = re.compile(r"\{(\w+)\}|(\*)")

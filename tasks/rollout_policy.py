@@ -1,0 +1,15 @@
+"""`rollout_policy`: videos of a policy that drives the simulator from recorded first frames on."""
+
+from tasks.execution.artifact_task import ArtifactTask
+
+rollout_policy = ArtifactTask(
+    name="rollout_policy",
+    summary="videos of a policy that drives the simulator from recorded first frames on",
+    version=1,
+    function="worldline_core.rollout.policy_rollout:rollout_policy",
+    config="worldline_core.rollout.rollout_config:PolicyRolloutConfig",
+    inputs=("checkpoint", "tokenizer", "episodes"),
+)
+
+if __name__ == "__main__":
+    rollout_policy.main()
