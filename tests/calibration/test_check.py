@@ -17,13 +17,14 @@ from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.calibration import check as check_module
 from worldline_core.calibration import check_report
-from worldline_core.calibration.check import GuardedSource, ListedEpisode, check_calibration, repairing_lines
+from worldline_core.calibration.check import ListedEpisode, check_calibration, repairing_lines
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SourceDiagnosis
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.reader_process import ReaderLimits
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.sources.guarded import GuardedSource
 from worldline_core.data.sources.open import EpisodeSetSourceConfig
 from worldline_core.errors import DataError
 

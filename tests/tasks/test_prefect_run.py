@@ -65,6 +65,7 @@ def run(store: Path, chain: Callable[..., None], *arguments: str, page: bool = F
     return some_calls()
 
 
+@pytest.mark.slow
 def test_a_call_starts_when_its_inputs_are_finished_and_is_found_where_nothing_may_be_written(
     storage: Path, two_calls: Callable[..., None], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
