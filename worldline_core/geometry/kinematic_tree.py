@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import Embodiment, read_description
@@ -407,6 +406,8 @@ def tool_poses(
     Args:
         posture: positions [rad, m] of joints outside the state; the embodiment's own where not given.
     """
+    from scipy.spatial.transform import Rotation  # takes a third of a reader's start, which few need
+
     positions: dict[str, np.ndarray] = {
         name: np.full(len(state), value) for name, value in {**embodiment.posture, **posture}.items()
     }

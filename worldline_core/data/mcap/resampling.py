@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
 from worldline_core.data.guards.rejection import Reason, RejectedInputError
@@ -267,6 +266,8 @@ def resampled(times_ns: np.ndarray, values: np.ndarray, grid_ns: np.ndarray, *, 
 
 def resampled_poses(times_ns: np.ndarray, values: np.ndarray, grid_ns: np.ndarray) -> np.ndarray:
     """(t, 4, 4) of poses (n, 7) x y z qx qy qz qw: linear in place, slerp in rotation; constant beyond the ends."""
+    from scipy.spatial.transform import Rotation, Slerp  # takes a third of a reader's start, which few need
+
     rotations = Rotation.from_quat(values[:, 3:])
     if len(times_ns) == 1:
         turned = rotations[np.zeros(len(grid_ns), np.int64)]
