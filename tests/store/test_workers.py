@@ -75,7 +75,7 @@ def straggle(folder: Path, begun: Any) -> None:
     """A worker of a command that was killed: it does not know yet."""
     with helper_lock(folder):
         begun.set()
-        time.sleep(0.4)
+        time.sleep(0.2)
         (folder / "late").write_text("by a worker whose command is gone")
 
 

@@ -29,7 +29,7 @@ def end_with_parent(end: Callable[[], object]) -> None:
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(1)
+            time.sleep(0.2)
         end()
 
     threading.Thread(target=watch, name="end with parent", daemon=True).start()
