@@ -17,7 +17,7 @@ def add_plan_command(commands: argparse._SubParsersAction[argparse.ArgumentParse
     plan = commands.add_parser(
         "plan",
         help="memory that every stage of a preset takes, planned hours, and the setting that would fit",
-        description="Memory a device of every stage and, of a card that is known, planned seconds and hours, from the configuration"
+        description="Memory a device of every stage and, of a card that is known, planned seconds, hours and frames a second, from the configuration"
         " alone; nothing is loaded. Exit status: 0 everything fits, 1 something does not.",
     )
     add_config_arguments(plan)
@@ -53,8 +53,8 @@ def _plan(arguments: argparse.Namespace) -> None:
         changes = largest_fitting(load, lambda smaller: sheet.model_copy(update={"config": smaller}).fits())
         print("what changes of the preset:", *([f"--set '{one}'" for one in changes] or ["nothing"]), sep="\n  ")
         sheet = sheet.model_copy(update={"config": load(changes)})
-    rows = sheet.rows()
-    print(sheet.as_text(rows))
+    rows, rollouts = sheet.rows_and_rollouts()
+    print(sheet.as_text(rows, rollouts))
     raise SystemExit(0 if not any(setting for _, setting in rows) else 1)
 
 

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from worldline_core.config import read_config
 from worldline_core.errors import ConfigError
 from worldline_core.pipeline.cards import CARDS, PRESETS, UTILISATION, card_memory, find_card, preset_for
-from worldline_core.pipeline.memory_estimate import Estimate
+from worldline_core.pipeline.memory_estimate import Estimate, Sources
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.rollout_speed import block_costs
 from worldline_core.pipeline.size_sheet import SizeSheet
 from worldline_core.pipeline.smaller import largest_fitting, smaller_settings
+from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
 
 
 @pytest.mark.parametrize(
@@ -93,6 +99,33 @@ def test_precision_goes_before_clips_and_pictures_and_adapters_come_last():
 @pytest.mark.parametrize("preset", ["edge-24gb", "edge-48gb", "edge-80gb", "nano-80gb-lora"])
 def test_every_stage_of_a_preset_fits_its_card(preset):
     config = PipelineConfig.load(preset)
-    rows = SizeSheet.model_validate({"config": config, "project": ".", "card": config.card}).rows()
+    sheet = SizeSheet.model_validate({"config": config, "project": ".", "card": config.card})
+    rows, rollouts = sheet.rows_and_rollouts()
     assert len(rows) == 5
     assert not [(row.title, row.total, setting) for row, setting in rows if setting]
+    assert [(cost.views, cost.frames) for cost in rollouts] == [(1, 16), (3, 16)]
+    assert all(cost.small_decoding < 0.03 * cost.decoding for cost in rollouts)
+    assert sheet.as_text(rows, rollouts).count("blocks of 16 frames") == 2
+
+
+def test_operations_of_a_block_are_those_that_a_rollout_does(make_model):
+    config = PipelineConfig.load("smoke").distill
+    spec, views = config.spec, config.views
+    model = make_model(num_layers=2)
+    source = Sources(None, None, (64, 96), (4, 6))
+    with ThreadPoolExecutor(1) as pool:  # processes would share no traces with this test
+        planned = block_costs(config, model.config, source, [views], pool)()[0]
+    simulator = BlockCausalSimulator(model, spec, noise=Noise([0]), views=views)
+
+    def maps(frames):
+        return torch.zeros(1, len(views), model.config.control_channels, frames, 4, 6)
+
+    simulator.start(torch.zeros(1, len(views), model.config.latent_channels, 4, 6), maps(1))
+    for _ in range(spec.sink_blocks + spec.recent_blocks):
+        simulator.step(maps(spec.block_size))
+    attention = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
+    known = {attention: lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v)}
+    with FlopCounterMode(display=False, custom_mapping=known) as counted:
+        simulator.step(maps(spec.block_size))
+    assert planned.sampling == counted.get_total_flops()
+    assert planned.frames_per_second(2 * (planned.sampling + planned.decoding), small=False) == 2 * planned.frames

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from pydantic import ByteSize, Field
@@ -17,9 +17,11 @@ from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline.cards import CARDS, UTILISATION, CardName
 from worldline_core.pipeline.memory_estimate import USABLE, AnyStage, Estimate, Sources, Training, gigabytes, trainings
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.rollout_speed import BlockCost, block_costs
 from worldline_core.progress import Progress
 from worldline_core.shipped import project_path
 from worldline_core.training.clip_config import FrameInput
+from worldline_core.training.stage2 import stage2_model_config
 
 Row = tuple[Estimate, str]
 """Memory of a training, and the setting with which it would fit; empty if it fits as it is."""
@@ -92,32 +94,47 @@ class SizeSheet(StrictModel):
         """One line of the sheet."""
         return self._trainings()[number].row(self.devices, self.bytes)
 
-    def _finished(self) -> Iterator[tuple[int, Row]]:
-        """Lines by their numbers as they are done, a core each; those that take longest are begun first."""
+    def _finished(self, pool: Executor) -> Iterator[tuple[int, Row]]:
+        """Lines by their numbers as they are done; those that take longest are begun first."""
         numbers = range(len(self._trainings()))
-        with ProcessPoolExecutor(len(os.sched_getaffinity(0)), multiprocessing.get_context("fork")) as pool:
-            waiting = {pool.submit(self.row, number): number for number in reversed(numbers)}
-            try:
-                for future in as_completed(waiting):
-                    yield waiting[future], future.result()
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
+        waiting = {pool.submit(self.row, number): number for number in reversed(numbers)}
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
 
     def rows(self) -> list[Row]:
         """Memory of every training in the order of a run, and the setting with which it would fit."""
+        with _processes() as pool:
+            return self._rows(pool)
+
+    def _rows(self, pool: Executor) -> list[Row]:
         made: dict[int, Row] = {}
         with Progress("worldline plan", len(self._trainings()), "training") as progress:
-            for number, row in self._finished():
+            for number, row in self._finished(pool):
                 made[number] = row
                 progress.advance()
         return [made[number] for number in sorted(made)]
 
+    def rows_and_rollouts(self) -> tuple[list[Row], list[BlockCost]]:
+        """The same, and blocks of the distilled model in one view and in all; none where nothing is distilled."""
+        config, views = self.config, () if self.config.distill is None else tuple(self.config.distill.views)
+        with _processes() as pool:
+            if config.distill is None or config.train_stage2 is None:
+                return self._rows(pool), []
+            model = stage2_model_config(config.train_stage2, self.model)
+            shown = list(dict.fromkeys((views[:1], views)))
+            costs = block_costs(config.distill, model, self.source(config.distill), shown, pool)
+            return self._rows(pool), costs()
+
     def fits(self) -> bool:
         """Returns whether every training fits; the first one that does not ends the work."""
-        return all(not setting for _, (_, setting) in self._finished())
+        with _processes() as pool:
+            try:
+                return all(not setting for _, (_, setting) in self._finished(pool))
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
 
-    def as_text(self, rows: Iterable[Row]) -> str:
-        """The sheet as a Markdown table; the last column names the setting with which a stage would fit."""
+    def as_text(self, rows: Iterable[Row], rollouts: Iterable[BlockCost] = ()) -> str:
+        """The sheet as a Markdown table, whose last column names the setting with which a stage would fit; then the rollouts."""
         devices = "1 device" if self.devices == 1 else f"{self.devices} devices"
         lines = [f"{devices} of {gigabytes(self.bytes)} GB ({USABLE:.0%} of it usable)"]
         if self.card is not None:
@@ -135,7 +152,21 @@ class SizeSheet(StrictModel):
                 hours += taken or 0
                 timed = f" {_figure(seconds)} | {_figure(taken)} |"
             lines.append(f"| {row.title} | {count} | {gigabytes(row.total)} | {row.describe_parts()} |{timed} {fits} |")
-        return "\n".join([*lines, *([f"\nIn all {_figure(hours)} hours (planned)."] if self.card is not None else [])])
+        if self.card is not None:
+            lines += ["", f"In all {_figure(hours)} hours (planned).", *self._speeds(rollouts)]
+        return "\n".join(lines)
+
+    def _speeds(self, rollouts: Iterable[BlockCost]) -> list[str]:
+        if self.card is None or not (costs := list(rollouts)):
+            return []
+        speed = UTILISATION * CARDS[self.card].operations
+        lines = ["", "| rollout | TFLOP a block | frames a second | with a small decoder |", "|---|---|---|---|"]
+        for cost in costs:
+            parts = f"model {cost.sampling / 1e12:.3g}, decoder {cost.decoding / 1e12:.3g}, small {cost.small_decoding / 1e12:.2g}"
+            own, small = (_figure(cost.frames_per_second(speed, small=small)) for small in (False, True))
+            shown = "1 view" if cost.views == 1 else f"{cost.views} views"
+            lines.append(f"| {shown}, blocks of {cost.frames} frames | {parts} | {own} | {small} |")
+        return lines
 
     def _times(self, row: Estimate) -> tuple[float | None, float | None]:
         """Planned seconds of a step, and hours of the stage; None where they cannot be said."""
@@ -144,6 +175,10 @@ class SizeSheet(StrictModel):
         if row.minutes is not None:
             return seconds, row.minutes / 60
         return seconds, None if seconds is None or row.steps is None else seconds * row.steps / 3600
+
+
+def _processes() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(len(os.sched_getaffinity(0)), multiprocessing.get_context("fork"))
 
 
 def _figure(value: float | None) -> str:
