@@ -1,0 +1,102 @@
+"""Rollouts of a preset's distilled model on one card, with random weights, beside what is planned and the floor.
+
+    python -m benchmarks.full_size --preset edge-24gb [--device cuda] [--blocks 8] [--compile]
+
+Blocks in bfloat16 after the window is full, one sampled while the one before is decoded (on a GPU), in one view and in all: with the shape
+of the published autoencoder, or a small decoder. Peak memory is that of the rollout. The floor is the operations at the card's whole
+dense speed; the plan counts on a share of it. Without `--device cuda` the same runs on the processor, for presets that are small enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import torch
+
+from benchmarks.harness import command_line, print_table, timed
+from worldline_core.distillation.distill_config import DistillConfig
+from worldline_core.model.networks import build_world_model
+from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig
+from worldline_core.model.tokenizers import VideoTokenizer, require_device, tokenizer_outline
+from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.pipeline.cards import CARDS, UTILISATION, find_card
+from worldline_core.pipeline.memory_estimate import Sources, to_bfloat16
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.rollout_speed import block_costs
+from worldline_core.pipeline.size_sheet import SizeSheet
+from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
+from worldline_core.rollout.simulation import Session
+from worldline_core.training.stage2 import stage2_model_config
+
+
+def measured(
+    distilled: DistillConfig, config: WorldModelConfig, source: Sources, views: Sequence[str], *, small: bool, device: str,
+    blocks: int, compiled: bool,
+) -> tuple[float, float]:  # fmt: skip
+    """Seconds a block, and peak memory [GB]; 0 on a processor, where it is not known."""
+    spec = distilled.spec
+    with torch.device(device):
+        model = build_world_model(config).eval().requires_grad_(False)
+        tokenizer: VideoTokenizer = tokenizer_outline(source.tokenizer)
+        if small:
+            tokenizer = SmallDecoder(SmallDecoderConfig.of(tokenizer, ""), tokenizer)
+        images = torch.rand(1, len(views), 3, *source.image_size) * 2 - 1
+        drawn = source.grid if config.takes_maps else (1, 1)
+        maps = torch.rand(1, len(views), config.control_channels, 1 + spec.block_size, *drawn)
+    to_bfloat16(model)
+    if compiled:
+        model.compile_blocks()
+    sampler = BlockCausalSimulator(model, spec, noise=Noise([0]), views=views, bfloat16=True)
+    session = Session(sampler, tokenizer, images, device=device, bfloat16=True)
+    window = spec.sink_blocks + spec.recent_blocks
+    list(session.steps([maps] * window))
+    on_gpu = torch.device(device).type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats()
+    _, seconds, _ = timed(lambda: list(session.steps([maps] * blocks)))
+    return seconds / blocks, torch.cuda.max_memory_allocated() / 1e9 if on_gpu else 0.0
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("--preset", default="edge-24gb")
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--card", help="whose speed is the floor (default: the preset's)")
+    parser.add_argument("--blocks", type=int, default=8)
+    parser.add_argument("--compile", action="store_true", help="torch.compile of each layer but its attention")
+    arguments = parser.parse_args()
+    require_device(arguments.device)
+    config = PipelineConfig.load(arguments.preset)
+    if config.distill is None or config.train_stage2 is None:
+        raise SystemExit(f"{arguments.preset} distils nothing")
+    distilled = config.distill
+    card = find_card(arguments.card or config.card or "H100")
+    sheet = SizeSheet.model_validate({"config": config, "project": Path.cwd(), "card": card})
+    model, source = stage2_model_config(config.train_stage2, sheet.model), sheet.source(distilled)
+    views = tuple(distilled.views)
+    view_sets = list(dict.fromkeys((views[:1], views)))
+    with ThreadPoolExecutor(1) as pool:
+        costs = dict(zip(view_sets, block_costs(distilled, model, source, view_sets, pool)(), strict=True))
+
+    def rows() -> Iterator[Sequence[object]]:
+        for shown, cost in costs.items():
+            for small in (False, True):
+                seconds, peak = measured(
+                    distilled, model, source, shown, small=small, device=arguments.device, blocks=arguments.blocks,
+                    compiled=arguments.compile,
+                )  # fmt: skip
+                floor = cost.frames_per_second(CARDS[card].operations, small=small)
+                yield (
+                    len(shown), "small" if small else "autoencoder", cost.frames / seconds, UTILISATION * floor, floor,
+                    cost.frames / seconds / floor, peak,
+                )  # fmt: skip
+
+    name = torch.cuda.get_device_name() if arguments.device.startswith("cuda") else "a processor"
+    print(f"{arguments.preset} on {name}, floor of {card}")
+    print_table(("views", "decoder", "frames a second", "planned", "floor", "share of the floor", "peak GB"), rows())
+
+
+if __name__ == "__main__":
+    main()
