@@ -11,6 +11,7 @@ import atexit
 import os
 import pickle
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
 from multiprocessing.util import get_temp_dir
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from typing import Any
 
 from pydantic import Field
@@ -91,9 +92,7 @@ class _Reader:
     def __init__(self) -> None:
         self.used = False
         self.environment = _environment()
-        self._folder = TemporaryDirectory(
-            prefix="worldline-reader-", dir=get_temp_dir()
-        )  # for its copies of remote files
+        self._folder = mkdtemp(prefix="worldline-reader-", dir=get_temp_dir())  # for its copies of remote files
         self._connection, there = Pipe()
         with there:
             # Not multiprocessing: that imports the program's main module again, and allows no children of daemons.
@@ -107,7 +106,7 @@ class _Reader:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[there.fileno()],
-                env={**self.environment, **dict.fromkeys(_THREADS, "1"), "TMPDIR": self._folder.name},
+                env={**self.environment, **dict.fromkeys(_THREADS, "1"), "TMPDIR": self._folder},
             )
         try:
             self._connection.recv_bytes()
@@ -157,7 +156,7 @@ class _Reader:
         self._process.kill()
         self._process.wait()
         self._connection.close()
-        self._folder.cleanup()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
 
 # Appending and popping are atomic: threads need no lock. A forked process has no readers of its own.
