@@ -104,11 +104,11 @@ def check_card(config: PipelineConfig, file: Path, memory: str) -> None:
 
     require_device("cuda")
     card = {"config": config, "project": Path.cwd(), "memory": card_memory(memory)}
-    rows = SizeSheet.model_validate(card).rows()
-    if too_large := [row.title for row, setting in rows if setting]:
+    sheet = SizeSheet.model_validate(card)
+    if too_large := [row.title for row in sheet.rows() if not row.fits(sheet.bytes)]:
         raise ConfigError(
             "A training does not fit this card", where="--gpu", expected=memory, got=", ".join(too_large),
-            next_step=f"worldline plan --config {file} --gpus 1 --memory {memory}",
+            next_step=f"worldline plan --config {file} --fit --gpus 1 --memory {memory}",
         )  # fmt: skip
 
 

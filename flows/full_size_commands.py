@@ -16,7 +16,7 @@ def add_plan_command(commands: argparse._SubParsersAction[argparse.ArgumentParse
     """Add the command to the parser of the whole command line."""
     plan = commands.add_parser(
         "plan",
-        help="memory that every stage of a preset takes, planned hours, and the setting that would fit",
+        help="memory that every stage of a preset takes, and planned hours",
         description="Memory a device of every stage and, of a card that is known, planned seconds, hours and frames a second, from the configuration"
         " alone; nothing is loaded. Exit status: 0 everything fits, 1 something does not.",
     )
@@ -55,7 +55,7 @@ def _plan(arguments: argparse.Namespace) -> None:
         sheet = sheet.model_copy(update={"config": load(changes)})
     rows, rollouts = sheet.rows_and_rollouts()
     print(sheet.as_text(rows, rollouts))
-    raise SystemExit(0 if not any(setting for _, setting in rows) else 1)
+    raise SystemExit(0 if all(row.fits(sheet.bytes) for row in rows) else 1)
 
 
 def add_rehearse_command(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -25,7 +25,7 @@ from worldline_core.distillation.distribution_matching import DistributionMatchi
 from worldline_core.distillation.teacher_trajectories import TrajectoryBatch, teacher_trajectories
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.errors import ConfigError
-from worldline_core.model.checkpoint import SINGLE_PRECISION, read_checkpoint_info
+from worldline_core.model.checkpoint import read_checkpoint_info
 from worldline_core.model.lpips import LPIPS
 from worldline_core.model.mixture import is_text_parameter
 from worldline_core.model.networks import build_world_model
@@ -61,14 +61,6 @@ USABLE = 0.92
 AnyStage = Stage1Config | Stage2Config | DistillConfig
 
 
-def to_bfloat16(model: nn.Module) -> None:
-    """Give a model weights in bfloat16, except those that stay in float32, as sharded trainings and rollouts have them."""
-    for name, module in model.named_modules():
-        for key, value in list(module.named_parameters(recurse=False)):
-            if not f"{name}.".startswith(SINGLE_PRECISION):
-                module.register_parameter(key, nn.Parameter(value.detach().bfloat16(), value.requires_grad))
-
-
 def gigabytes(size: float) -> str:
     """Bytes as GB (10^9), short enough for a table."""
     value = size / 1e9
@@ -96,12 +88,14 @@ class Sources:
         """An uninitialised batch of clips of so many recorded frames, with maps, or with ``text`` tokens for each clip."""
         size, count = (clips, len(views)), latent_frame_count(frames)
         drawn = self.grid if model.takes_maps else (1, 1)
+        embedded = (model.text_size,) if isinstance(model, WanConfig) else ()  # in place of ids
+        texts = torch.zeros(clips, text, *embedded, dtype=torch.float32 if embedded else torch.long)
         return Batch(
             (Clip("", 0, frames, 1),) * clips,
             tuple(views),
             torch.empty(*size, model.latent_channels, count, *self.grid),
             None if text else torch.empty(*size, model.control_channels, count, *drawn),
-            _text(model, clips, text) if text else None,
+            texts if text else None,
             torch.ones(clips, text, dtype=torch.bool) if text else None,
         )
 
@@ -127,12 +121,6 @@ class Sources:
         with FakeTensorMode(), torch.no_grad(), autocast(TrainerConfig(steps=1, precision=precision)):
             look = teacher_outline(self.teacher)[1] if by == "teacher" else tokenizer_outline(self.tokenizer).encode
             return traced(lambda: look(torch.empty(views, 3, frames, *self.image_size)))
-
-
-def _text(model: WorldModelConfig, clips: int, tokens: int) -> Tensor:
-    """Texts as the model takes them: ids, or embeddings."""
-    sizes = (model.text_size,) if isinstance(model, WanConfig) else ()
-    return torch.zeros(clips, tokens, *sizes, dtype=torch.float32 if sizes else torch.long)
 
 
 @dataclass(frozen=True)
@@ -179,23 +167,12 @@ class Work(NamedTuple):
     whole: Mapping[str, nn.Module] = {}
 
 
-def whole_bytes(models: Mapping[str, nn.Module]) -> dict[str, float]:
-    """Bytes of weights and buffers."""
-    return {name: sum(value.nbytes for value in one.state_dict().values()) for name, one in models.items()}
-
-
 def adapted(config: WorldModelConfig, lora: LoRAConfig) -> WorldModel:
     """A model with adapters, made within a FakeTensorMode; peft, which moves them from device to device, does so outside of it."""
     with unset_fake_temporarily(), torch.device("meta"):
         model = build_world_model(config)
         add_adapters(model, lora, 0)
-    for module in model.modules():
-        for name, value in list(module.named_parameters(recurse=False)):
-            empty = torch.empty(value.shape, dtype=value.dtype)
-            module.register_parameter(name, nn.Parameter(empty, value.requires_grad))
-        for name, value in list(module.named_buffers(recurse=False)):
-            module.register_buffer(name, torch.empty(value.shape, dtype=value.dtype))
-    return model
+    return model._apply(lambda one: torch.empty(one.shape, dtype=one.dtype))
 
 
 def _new_bytes(model: nn.Module, seen: set[int]) -> float:
@@ -221,7 +198,6 @@ class Training:
         trained: whether a parameter gets gradients, by its name.
         turns: numbers of steps, one of each kind that the training takes (distribution matching alternates), and their shares.
         before: what is done before a step's forward pass, and how often: clips are encoded, a teacher looks at them.
-        smaller: the only setting with which it takes less; by default devices and checkpointing are proposed.
     """
 
     title: str
@@ -232,37 +208,33 @@ class Training:
     lora: LoRAConfig | None = None
     turns: Mapping[int, float] = field(default_factory=lambda: {0: 1.0})
     before: Sequence[tuple[int, Callable[[], Held]]] = ()
-    smaller: str = ""
 
-    def outline(self, layers: int) -> Work:
-        """The step of a model of so many layers; call it within a FakeTensorMode."""
+    def outline(self, layers: int, weights: Literal["fp32", "bf16"] | None = None) -> Work:
+        """The step of a model of so many layers; call it within a FakeTensorMode.
+
+        Args:
+            weights: those of trained matrices as a device computes with them; None: all in float32, as shards are kept.
+        """
         network = build_world_model(self.model.model_copy(update={"num_layers": layers}))
         for name, parameter in network.named_parameters():
             parameter.requires_grad_(self.trained(name))
-        return self.work(network if self.lora is None else adapted(network.config, self.lora))
-
-    def _placed(self, layers: int, sharded: bool) -> Work:
-        """The step's models with weights as a device computes with them."""
-        work, trainer = self.outline(layers), self.trainer
-        for one in (*work.models, *work.scores):
-            if not sharded:
-                hold_weights(one, trainer.precision, trainer.weights)
-            elif trainer.precision == "bf16":
-                to_bfloat16(one)
-        if self.lora is not None and len(work.models) > 1:
-            share_frozen(work.models[1], work.scores[0])
+        work = self.work(network if self.lora is None else adapted(network.config, self.lora))
+        if weights is not None:
+            for one in (*work.models, *work.scores):
+                hold_weights(one, self.trainer.precision, weights)
+            if self.lora is not None and len(work.models) > 1:
+                share_frozen(work.models[1], work.scores[0])
         return work
 
-    @cache  # noqa: B019 - a few trainings a process
-    def _held(self, sharded: bool, block: bool) -> Held:
+    def _held(self, sharded: bool) -> Held:
         """A micro-step; its operations are a mean over the kinds of steps."""
         trainer = self.trainer.model_copy(update={"device": "cpu"})  # tensors without values follow a CPU's paths
 
         def trace(step: int, layers: int) -> Held:
             with FakeTensorMode():
-                work = self._placed(layers, sharded)
+                work = self.outline(layers, "bf16" if sharded else trainer.weights)
                 for one in (*work.models, *work.scores):
-                    one.checkpointing = "block" if block else "none"
+                    one.checkpointing = trainer.sharding.checkpointing
 
                 def loss() -> Tensor:
                     with autocast(trainer):
@@ -276,14 +248,13 @@ class Training:
         operations = sum(share * steps[step].operations for step, share in self.turns.items())
         return Held(most, 0, operations + sum(times * held.operations for times, held in before))
 
-    @cache  # noqa: B019 - a few trainings a process
     def _parts(self, shards: int) -> tuple[dict[str, float], int, int]:
         """Bytes of weights, and what comes with them, at all layers; bytes of gradients when they are whole; trained parameters."""
-        trainer, alone = self.trainer, shards == 1
+        trainer = self.trainer
 
         def parts(layers: int) -> dict[str, float]:
             with FakeTensorMode():
-                work = self._placed(layers, sharded=not alone) if alone else self.outline(layers)
+                work = self.outline(layers, trainer.weights if shards == 1 else None)
             seen: set[int] = set()
             scores = sum(_new_bytes(score, seen) for score in work.scores)
             trained = [[value for value in model.parameters() if value.requires_grad] for model in work.models]
@@ -291,7 +262,7 @@ class Training:
                 "weights": sum(_new_bytes(model, seen) for model in work.models) / shards,
                 "moments": sum(_moment_bytes(value, trainer) for values in trained for value in values) / shards,
                 "average": (trainer.average == "device") * sum(4 * value.numel() for value in trained[0]) / shards,
-                **whole_bytes(work.whole),
+                **{name: sum(value.nbytes for value in one.state_dict().values()) for name, one in work.whole.items()},
                 "frozen scores": scores / shards,
                 "gradients": max(sum(value.nbytes for value in values) for values in trained),
                 "trained": sum(value.numel() for values in trained for value in values)
@@ -303,16 +274,12 @@ class Training:
         line = {name: size + (two[name] - size) * (self.model.num_layers - 1) for name, size in one.items()}
         return line, round(line.pop("trained")), round(line.pop("block"))
 
-    def micro_steps(self, devices: int) -> int:
-        """Micro-steps of a step on each of so many devices."""
-        whole, batch = self.trainer.global_batch, self.trainer.batch_size
-        return self.trainer.accumulation if whole is None else -(-whole // (batch * devices))
-
-    def estimate(self, devices: int, sharding: ShardingConfig | None = None) -> Estimate:
-        """Memory on each of so many devices that share the training, as it is configured or with another sharding."""
-        trainer, sharding = self.trainer, sharding or self.trainer.sharding
-        shards, micro_steps = min(sharding.shards or devices, devices), self.micro_steps(devices)
-        held = self._held(sharded=shards > 1, block=sharding.checkpointing == "block")
+    def estimate(self, devices: int) -> Estimate:
+        """Memory on each of so many devices that share the training."""
+        trainer, sharding = self.trainer, self.trainer.sharding
+        shards, clips = min(sharding.shards or devices, devices), trainer.batch_size * devices
+        micro_steps = trainer.accumulation if trainer.global_batch is None else -(-trainer.global_batch // clips)
+        held = self._held(sharded=shards > 1)
         sizes, trained, block = self._parts(shards)
         summed = micro_steps == 1 or sharding.reduce_every_micro_step
         parts = {
@@ -325,20 +292,6 @@ class Training:
         operations = micro_steps * held.operations if trainer.precision == "bf16" else None
         parts = {name: size for name, size in parts.items() if size}
         return Estimate(self.title, trained, parts, operations, trainer.steps, trainer.minutes)
-
-    def row(self, devices: int, memory: float) -> tuple[Estimate, str]:
-        """A line of the sheet: what the training takes, and the nearest setting with which it would fit devices of ``memory`` bytes;
-        empty where it does."""
-        need = self.estimate(devices)
-        return need, "" if need.fits(memory) else self.smaller or self._fitting_setting(devices, memory)
-
-    def _fitting_setting(self, devices: int, memory: float) -> str:
-        block = ShardingConfig(checkpointing="block", reduce_every_micro_step=True)
-        for count in (devices * 2**power for power in range(11)):
-            if (need := self.estimate(count, block)).fits(memory):
-                several = "" if count == 1 else f", reduce_every_micro_step: true, on {count} devices"
-                return f"trainer.sharding.checkpointing: block{several} ({gigabytes(need.total)} GB a device)"
-        return "shorter clips, devices of more memory, or a smaller model"
 
 
 class _Similarities(ClipSimilarities):
@@ -434,7 +387,8 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
         if config.lpips_weights is not None:
             decoder, lpips = tokenizer_outline(source.tokenizer), LPIPS().requires_grad_(False)
             if config.perceptual.bfloat16:
-                to_bfloat16(decoder)
+                for parameter in decoder.parameters():
+                    parameter.data = parameter.data.bfloat16()
             whole |= {"tokenizer": decoder, "lpips": lpips}
             compared = 1 + config.perceptual.latent_frames
             perceptual = PerceptualLoss(decoder, lpips, config.perceptual.latent_frames)
@@ -482,7 +436,6 @@ def _trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: So
         f"distill: trajectories (a shard of {clips} clips)", trainer, model, work, trained=lambda _: False,
         # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
         turns={0: (1 + sum(steps.substeps)) / (1 + config.spec.steps)}, before=[encoded] if frames else [],
-        smaller="fewer clips_per_shard",
     )  # fmt: skip
 
 
@@ -505,14 +458,14 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
     if isinstance(config, Stage2Config):
         model = stage2_model_config(config, model)
     for training in trainings(config, model, source):
-        need, setting = training.row(int(os.environ.get("WORLD_SIZE", "1")), memory)
-        if setting:
+        need = training.estimate(int(os.environ.get("WORLD_SIZE", "1")))
+        if not need.fits(memory):
             raise ConfigError(
                 "This training does not fit the device's memory.",
                 where=f"{need.title} on {device}",
                 expected=f"at most {gigabytes(USABLE * memory)} GB",
                 got=f"{gigabytes(need.total)} GB ({need.describe_parts()})",
-                next_step=f"set {setting}; `worldline plan` shows every stage",
+                next_step="take more devices or what `worldline plan --fit` proposes, first trainer.sharding.checkpointing: block",
             )
 
 

@@ -23,9 +23,6 @@ from worldline_core.shipped import project_path
 from worldline_core.training.clip_config import FrameInput
 from worldline_core.training.stage2 import stage2_model_config
 
-Row = tuple[Estimate, str]
-"""Memory of a training, and the setting with which it would fit; empty if it fits as it is."""
-
 
 class SizeSheet(StrictModel):
     """The trainings of one preset on so many devices of one kind.
@@ -90,31 +87,31 @@ class SizeSheet(StrictModel):
         given = ((stage, model) for stage, model in stages if stage is not None)
         return [training for stage, model in given for training in trainings(stage, model, self.source(stage))]
 
-    def row(self, number: int) -> Row:
+    def row(self, number: int) -> Estimate:
         """One line of the sheet."""
-        return self._trainings()[number].row(self.devices, self.bytes)
+        return self._trainings()[number].estimate(self.devices)
 
-    def _finished(self, pool: Executor) -> Iterator[tuple[int, Row]]:
+    def _finished(self, pool: Executor) -> Iterator[tuple[int, Estimate]]:
         """Lines by their numbers as they are done; those that take longest are begun first."""
         numbers = range(len(self._trainings()))
         waiting = {pool.submit(self.row, number): number for number in reversed(numbers)}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
 
-    def rows(self) -> list[Row]:
-        """Memory of every training in the order of a run, and the setting with which it would fit."""
+    def rows(self) -> list[Estimate]:
+        """Memory of every training in the order of a run."""
         with _processes() as pool:
             return self._rows(pool)
 
-    def _rows(self, pool: Executor) -> list[Row]:
-        made: dict[int, Row] = {}
+    def _rows(self, pool: Executor) -> list[Estimate]:
+        made: dict[int, Estimate] = {}
         with Progress("worldline plan", len(self._trainings()), "training") as progress:
             for number, row in self._finished(pool):
                 made[number] = row
                 progress.advance()
         return [made[number] for number in sorted(made)]
 
-    def rows_and_rollouts(self) -> tuple[list[Row], list[BlockCost]]:
+    def rows_and_rollouts(self) -> tuple[list[Estimate], list[BlockCost]]:
         """The same, and blocks of the distilled model in one view and in all; none where nothing is distilled."""
         config, views = self.config, () if self.config.distill is None else tuple(self.config.distill.views)
         with _processes() as pool:
@@ -129,12 +126,12 @@ class SizeSheet(StrictModel):
         """Returns whether every training fits; the first one that does not ends the work."""
         with _processes() as pool:
             try:
-                return all(not setting for _, (_, setting) in self._finished(pool))
+                return all(row.fits(self.bytes) for _, row in self._finished(pool))
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
 
-    def as_text(self, rows: Iterable[Row], rollouts: Iterable[BlockCost] = ()) -> str:
-        """The sheet as a Markdown table, whose last column names the setting with which a stage would fit; then the rollouts."""
+    def as_text(self, rows: Iterable[Estimate], rollouts: Iterable[BlockCost] = ()) -> str:
+        """The sheet as a Markdown table; then the rollouts."""
         devices = "1 device" if self.devices == 1 else f"{self.devices} devices"
         lines = [f"{devices} of {gigabytes(self.bytes)} GB ({USABLE:.0%} of it usable)"]
         if self.card is not None:
@@ -144,9 +141,9 @@ class SizeSheet(StrictModel):
         lines += ["", f"| stage | parameters | GB a device | of that |{timed} fits |"]
         lines.append("|---" * (lines[-1].count("|") - 1) + "|")
         hours = 0.0
-        for row, setting in rows:
+        for row in rows:
             count = f"{row.parameters / 1e9:.2f} G" if row.parameters >= 1e9 else f"{row.parameters / 1e6:.1f} M"
-            fits = f"no: set {setting}" if setting else "yes"
+            fits = "yes" if row.fits(self.bytes) else "no"
             if self.card is not None:
                 seconds, taken = self._times(row)
                 hours += taken or 0
