@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ SIGMA = 40.0
 def trainer(steps, **changes):
     return {
         "steps": steps, "batch_size": 2, "precision": "fp32", "log_every": 6, "validation_batches": 1,
-        "save_every_seconds": 3600, "save_every_steps": 2, "optimizer": {"learning_rate": 1e-3, "warmup_steps": 2},
+        "save_every_seconds": 3600, "optimizer": {"learning_rate": 1e-3, "warmup_steps": 2},
         **changes,
     }  # fmt: skip
 
@@ -46,9 +47,16 @@ def write_inputs(root, make_model, make_contract):
     return folders
 
 
+@pytest.fixture(scope="session")
+def written(tmp_path_factory, make_model, make_contract):
+    return write_inputs(tmp_path_factory.mktemp("written"), make_model, make_contract)
+
+
 @pytest.fixture
-def inputs(tmp_path, make_model, make_contract):
-    return write_inputs(tmp_path, make_model, make_contract)
+def inputs(tmp_path, written):
+    """Copies, which a test may change."""
+    shutil.copytree(written["episodes"].parent, tmp_path, dirs_exist_ok=True)
+    return {name: tmp_path / name for name in written}
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from flows.pipeline import chain
 from tasks.execution.chain import outline
-from tests.distillation.conftest import SIGMA, trainer, write_inputs
+from tests.distillation.conftest import SIGMA, trainer
 from tests.rollout.conftest import SIZE, mixed_views, small_model
 from tests.training.conftest import FRAME_INPUT, stage1, stage2, write_tokenizer
 from worldline_core.actions.episode_tracks import ActionTracks, write_index
@@ -48,14 +48,16 @@ from worldline_core.training.encode_latents import encode_latents
 from worldline_core.training.stage1 import train_stage1
 from worldline_core.training.stage2 import train_stage2
 
+SAVING = {"save_every_steps": 2}
+
 
 def config(**changes):
     forcing = {"history_noise": 0.1, "view_weights": {"joint": 1.0, "head": 1.0}, "single_view_factor": 2}
     trajectories = {"clips": 4, "clips_per_shard": 2, "substeps": [1, 1, 1, 2]}
     return DistillConfig.model_validate({
-        "clips": {"lengths": [17]}, "block_size": 2, "teacher_forcing": {"trainer": trainer(3), **forcing},
-        "trajectory_regression": {"trainer": trainer(3), "trajectories": trajectories},
-        "distribution_matching": {"trainer": trainer(12)}, **changes,
+        "clips": {"lengths": [17]}, "block_size": 2, "teacher_forcing": {"trainer": trainer(3, **SAVING), **forcing},
+        "trajectory_regression": {"trainer": trainer(3, **SAVING), "trajectories": trajectories},
+        "distribution_matching": {"trainer": trainer(12, **SAVING)}, **changes,
     })  # fmt: skip
 
 
@@ -77,10 +79,9 @@ class Finished:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, make_model, make_contract):
-    inputs = write_inputs(tmp_path_factory.mktemp("inputs"), make_model, make_contract)
+def finished(tmp_path_factory, written):
     output = tmp_path_factory.mktemp("finished") / "out"
-    return Finished(inputs, output, distill(config(), inputs, output))
+    return Finished(written, output, distill(config(), written, output))
 
 
 def test_three_steps_give_a_causal_checkpoint(finished, monkeypatch):
