@@ -62,10 +62,16 @@ def images() -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="session")
-def healthy() -> list:
-    """One episode of each robot of the test splits."""
+def healthy_episodes() -> list:
+    """Every fourth episode of the test splits."""
+    return list(benchmark.healthy(benchmark.RECORDINGS, {"test", "ood_test"}, 4))
+
+
+@pytest.fixture(scope="session")
+def healthy(healthy_episodes: list) -> list:
+    """One of these of each robot."""
     found: dict[str, object] = {}
-    for item in benchmark.healthy(benchmark.RECORDINGS, {"test", "ood_test"}, 4):
+    for item in healthy_episodes:
         found.setdefault(item.joints.embodiment, item)
     return list(found.values())
 
