@@ -22,7 +22,7 @@ SMALL = (
     "distill.clips={lengths: [17]}", "distill.distribution_matching.trainer.steps=2",
     "distill.distribution_matching.trainer.log_every=2",
     "curate.sources=[{kind: episode_set, path: artifacts/shipped/recordings, name: shipped, include: ["
-    "ur5e_silver-test-s1-00000, ur5e_silver-train-s1-00000, ur5e_silver-train-s1-00001]}]",
+    "ur5e_silver-test-s1-00000, ur5e_silver-train-s1-00000]}]",
 )  # fmt: skip
 WANTED = (
     "curate", "filter", "render_actions", "train_tokenizer", "encode_latents", "train_stage1", "train_stage2", "distill",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import threading
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -37,11 +38,16 @@ def declare(root: Path, **changes: Any) -> None:
     (root / "sources.json").write_text(json.dumps([row]))
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    root = make_set(tmp_path / "set")
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = make_set(tmp_path_factory.mktemp("made") / "set")
     declare(root)
     return root
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(made, tmp_path / "set")
 
 
 def test_a_set_comes_back_to_the_byte_with_its_card(hub: Any, folder: Path, tmp_path: Path) -> None:

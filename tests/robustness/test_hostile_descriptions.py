@@ -25,8 +25,8 @@ def bomb(levels: int, one: Callable[[str], str]) -> str:
 YAML = {
     "aliases": bomb(12, lambda name: "[" + ", ".join([name] * 10) + "]"),
     "aliases in mappings": bomb(12, lambda name: "{" + ", ".join(f"k{i}: {name}" for i in range(10)) + "}"),
-    "an alias of itself": "a: &a [*a]\n", "deep lists": "a: " + "[" * 2000 + "]" * 2000,
-    "deep mappings": "a: " + "{a: " * 2000 + "1" + "}" * 2000, "a key twice": "a: 1\na: 2\n",
+    "an alias of itself": "a: &a [*a]\n", "deep lists": "a: " + "[" * 600 + "]" * 600,
+    "deep mappings": "a: " + "{a: " * 600 + "1" + "}" * 600, "a key twice": "a: 1\na: 2\n",
     "a python object": "a: !!python/object/apply:os.system ['touch harmed']\n", "no date": "a: 2001-99-99\n",
     "no integer": "a: !!int x\n", "no number": "a: !!float x\n", "no time": "a: !!timestamp x\n", "no truth": "a: !!bool maybe\n",
     "an integer of 5000 digits": "a: " + "9" * 5000 + "\n", "a list as a key": "? [a]\n: 1\n",

@@ -58,8 +58,8 @@ def flipped(path: Path, position: int, bit: int) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> dict[str, Path]:
-    """A curated and a filtered set of two recordings."""
-    recordings = 'curate.sources=[{kind: episode_set, path: artifacts/shipped/recordings, name: shipped, include: ["viperx_pearl-train-s1-00001", "ur5e_silver-test-s1-00000"]}]'  # fmt: skip
+    """A curated and a filtered set of one recording."""
+    recordings = "curate.sources=[{kind: episode_set, path: artifacts/shipped/recordings, name: shipped, include: [ur5e_silver-test-s1-00000]}]"  # fmt: skip
     calls = outline(chain, load_config(PipelineConfig, preset="smoke", overrides=[recordings]))
     store = ArtifactStore(tmp_path_factory.mktemp("store"))
     made = {}
