@@ -20,7 +20,8 @@ from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.model.tokenizers import PatchTokenizer, PatchTokenizerConfig
 from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.training.clip_source import LatentRow, group_key, single_key
+from worldline_core.training.clip_sampler import ClipRow
+from worldline_core.training.clip_source import latent_key
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.trainer import TrainingRun
 from worldline_core.training.training_config import Stage1Config, Stage2Config, TeacherConfig
@@ -97,10 +98,10 @@ def write_latents(root, count, validation, frames=FRAMES):
     for number, (name, split) in enumerate(names_of(count, validation).items()):
         pictures = np.stack([picture(number, frame) for frame in range(frames)], 1)
         latents = torch.from_numpy(np.stack([pictures] * 3)).half()
-        tensors[single_key(name)] = latents[:, :, ::4].contiguous()
-        tensors[group_key(name, 1, 1)] = latents[:, :, 4::4].contiguous()
+        tensors[latent_key(name, "single")] = latents[:, :, ::4].contiguous()
+        tensors[latent_key(name, "groups", 1, 1)] = latents[:, :, 4::4].contiguous()
         facts = (split, f"move {number}", "head", "00000.safetensors")
-        rows.append(vars(LatentRow(name, frames, VIEWS, "synthetic", "square", *facts)) | {"views": list(VIEWS)})
+        rows.append(vars(ClipRow(name, frames, VIEWS, "synthetic", "square", *facts)) | {"views": list(VIEWS)})
     save_file(tensors, root / "00000.safetensors")
     pq.write_table(pa.Table.from_pylist(rows), root / "index.parquet")
     description = {

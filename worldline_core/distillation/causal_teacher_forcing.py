@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from worldline_core.actions.action_maps import latent_frame_indices
 from worldline_core.distillation.causal_objective import (
     CausalObjective,
     block_sigmas,
@@ -27,7 +28,6 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.rollout.samplers import euler_step
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.clip_sampler import latent_frame_count
 from worldline_core.training.flow_matching import add_noise, flow_matching_loss
 from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
@@ -70,7 +70,7 @@ class TeacherForcingObjective(CausalObjective[Batch]):
         """Target of the blocks: the recording, in part what the teacher predicts in one step from this noise."""
         latents, settings = batch.latents, self.settings
         longest = settings.teacher_frames
-        if self.teacher is None or (longest is not None and latents.shape[3] > latent_frame_count(longest)):
+        if self.teacher is None or (longest is not None and latents.shape[3] > len(latent_frame_indices(longest))):
             return latents
         first = latents[..., :1, :, :]
         state = with_observed_frame(first, noise[..., 1:, :, :])

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode, unset_fake_temporarily
 
+from worldline_core.actions.action_maps import latent_frame_indices
 from worldline_core.config import StrictModel
 from worldline_core.distillation.auxiliary_losses import PerceptualLoss
 from worldline_core.distillation.causal_objective import maps_of
@@ -36,7 +37,7 @@ from worldline_core.pipeline.memory_trace import Held, extrapolated, traced
 from worldline_core.training.adapters import add_adapters, share_frozen
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.clip_sampler import Clip, latent_frame_count
+from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.optimizers import BLOCK, in_eight_bits
@@ -86,7 +87,7 @@ class Sources:
 
     def batch(self, model: WorldModelConfig, clips: int, views: Sequence[str], frames: int, text: int = 0) -> Batch:
         """An uninitialised batch of clips of so many recorded frames, with maps, or with ``text`` tokens for each clip."""
-        size, count = (clips, len(views)), latent_frame_count(frames)
+        size, count = (clips, len(views)), len(latent_frame_indices(frames))
         drawn = self.grid if model.takes_maps else (1, 1)
         embedded = (model.text_size,) if isinstance(model, WanConfig) else ()  # in place of ids
         texts = torch.zeros(clips, text, *embedded, dtype=torch.float32 if embedded else torch.long)

@@ -57,7 +57,10 @@ class ClipBatch:
 
 @dataclass(frozen=True)
 class ClipRow:
-    """One episode (or kept segment) that clips are drawn from. ``num_frames`` counts the frames with images."""
+    """One episode (or kept segment) that clips are drawn from.
+
+    ``num_frames`` counts the frames with images; ``shard`` is the file of its cached latents.
+    """
 
     episode_id: str
     num_frames: int
@@ -67,30 +70,18 @@ class ClipRow:
     split: str
     instruction: str
     primary_view: str
+    shard: str = ""
 
     @classmethod
-    def from_episode(cls, row: EpisodeRow, views: Sequence[str], **more: Any) -> Self:
+    def from_episode(cls, row: EpisodeRow, views: Sequence[str], shard: str = "") -> Self:
         """A row for those views of an episode that clips have."""
         copied = ("episode_id", "source", "embodiment", "split", "instruction", "primary_view")
         named = {name: getattr(row, name) for name in copied}
-        return cls(num_frames=row.video_frames, views=tuple(views), **named, **more)
+        return cls(num_frames=row.video_frames, views=tuple(views), shard=shard, **named)
 
     def identity(self) -> list[Any]:
         """JSON values that clips are drawn by: two runs whose rows differ here train on other clips."""
         return [self.episode_id, self.num_frames, list(self.views), self.source, self.split, self.instruction]
-
-
-def latent_frame_count(num_frames: int) -> int:
-    """T_l = 1 + (T - 1) / 4 (docs/method.md section 2).
-
-    Raises:
-        DataError: if ``num_frames`` is not one more than a multiple of four.
-    """
-    if num_frames < 1 or (num_frames - 1) % TEMPORAL_FACTOR:
-        raise DataError(
-            "A clip has a length that the causal tokenizer cannot encode.", expected="4 k + 1 frames", got=num_frames
-        )
-    return 1 + (num_frames - 1) // TEMPORAL_FACTOR
 
 
 def longest_clip(num_frames: int, start: int, stride: int) -> int:

@@ -22,6 +22,7 @@ from jaxtyping import Float, Shaped, UInt8
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from worldline_core.actions.action_maps import latent_frame_indices
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import EpisodeRow
@@ -39,7 +40,7 @@ from worldline_core.model.tokenizers import (
 from worldline_core.progress import with_progress
 from worldline_core.store.artifact_files import read_json, read_rows
 from worldline_core.training.clip_config import ClipInput, FrameInput
-from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipRow, latent_frame_count, longest_clip
+from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipRow, longest_clip
 
 logger = logging.getLogger(__name__)
 
@@ -115,26 +116,13 @@ class ClipSource(ABC):
         """Latents (float32) of clips that were read, on ``device``."""
 
 
-@dataclass(frozen=True)
-class LatentRow(ClipRow):
-    """One episode of a latent store. A start frame is a multiple of the store's ``start_step``."""
+def latent_key(episode_id: str, kind: Literal["single", "groups", "clips"], *numbers: int) -> str:
+    """Name of a tensor of latents.
 
-    shard: str
-
-
-def group_key(episode_id: str, stride: int, phase: int) -> str:
-    """Tensor name of the group latents whose first video frame is ``phase`` modulo 4 x stride."""
-    return f"{episode_id}/groups/{stride}/{phase}"
-
-
-def clip_key(episode_id: str, stride: int, start: int) -> str:
-    """Tensor name of the latents of the longest clip that starts at ``start``."""
-    return f"{episode_id}/clips/{stride}/{start}"
-
-
-def single_key(episode_id: str) -> str:
-    """Tensor name of the single-frame latents of all allowed start frames."""
-    return f"{episode_id}/single"
+    Single-frame latents of all start frames (``single``); ``groups`` whose first video frame is, for a stride, a phase modulo
+    4 x stride; the longest of ``clips`` of a stride that begin at a start.
+    """
+    return "/".join([episode_id, kind, *map(str, numbers)])
 
 
 class LatentStore(ClipSource):
@@ -149,9 +137,7 @@ class LatentStore(ClipSource):
       clip, or of ``clip_frames`` frames.
     """
 
-    rows: list[LatentRow]
-
-    def __init__(self, root: Path, description: dict[str, Any], rows: Sequence[LatentRow]) -> None:
+    def __init__(self, root: Path, description: dict[str, Any], rows: Sequence[ClipRow]) -> None:
         super().__init__(rows)
         self.root, self.description = root, description
         self.layout: Layout = description["layout"]
@@ -172,7 +158,7 @@ class LatentStore(ClipSource):
             ArtifactError: if the folder is not a Latents artifact.
         """
         try:
-            rows = [LatentRow(**{**row, "views": tuple(row["views"])}) for row in read_rows(root / INDEX)]
+            rows = [ClipRow(**{**row, "views": tuple(row["views"])}) for row in read_rows(root / INDEX)]
             return cls(root, read_json(root / DESCRIPTION), rows)
         except (TypeError, KeyError) as error:
             raise ArtifactError(
@@ -215,15 +201,15 @@ class LatentStore(ClipSource):
 
     def _parts(self, clip: Clip) -> list[tuple[str, int, int]]:
         """Tensors that a clip's latent frames are in, in order: (name, first latent frame, stop)."""
-        frames = latent_frame_count(clip.num_frames)
+        frames = len(latent_frame_indices(clip.num_frames))
         if self.layout == "clips":
-            return [(clip_key(clip.episode_id, clip.stride, clip.start), 0, frames)]
+            return [(latent_key(clip.episode_id, "clips", clip.stride, clip.start), 0, frames)]
         index = clip.start // self.start_step
-        single = (single_key(clip.episode_id), index, index + 1)
+        single = (latent_key(clip.episode_id, "single"), index, index + 1)
         if frames == 1:
             return [single]
         offset, phase = divmod(clip.start + clip.stride, TEMPORAL_FACTOR * clip.stride)
-        return [single, (group_key(clip.episode_id, clip.stride, phase), offset, offset + frames - 1)]
+        return [single, (latent_key(clip.episode_id, "groups", clip.stride, phase), offset, offset + frames - 1)]
 
     def _stored_views(self, clip: Clip, views: tuple[str, ...]) -> list[int]:
         """Numbers of a clip's views among those that are stored; raises as `read` does."""

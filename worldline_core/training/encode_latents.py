@@ -21,6 +21,7 @@ from jaxtyping import Float, UInt8
 from safetensors.torch import save_file
 from torch import Tensor
 
+from worldline_core.actions.action_maps import latent_frame_indices
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
@@ -31,8 +32,8 @@ from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 from worldline_core.training.clip_config import EncodeLatentsConfig
-from worldline_core.training.clip_sampler import latent_frame_count, longest_clip
-from worldline_core.training.clip_source import DESCRIPTION, INDEX, LatentRow, Layout, clip_key, group_key, single_key
+from worldline_core.training.clip_sampler import ClipRow, longest_clip
+from worldline_core.training.clip_source import DESCRIPTION, INDEX, Layout, latent_key
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +68,7 @@ def encode_episode(
 
     if layout == "groups":
         singles = [stacked(range(start, start + 1)) for start in range(0, count, config.start_step)]
-        tensors[single_key(episode_id)] = torch.cat(singles, 2)
+        tensors[latent_key(episode_id, "single")] = torch.cat(singles, 2)
     for stride in config.strides:
         period = TEMPORAL_FACTOR * stride
         for start in range(0, count, config.start_step):
@@ -76,10 +77,10 @@ def encode_episode(
                 frames = min(frames, config.clip_frames or frames)
             indices = range(start, start + stride * (frames - 1) + 1, stride)
             if layout == "clips":
-                tensors[clip_key(episode_id, stride, start)] = stacked(indices)
+                tensors[latent_key(episode_id, "clips", stride, start)] = stacked(indices)
                 continue
             # The first clip of each phase yields every group of that phase.
-            key = group_key(episode_id, stride, (start + stride) % period)
+            key = latent_key(episode_id, "groups", stride, (start + stride) % period)
             if key in tensors or frames == 1:
                 continue
             groups = stacked(indices)[:, :, 1:]
@@ -95,13 +96,13 @@ def stored_latent_frames(count: int, layout: Layout, config: EncodeLatentsConfig
     starts = range(0, count, config.start_step)
     lengths = {(stride, start): longest_clip(count, start, stride) for stride in config.strides for start in starts}
     if layout == "clips":
-        return sum(latent_frame_count(min(length, config.clip_frames or length)) for length in lengths.values())
+        return sum(len(latent_frame_indices(min(length, config.clip_frames or length))) for length in lengths.values())
     total, phases = len(starts), set[tuple[int, int]]()
     for (stride, start), length in lengths.items():
         missing, phase = divmod(start + stride, TEMPORAL_FACTOR * stride)
         if length > 1 and (stride, phase) not in phases:
             phases.add((stride, phase))
-            total += missing + latent_frame_count(length) - 1
+            total += missing + len(latent_frame_indices(length)) - 1
     return total
 
 
@@ -289,11 +290,11 @@ def encode_latents(
     pieces = list(batched(selected, config.episodes_per_shard))
     map_episodes(mapper or SerialMapper(), work, pieces)
     summaries = [work.summary(number) for number in range(len(pieces))]
-    rows: list[LatentRow] = []
+    rows: list[ClipRow] = []
     account: list[InputRow] = []
     for number, (members, summary) in enumerate(zip(pieces, summaries, strict=True)):
         for row in (episodes.rows[index] for index in members):
-            rows.append(LatentRow.from_episode(row, _views(row, config), shard=SHARD_FILE.format(number)))
+            rows.append(ClipRow.from_episode(row, _views(row, config), shard=SHARD_FILE.format(number)))
             size = summary["stored_bytes"][row.episode_id]
             account.append(InputRow(episode_id=row.episode_id, source=row.source, status="kept", stored_bytes=size))
     write_account(output, account)
