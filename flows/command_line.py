@@ -66,7 +66,6 @@ def build_parser() -> argparse.ArgumentParser:
         help="the EpisodeSet of tracks or predictions (default: see manifest)",
     )
     inspect.add_argument("--episode", metavar="ID", help="the episode to show (default: the first one)")
-    inspect.add_argument("--video", action="store_true", help="write a video of it: controls drawn over all views")
     inspect.set_defaults(run=_inspect)
     listing = commands.add_parser("list", help="name the artifacts of a run: what is finished, and where it is")
     add_config_arguments(listing)
@@ -274,14 +273,7 @@ def _record(arguments: argparse.Namespace) -> None:
 def _inspect(arguments: argparse.Namespace) -> None:
     from worldline_core.report.inspect import inspect
 
-    found = inspect(
-        arguments.artifact,
-        arguments.output,
-        episodes=arguments.episodes,
-        episode_id=arguments.episode,
-        video=arguments.video,
-    )
-    print(found)
+    print(inspect(arguments.artifact, arguments.output, episodes=arguments.episodes, episode_id=arguments.episode))
 
 
 def _list(arguments: argparse.Namespace) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 def add_exchange_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add them to the command line's parser."""
-    card = commands.add_parser("card", help="write the card of an EpisodeSet or a checkpoint: README.md, and pictures")
+    card = commands.add_parser("card", help="write the card of an EpisodeSet or a checkpoint: README.md")
     card.add_argument(
         "artifact", type=Path, metavar="FOLDER", help="an EpisodeSet, curated or filtered, or a checkpoint"
     )
@@ -85,10 +85,8 @@ def _card(arguments: argparse.Namespace) -> None:
         return
     from worldline_core.report.data import write_card
 
-    for path in write_card(
-        arguments.artifact, arguments.output or arguments.artifact / "run" / "card", arguments.title
-    ):
-        print(f"wrote {path}")
+    output = arguments.output or arguments.artifact / "run" / "card"
+    print(f"wrote {write_card(arguments.artifact, output, arguments.title)}")
 
 
 def _compare(arguments: argparse.Namespace) -> None:

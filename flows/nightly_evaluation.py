@@ -18,7 +18,7 @@ from worldline_core.report.comparison import NightlyComparison, compare_with_his
 def compare_nights(done: dict[str, Path], history: Path, night: str | None) -> NightlyComparison:
     """Append this night's scores to the history and write the comparison."""
     scores = {name: path for name, path in done.items() if name.startswith("evaluate_")}
-    return compare_with_history(scores, history, night, done)
+    return compare_with_history(scores, history, night)
 
 
 @flow(name="nightly-evaluation")
@@ -44,7 +44,6 @@ def nightly_evaluation(
         report.submit(settings.report, **made, rollout=predicted, models=models)
     history = artifacts.resolve() / "nightly"
     compared = compare_nights({name: made.folder for name, made in run.artifacts.items()}, history, night)
-    pictures = {what: history / file for what, file in compared.pictures.items()}
-    show_in_prefect(history, run.artifacts, pictures, compared.verdicts)
+    show_in_prefect(history, run.artifacts, compared.verdicts)
     refuse_regressions(compared, history)
     return history

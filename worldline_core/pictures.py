@@ -5,7 +5,7 @@ Text uses Pillow's embedded font, so the same call gives the same bytes on every
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
@@ -121,20 +121,16 @@ def jpeg_bytes(picture: Picture, quality: int = 88) -> bytes:
 
 # Contact sheets
 
-GAP_PX, MARGIN_PX, BAND_PX = 4, 12, 10
+GAP_PX, MARGIN_PX = 4, 12
 
 
 @dataclass(frozen=True)
 class SheetRow:
-    """One row of a sheet: a title, pictures `n h w 3` of one size, and an optional second line in grey.
-
-    ``timeline`` (m, 3) is a band of colours along the whole clip, below the pictures.
-    """
+    """One row of a sheet: a title, pictures `n h w 3` of one size, and an optional second line in grey."""
 
     title: str
     frames: NDArray[np.uint8]
     note: str = ""
-    timeline: NDArray[np.uint8] | None = None
 
 
 def evenly_spaced(count: int, wanted: int) -> list[int]:
@@ -178,13 +174,7 @@ def contact_sheet(
             if text:
                 strip = text_strip(text, width - 2 * MARGIN_PX + 12, height, size_px=size_px, ink=ink)
                 blocks.append(pad(strip, MARGIN_PX - 6, width))
-        pictures = joined(tile)
-        blocks.append(pad(pictures, MARGIN_PX, width))
-        if row.timeline is not None:
-            moments = np.arange(pictures.shape[1]) * len(row.timeline) // pictures.shape[1]
-            band = np.repeat(row.timeline[None, moments], BAND_PX, axis=0)
-            blocks += [blank(GAP_PX, width), pad(band, MARGIN_PX, width)]
-        blocks.append(blank(10, width))
+        blocks += [pad(joined(tile), MARGIN_PX, width), blank(10, width)]
     return np.concatenate(blocks, axis=0)
 
 
@@ -227,7 +217,7 @@ class WrittenVideo:
 
 
 def side_by_side(
-    columns: Mapping[str, Frames], *, tile_height: int = 256, labels: bool = True, most: int | None = None
+    columns: Mapping[str, Frames], *, tile_height: int = 256, most: int | None = None
 ) -> Iterator[Picture]:
     """Pictures of labelled columns of frames `n h w 3`, one after the other.
 
@@ -247,7 +237,7 @@ def side_by_side(
     ink = {"size_px": size_px, "ink": STRIP_INK, "paper": STRIP_PAPER}
     strips = {label: text_strip(label, width, LABEL_HEIGHT_PX, align="centre", **ink) for label in columns}
     line_length = min(most or len(columns), len(columns))
-    tile = height + LABEL_HEIGHT_PX * labels
+    tile = height + LABEL_HEIGHT_PX
     step = width + COLUMN_GAP_PX
     size = tile * -(-len(columns) // line_length), step * line_length - COLUMN_GAP_PX, 3
 
@@ -257,8 +247,7 @@ def side_by_side(
             top, left = tile * (place // line_length), step * (place % line_length)
             body = scale_frames(frame[None], (height, width))[0]
             page[top + tile - height : top + tile, left : left + width] = body
-            if labels:
-                page[top : top + LABEL_HEIGHT_PX, left : left + width] = strips[label]
+            page[top : top + LABEL_HEIGHT_PX, left : left + width] = strips[label]
         return page
 
     return map(picture, in_step(columns))
@@ -267,17 +256,11 @@ def side_by_side(
 def write_side_by_side(
     path: Path, columns: Mapping[str, Frames], fps: float, *, tile_height: int = 256, most: int | None = None
 ) -> WrittenVideo:
-    """Write labelled columns as `path` (mp4) with a poster beside it."""
-    count = min(map(len, columns.values()), default=0)
-    return write_video(path, side_by_side(columns, tile_height=tile_height, most=most), count, fps)
-
-
-def write_video(path: Path, frames: Iterable[Picture], count: int, fps: float) -> WrittenVideo:
-    """Write `count` pictures as `path` (mp4), and a poster JPEG of a moment after its middle beside it."""
-    shown: list[Picture] = []
+    """Write labelled columns as `path` (mp4), and a poster JPEG of a moment after its middle beside it."""
+    count, shown = min(map(len, columns.values()), default=0), list[Picture]()
 
     def watched() -> Iterator[Picture]:
-        for number, frame in enumerate(frames):
+        for number, frame in enumerate(side_by_side(columns, tile_height=tile_height, most=most)):
             if number == round(0.6 * (count - 1)):
                 shown.append(frame)
             yield frame

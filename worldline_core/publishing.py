@@ -162,7 +162,8 @@ def _card_files(folder: Path) -> dict[str, Path]:
     from worldline_core.report.data import write_card
 
     output = folder / VOLATILE_FOLDER / "card"
-    return {path.relative_to(output).as_posix(): path for path in write_card(folder, output)}
+    path = write_card(folder, output)
+    return {path.name: path}
 
 
 def _check_may_publish(folder: Path, *, public: bool) -> None:

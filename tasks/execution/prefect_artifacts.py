@@ -66,7 +66,6 @@ def _report_pictures(report: Path) -> dict[str, Path]:
 def show_in_prefect(
     page: Path,
     done: Mapping[str, ArtifactReference],
-    pictures: Mapping[str, Path] | None = None,
     verdicts: Mapping[str, str] | None = None,
 ) -> None:
     """Add the artifacts `report`, `metrics` and `pictures` (a link, a table, images) to the flow run that calls this.
@@ -74,12 +73,9 @@ def show_in_prefect(
     Args:
         page: folder of the report or comparison, with `index.html`.
         done: the artifacts of the run by the nodes' names; its evaluations fill the table.
-        pictures: files to show by what they show (default: the report's). They travel inside of the artifacts: a page that a
-            browser has over http may not show files.
         verdicts: of metrics beside an earlier run, in the order of the table's rows.
     """
-    if pictures is None:
-        pictures = _report_pictures(done["report"].folder) if "report" in done else {}
+    pictures = _report_pictures(done["report"].folder) if "report" in done else {}
     scores = {name: Path(str(artifact.path)) for name, artifact in done.items() if name.startswith("evaluate_")}
     found, verdicts = collect_metrics(scores), verdicts or {}
     rows: list[dict[str, Any]] = []
@@ -98,6 +94,7 @@ def show_in_prefect(
         if rows:
             description = f"{summary}Means with 95 % intervals: what/where/method/metric"
             create_table_artifact(rows, key="metrics", description=description)
+        # They travel inside of the artifacts: a page that a browser has over http may not show files.
         for number, (what, picture) in enumerate(pictures.items()):
             key = "picture" if number == 0 else f"picture-{number}"
             data = f"data:{mimetypes.guess_type(picture)[0]};base64,{base64.b64encode(picture.read_bytes()).decode()}"

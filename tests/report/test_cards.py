@@ -25,7 +25,6 @@ from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.model_card import model_facts
-from worldline_core.pages.page import markdown
 from worldline_core.report.data import DatasetFacts, write_card
 from worldline_core.report.report import ReportConfig, report
 from worldline_core.report.results import evaluations_of_store, measurements
@@ -85,7 +84,7 @@ def table(text: str, heading: str) -> list[list[str]]:
 
 
 def test_the_markdown_says_what_the_tables_say(curated: Path, tmp_path: Path) -> None:
-    files = write_card(curated, tmp_path, title="A set")
+    write_card(curated, tmp_path, title="A set")
     text = (tmp_path / "README.md").read_text()
     assert len(read_index(curated)) == 6
     sources = {row[0]: row[1:] for row in table(text, "Sources and licences")[1:]}
@@ -94,13 +93,9 @@ def test_the_markdown_says_what_the_tables_say(curated: Path, tmp_path: Path) ->
     funnel = {tuple(row) for row in table(text, "From recordings to training")}
     assert {("episodes found", "8"), ("kept by curation", "6")} <= funnel
     assert {row[:3] for row in funnel} >= {("curation", "duplicate", "1"), ("curation", "nan_state", "1")}
-    assert ["lift the block", "5"] in table(text, "Instructions")
     splits = {row[0]: row[1:] for row in table(text, "Splits")[1:]}
     assert (splits["train"][:2], splits["train"][3:]) == (["3", "5"], ["3", "2", "0"])
     assert "1 pairs of scenes across the split look alike by their first images (room 0 and hall)" in text
-    assert [path.name for path in files] == ["README.md", "source_00.jpg", "source_01.jpg"]
-    for path in re.findall(r"\]\((\S+)\)", text):
-        assert np.all(cv2.imread(str(tmp_path / path)).shape[:2] > (128, 6 * 96))
 
 
 def test_the_hub_reads_the_header_and_recorded_text_cannot_break_the_card(curated: Path, tmp_path: Path) -> None:
@@ -114,10 +109,7 @@ def test_the_hub_reads_the_header_and_recorded_text_cannot_break_the_card(curate
     assert header["tags"] == ["LeRobot", "WorldLine", "robotics", "ur5e_pair"]
     (config,) = header["configs"]
     assert list(curated.glob(config["data_files"]))
-    assert "<script" not in markdown(card.text)
     assert not re.search(r"https?://", card.text)
-    assert "\\<script\\>alert('x')\\</script\\> \\| \\*lift\\* \\`it\\`" in card.text
-    assert all(len(row) == 2 for row in table(card.text, "Instructions"))
 
 
 def test_equal_sets_give_equal_bytes_and_the_set_stays_as_it_is(

@@ -281,14 +281,8 @@ def test_scores_of_every_evaluation_are_read_under_the_names_of_the_summaries(
     assert found["planning/N=8/a/success"] == found["planning/N=8|ur5e/a/success"] == {"bank": 0.5}
 
 
-def test_the_page_shows_pictures_and_the_history(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
+def test_the_page_shows_the_history(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     scores = {"evaluate_video": run_artifacts["evaluate_video"]}
-    artifacts = {name: path for name, path in run_artifacts.items() if name == "filter" or name.startswith("rollout.")}
-    assert compare_with_history(scores, tmp_path, "first", artifacts).pictures
-    second = compare_with_history(scores, tmp_path, "second", artifacts)
-    page = (tmp_path / "index.html").read_text()
-    for file in second.pictures.values():
-        assert (tmp_path / file).read_bytes().startswith(b"\xff\xd8")
-        assert file in page
-    assert len(list((tmp_path / "pictures").iterdir())) == len(second.pictures)  # those of the first night are gone
-    assert "second good, first good" in page
+    for night in ("first", "second"):
+        compare_with_history(scores, tmp_path, night)
+    assert "second good, first good" in (tmp_path / "index.html").read_text()

@@ -9,7 +9,7 @@ import pytest
 
 from tasks.execution.run_page import FinishedStep, write_finished_page, write_progress_page
 from worldline_core.report.context import ReportConfig, ReportContext, VideoScores, in_order, method, share_interval
-from worldline_core.report.report import Figure, first_page, head_view, headline, planning_figure, video_figures
+from worldline_core.report.report import Figure, first_page, head_view, headline, planning_figure, video_figure
 from worldline_core.report.videos import best_median_worst, choose_episodes
 
 COPY, SHUFFLED = "copy_first_frame", "shipped_stage2_shuffled"
@@ -22,7 +22,6 @@ def context_of(
     copy: float = 0.5,
     over_copy: tuple[float, float] = (0.2, 0.4),
     over_shuffled: tuple[float, float] = (0.2, 0.4),
-    own: float | None = None,
     success: float | None = None,
     gain: tuple[float, float] = (-0.1, 0.3),
 ) -> ReportContext:
@@ -34,14 +33,12 @@ def context_of(
     def measured(mean: float) -> dict[str, dict[str, float]]:
         return {"robot_iou@head": interval(mean, mean - 0.1, mean + 0.1) | {"count": 9}}
 
-    def difference(second: str, bounds: tuple[float, float], first: str = "shipped_stage2") -> dict[str, object]:
-        return {"metric": "robot_iou@head", "first": first, "second": second} | interval(sum(bounds) / 2, *bounds)
+    def difference(second: str, bounds: tuple[float, float]) -> dict[str, object]:
+        names = {"metric": "robot_iou@head", "first": "shipped_stage2", "second": second}
+        return {**names, **interval(sum(bounds) / 2, *bounds)}
 
     methods = {"shipped_stage2": measured(iou), COPY: measured(copy), SHUFFLED: measured(0.4)}
     rows = [difference(COPY, over_copy), difference(SHUFFLED, over_shuffled)]
-    if own is not None:
-        methods["stage2"] = measured(own)
-        rows.append(difference(COPY, (own - 0.51, own - 0.49), "stage2"))
     summaries: dict[str, object] = {"evaluate_video": {"metrics": {"test": methods}, "differences": {"test": rows}}}
     if success is not None:
         result = {
@@ -61,7 +58,7 @@ def context_of(
 def headline_of(context: ReportContext) -> str:
     view = head_view(context)
     assert view is not None
-    return headline(context, view, video_figures(view)[0], planning_figure(context))
+    return headline(context, view, video_figure(view), planning_figure(context))
 
 
 @pytest.mark.parametrize(
@@ -86,7 +83,7 @@ def test_the_tool_error_heads_the_page_of_a_robot_that_no_segmenter_knows(tmp_pa
     summary = tmp_path / "evaluate_video" / "summary.json"
     summary.write_text(summary.read_text().replace("robot_iou@head", "end_effector_error_px@head"))
     assert headline_of(context) == "The shipped simulator follows the controls."
-    figure = video_figures(head_view(context))[0]  # type: ignore[arg-type]
+    figure = video_figure(head_view(context))  # type: ignore[arg-type]
     assert figure.verdict == "better"
     assert "better than copying the first frame: 3.80\u202fpx" in first_page(context, [])
 
@@ -126,15 +123,15 @@ def test_a_figure_is_coloured_by_its_reference(mean: float, bounds: tuple, verdi
 
 
 def test_a_figure_within_chance_is_neutral_on_the_page(tmp_path: Path) -> None:
-    page = first_page(context_of(tmp_path, over_copy=(-0.1, 0.7), success=0.76, own=0.7), [])
+    page = first_page(context_of(tmp_path, over_copy=(-0.1, 0.7), success=0.76), [])
     assert "better than copying the first frame: 0.50, within chance" in page
-    assert [page.count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")] == [1, 0, 2]
+    assert [page.count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")] == [0, 0, 2]
 
 
-def test_the_page_shows_the_video_and_four_coloured_figures(full_report: Path) -> None:
+def test_the_page_shows_the_video_and_three_coloured_figures(full_report: Path) -> None:
     text = (full_report / "index.html").read_text()
-    assert 'src="media/overview.mp4"' in text
-    assert [text.count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")] == [4, 0, 0]
+    assert 'src="media/episode0_shipped_head.mp4"' in text
+    assert [text.count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")] == [3, 0, 0]
 
 
 def artifact(store: Path, step: str, key: str, seconds: float, finished: str = "2026-01-01", **metrics: object) -> Path:

@@ -11,17 +11,13 @@ import numpy as np
 import pytest
 
 from worldline_core.pages.page import (
-    VALUE_WIDTH,
-    WIDTH,
     Axis,
     Line,
     asset,
     duration,
     environment,
     interval,
-    interval_chart,
     line_chart,
-    markdown,
     nice_ticks,
     number,
     percent,
@@ -29,7 +25,7 @@ from worldline_core.pages.page import (
 )
 
 
-def test_every_template_escapes_but_those_of_markdown() -> None:
+def test_every_template_escapes() -> None:
     names = environment().list_templates(extensions=["html", "md"])
     assert {"pages/base.html", "report/overview.html", "report/card.md"} <= set(names)
     sources = {name: environment().loader.get_source(environment(), name)[0] for name in names}  # type: ignore[union-attr]
@@ -49,11 +45,6 @@ def test_numbers_are_written_for_readers() -> None:
     assert "+0.50" in str(interval({"mean": 0.5, "low": 0.4, "high": 0.6}, signed=True))
     assert interval(None) is None
     assert [duration(s) for s in (3.21, 61, 150, 8000)] == ["3.2 s", "61 s", "2.5 min", "2.2 h"]
-
-
-def test_markdown_of_others_has_no_links_pictures_or_html() -> None:
-    text = "[a](javascript:alert(1)) ![b](https://x/y.png) <https://x> <img src=x onerror=alert(1)> &lt;b&gt;"
-    assert re.findall(r"<(\w+)", markdown(text)) == ["p"]
 
 
 def test_text_and_lines_can_be_read_in_both_themes() -> None:
@@ -81,18 +72,10 @@ def test_ticks_are_round_and_inside(low: float, high: float) -> None:
 
 
 def test_charts_are_xml_and_hold_every_point(hostile_text: str) -> None:
-    series = Line(hostile_text, [1, 2, 3], [0.5, 0.25, math.nan], [0.4, 0.2, 0.1], [0.6, 0.3, 0.2], markers=True)
+    series = Line(hostile_text, [1, 2, 3], [0.5, 0.25, math.nan], markers=True)
     chart = line_chart([series], title=hostile_text, x_label="step", y_label="loss", log_y=True)
     root = ElementTree.fromstring(chart)  # noqa: S314  # made two lines above
     assert len(root.findall(".//circle")) == 2  # the value that is not a number is left out
-    name = "Stage II, shuffled actions (long-trained)"
-    intervals = interval_chart([(name, {"mean": 0.1, "low": -0.2, "high": 0.3}, "c0")], title="t", value_label="v")
-    dots = ElementTree.fromstring(intervals)  # noqa: S314
-    (dot,), (_,) = dots.findall(".//circle"), dots.findall(".//line[@class='whisker']")
-    (label,) = (text for text in dots.findall(".//text[@class='row']") if text.text == name)
-    assert float(label.get("x", "")) + 7.4 * len(name) <= WIDTH  # 7.4 is the mean width of a letter
-    assert 0 < float(dot.get("cx", "")) <= WIDTH - VALUE_WIDTH
-    assert float(dot.get("cy", "")) > float(label.get("y", "")) + 5  # the dot is below its label
 
 
 def test_axes_map_both_ends_and_have_even_ticks() -> None:

@@ -104,7 +104,7 @@ EXPORT = [
         ([*EXPORT, "rrd"], 0),
         ([*EXPORT, "rrd"], 60_000),
         ([*EXPORT, "mcap"], 60_000),
-        (["inspect", "artifacts/shipped/recordings", "--video", "--output", "{disk}/out"], 60_000),
+        (["inspect", "artifacts/shipped/recordings", "--output", "{disk}/out"], 60_000),
         (["push", "artifacts/shipped/recordings", "{disk}/out"], 60_000),
         (["record", "--output", "{disk}/out"], 60_000),
     ],

@@ -18,6 +18,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from markdown_it import MarkdownIt
 from safetensors import SafetensorError
 
 from tasks.execution.command_line import exit_with_clear_errors, log_to_stderr
@@ -34,7 +35,7 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.video_folder import VideoFolderSourceConfig
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import VLMConfig
-from worldline_core.pages.page import Table, environment, markdown
+from worldline_core.pages.page import Table, environment
 from worldline_core.pictures import fit_text, text_width_px
 from worldline_core.report.data import markdown_table, plain
 from worldline_core.store.remote import parse_location
@@ -86,8 +87,11 @@ def checked(name: str, folder: Path) -> str:
     return check_page(CalibrationCheck((EpisodeCheck(name, name, None, reason=name, detail=name),), (), folder))
 
 
+MARKDOWN = MarkdownIt("commonmark").enable("table").render
+
+
 def card(name: str, _: Path) -> str:
-    return str(markdown(markdown_table(Table((name, "b"), [(name, name)])) + f"\n\n# {plain(name)}\n"))
+    return MARKDOWN(markdown_table(Table((name, "b"), [(name, name)])) + f"\n\n# {plain(name)}\n")
 
 
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
@@ -96,7 +100,7 @@ def test_pages_and_cells_keep_their_elements_whatever_ids_and_reasons_say(text: 
         same_elements(make(text, tmp_path), make("harmless", tmp_path))
     table = markdown_table(Table(("Instruction", "Episodes"), [(text, 1)]))
     assert len(table.splitlines()) == 3
-    assert set(re.findall(r"<(\w+)", str(markdown(table)))) == {"div", "table", "thead", "tbody", "tr", "th", "td"}
+    assert set(re.findall(r"<(\w+)", MARKDOWN(table))) == {"table", "thead", "tbody", "tr", "th", "td"}
 
 
 def test_a_template_cuts_what_is_long_and_keeps_what_was_rendered() -> None:
@@ -104,7 +108,7 @@ def test_a_template_cuts_what_is_long_and_keeps_what_was_rendered() -> None:
     html = environment().from_string("{{ text }}{{ table }}").render(text="x" * 100_000, table=table)
     assert "(100,000 characters)" in html
     assert html.count("<tr>") == 2001
-    assert "&amp;lt;b&amp;gt;" in markdown(plain("&lt;b&gt;"))  # entities as they were recorded
+    assert "&amp;lt;b&amp;gt;" in MARKDOWN(plain("&lt;b&gt;"))  # entities as they were recorded
 
 
 def test_labels_of_pictures_take_long_texts() -> None:

@@ -104,14 +104,15 @@ def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path
     summary = {"methods": {"causal": {"budgets": {"32": {"success": success}}}}}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     scores = ArtifactReference(step="evaluate_planning", path=tmp_path, digest="0" * 64)
-    pictures = {"e1, causal: ssim became worse by 0.1": tmp_path / "worst.jpg", "second": tmp_path / "second.jpg"}
-    for colour, picture in zip(("red", "blue"), pictures.values(), strict=True):
+    (tmp_path / "media").mkdir()
+    pictures = [tmp_path / "media" / name for name in ("contact_sheet.jpg", "episode0_shipped_head.jpg")]
+    for colour, picture in zip(("red", "blue"), pictures, strict=True):
         Image.new("RGB", (8, 6), colour).save(picture)
     verdicts = {"video/gone": "missing", "planning/N=32/causal/success": "worse by 0.200"}
 
     @flow
     def shown() -> None:
-        show_in_prefect(tmp_path / "latest", {"evaluate_planning": scores, "report": scores}, pictures, verdicts)
+        show_in_prefect(tmp_path / "latest", {"evaluate_planning": scores, "report": scores}, verdicts)
 
     shown()
     with get_client(sync_client=True) as client:
@@ -123,8 +124,8 @@ def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path
            "trajectories": 9}  # fmt: skip
     assert json.loads(found["metrics"]) == [{"metric": "video/gone", "verdict": "missing"}, row]
     assert "2 of 2 metrics became worse or are missing" in described["metrics"]
-    assert "e1, causal: ssim became worse by 0.1" in described["picture"]
-    for key, picture in zip(("picture", "picture-1"), pictures.values(), strict=True):
+    assert "recorded episodes" in described["picture"]
+    for key, picture in zip(("picture", "picture-1"), pictures, strict=True):
         # A browser shows it wherever the page comes from: the picture itself is in its address.
         with urllib.request.urlopen(found[key]) as reply:
             assert (reply.headers["Content-type"], reply.read()) == ("image/jpeg", picture.read_bytes())

@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markdown_it import MarkdownIt
 from markupsafe import Markup
 
 from worldline_core.untrusted_text import cut, visible
@@ -38,7 +37,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     found.globals |= {"asset": asset, "interval": interval}
-    found.filters |= {"number": number, "percent": percent, "words": words, "duration": duration, "markdown": markdown}
+    found.filters |= {"number": number, "percent": percent, "words": words, "duration": duration}
     return found
 
 
@@ -59,24 +58,6 @@ def render_macro(template: str, macro: str, **values: object) -> Markup:
 def asset(name: str) -> Markup:
     """A style sheet or a script of this package, to be put into a page as it is."""
     return Markup((PACKAGE / name).read_text(encoding="utf-8"))  # noqa: S704  # a file of this package
-
-
-@cache
-def _markdown_reader() -> MarkdownIt:
-    reader = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["link", "autolink", "image"])
-    reader.add_render_rule("table_open", lambda *_: '<div class="table-wrap"><div tabindex="0"><table>\n')
-    reader.add_render_rule("table_close", lambda *_: "</table></div></div>\n")
-    return reader
-
-
-def markdown(text: str) -> Markup:
-    """Markdown as HTML, its headings three levels lower; raw HTML, links and pictures stay text."""
-    reader = _markdown_reader()
-    tokens = reader.parse(str(text))
-    for token in tokens:
-        if token.type in ("heading_open", "heading_close"):
-            token.tag = f"h{min(6, int(token.tag[1]) + 3)}"
-    return Markup(reader.renderer.render(tokens, reader.options, {}))  # noqa: S704  # raw HTML is switched off
 
 
 def number(value: object, digits: int = 2, *, signed: bool = False) -> str:
@@ -139,19 +120,15 @@ class Table:
 
 WIDTH, HEIGHT = 480, 270
 LEFT, RIGHT, TOP, BOTTOM = 62, 14, 12, 30
-VALUE_WIDTH, ROW_HEIGHT = 70, 46
-"""Room for the number at the right end of an interval chart's row, and the row's height."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One line: points, optionally an interval around each, and a colour class (`c0` .. `c7`)."""
+    """One line: points, and a colour class (`c0` .. `c7`)."""
 
     label: str
     x: Sequence[float]
     y: Sequence[float]
-    low: Sequence[float] = ()
-    high: Sequence[float] = ()
     colour: str = "c0"
     dashed: bool = False
     markers: bool = False
@@ -209,49 +186,23 @@ def line_chart(
     x_label: str,
     y_label: str,
     log_y: bool = False,
-    log_x: bool = False,
-    x_ticks: Sequence[float] | None = None,
-    shares: bool = False,
 ) -> Markup:
-    """Lines with optional interval bands and a legend below the title.
-
-    Args:
-        log_y, log_x: logarithmic axes; values that are not positive are left out.
-        x_ticks: where the x axis is labelled (default: round numbers).
-        shares: y is from 0 to 1 and labelled in per cent.
-    """
-    found = [(item, _points(item, log_x=log_x, log_y=log_y)) for item in series]
-    xs = [x for _, points in found for x, *_ in points] or [0.0, 1.0]
-    ys = [y for _, points in found for _, *values in points for y in values if y > 0 or not log_y] or [0.1, 1.0]
+    """Lines with a legend below the title; values that are not finite, or not positive on a logarithmic axis, are left out."""
+    found = [
+        (item, [(x, y) for x, y in zip(item.x, item.y, strict=True) if math.isfinite(y) and (y > 0 or not log_y)])
+        for item in series
+    ]
+    xs, ys = ([p[k] for _, points in found for p in points] or [0.1, 1.0] for k in (0, 1))
     air = 0.06 * (max(ys) - min(ys)) or 0.05 * abs(max(ys)) or 1.0
     y_range = (min(ys) / 1.15, max(ys) * 1.15) if log_y else (min(ys) - air, max(ys) + air)
-    x_axis = Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT, log_x)
-    y_axis = Axis(*((0.0, 1.02) if shares else y_range), HEIGHT - BOTTOM, TOP, log_y)
-    rows = [(y_axis.at(v), percent(v) if shares else tick_label(v)) for v in y_axis.ticks()]
-    columns = [(x_axis.at(v), tick_label(v)) for v in (x_axis.ticks(6) if x_ticks is None else x_ticks)]
+    x_axis = Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT)
+    y_axis = Axis(*y_range, HEIGHT - BOTTOM, TOP, log_y)
+    rows = [(y_axis.at(v), tick_label(v)) for v in y_axis.ticks()]
+    columns = [(x_axis.at(v), tick_label(v)) for v in x_axis.ticks(6)]
     lines = [
-        (item, [(f"{tick_label(x)}, {y:.4g}", x_axis.at(x), *map(y_axis.at, (y, *bounds))) for x, y, *bounds in points])
-        for item, points in found
+        (item, [(f"{tick_label(x)}, {y:.4g}", x_axis.at(x), y_axis.at(y)) for x, y in points]) for item, points in found
     ]
     return render_macro(
         "pages/charts.html", "lines", title=title, x_label=x_label, y_label=y_label, rows=rows, columns=columns, lines=lines,
         width=WIDTH, height=HEIGHT, left=LEFT, right=WIDTH - RIGHT, bottom=HEIGHT - BOTTOM,
-    )  # fmt: skip
-
-
-def _points(item: Line, *, log_x: bool, log_y: bool) -> list[tuple[float, ...]]:
-    """Points (x, y), or (x, y, low, high) of a series with intervals: those that can be drawn."""
-    found = zip(item.x, item.y, *([item.low, item.high] if item.low else []), strict=True)
-    usable = [point for point in found if all(map(math.isfinite, point))]
-    return [point for point in usable if (point[0] > 0 or not log_x) and (point[1] > 0 or not log_y)]
-
-
-def interval_chart(rows: Sequence[tuple[str, dict[str, float], str]], *, title: str, value_label: str) -> Markup:
-    """Differences (label, `{"mean", "low", "high"}`, colour) with their intervals, a row each, beside a line at zero."""
-    values = [0.0, *(found[key] for _, found, _ in rows for key in ("mean", "low", "high"))]
-    air = 0.08 * (max(values) - min(values)) or 0.1
-    axis = Axis(min(values) - air, max(values) + air, 8, WIDTH - VALUE_WIDTH)
-    return render_macro(
-        "pages/charts.html", "dots", title=title, x_label=value_label, rows=rows, at=axis.at, height=ROW_HEIGHT,
-        width=WIDTH, ticks=[(axis.at(v), tick_label(v)) for v in axis.ticks(4)],
     )  # fmt: skip

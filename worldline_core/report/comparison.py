@@ -7,20 +7,17 @@ later nights are compared with the same reference until the loss is repaired or 
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from markupsafe import Markup
 from pydantic import ValidationError
 
 from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, RegressionError
 from worldline_core.evaluation.paired import (
     EVALUATIONS,
@@ -35,13 +32,10 @@ from worldline_core.evaluation.paired import (
     sign_of,
     write_series,
 )
-from worldline_core.evaluation.recordings import HEAD, ROLLOUT_PREFIX
+from worldline_core.evaluation.recordings import ROLLOUT_PREFIX
 from worldline_core.evaluation.scores import SCORES_FILE, Interval
-from worldline_core.pages.page import Line, line_chart, render, words
-from worldline_core.pictures import contact_sheet, jpeg_bytes
+from worldline_core.pages.page import render
 from worldline_core.report.context import headline_metrics
-from worldline_core.report.videos import compared_rows
-from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import MANIFEST_NAME, digest_value, linked_folder, read_json, verify_artifact
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import exclusive_lock
@@ -51,9 +45,7 @@ FALSE_ALARM = 0.02
 REFERENCE_NIGHTS = 7
 HISTORY_FILE = "history.jsonl"
 """A `Night` a line, oldest first; its scores by recording are in `scores/`."""
-PICTURES = "pictures"
 HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "psnr@head", "accuracy", "success")
-MOST_CHARTS, MOST_TICKS, MOST_PICTURES = 8, 8, 4
 
 Verdict = Literal["better", "worse", "same", "new", "missing"]
 
@@ -277,12 +269,11 @@ def night_tests(present: Series, good: Sequence[Series]) -> dict[str, PairedTest
 
 @dataclass(frozen=True)
 class NightlyComparison:
-    """A night against the last good one before it; ``pictures`` are files by what they show."""
+    """A night against the last good one before it."""
 
     night: str
     previous: str | None
     changes: Sequence[MetricChange]
-    pictures: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def worse(self) -> list[MetricChange]:
@@ -392,32 +383,22 @@ def read_history(history: Path) -> list[Night]:
 # The page of the nights
 
 
-def compare_with_history(
-    scores: Mapping[str, Path], history: Path, night: str | None = None, artifacts: Mapping[str, Path] | None = None
-) -> NightlyComparison:
-    """Record a night, and write `comparison.json`, pictures and the page with trends into the history's folder.
+def compare_with_history(scores: Mapping[str, Path], history: Path, night: str | None = None) -> NightlyComparison:
+    """Record a night, and write `comparison.json` and its page into the history's folder.
 
     Args:
         scores: finished evaluations by step name.
         night: its name, as in `record_night`.
-        artifacts: ``filter`` (the episodes) and ``rollout.<method>`` of this night, for pictures.
 
     Raises:
         ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
     """
     compared = record_night(history, night, scores)
-    compared = replace(compared, pictures=_write_pictures(history, compared, artifacts or {}))
     changes = [asdict(change) | {"verdict": change.verdict} for change in compared.changes]
     content = asdict(compared) | {"changes": changes, "regressions": compared.regressions}
     write_json_atomic(history / "comparison.json", content)
-    nights = read_history(history)
-    page = render(
-        "report/nights.html",
-        title="WorldLine nightly evaluation",
-        compared=compared,
-        nights=nights,
-        charts=_trends(nights),
-    )
+    title, nights = "WorldLine nightly evaluation", read_history(history)
+    page = render("report/nights.html", title=title, compared=compared, nights=nights)
     write_bytes_atomic(history / "index.html", page.encode())
     return compared
 
@@ -428,54 +409,6 @@ def refuse_regressions(compared: NightlyComparison, history: Path) -> None:
         raise RegressionError(
             f"{len(compared.regressions)} of {len(compared.changes)} metrics became worse than in {compared.previous}",
             where=history / "index.html",
-            got="; ".join(str(change) for change in compared.worse)
-            + (f"; pictures: {', '.join(compared.pictures.values())}" if compared.pictures else ""),
+            got="; ".join(str(change) for change in compared.worse),
             next_step=f"find the cause; if this is the new normal: worldline nightly --accept {compared.night}",
         )
-
-
-def _write_pictures(history: Path, compared: NightlyComparison, artifacts: Mapping[str, Path]) -> dict[str, str]:
-    """Head views of the recordings that lost most, or of each method's first recording; replaces those of the night before."""
-    shutil.rmtree(history / PICTURES, ignore_errors=True)
-    rollouts = {
-        n.removeprefix("rollout."): RolloutSet.open(path) for n, path in artifacts.items() if n.startswith("rollout.")
-    }
-    if "filter" not in artifacts or not rollouts:
-        return {}
-    episodes = EpisodeSet.open(artifacts["filter"])
-    recorded = {row.episode_id for row in episodes.rows}
-    shown: dict[tuple[str, str], str] = {}
-    for change in compared.worse:
-        _, _, method, metric = change.metric.split("/", 3)
-        for recording, value in change.test.worst if change.test else ():
-            shown.setdefault((method, recording), f": {metric} became worse by {-value:.3f}")
-    written: dict[str, str] = {}
-    for method, recording in shown or [(name, rollout.episode_ids[0]) for name, rollout in rollouts.items()]:
-        usable = method in rollouts and recording in recorded and HEAD in rollouts[method].views(recording)
-        if usable and len(written) < MOST_PICTURES:
-            what = f"{recording}, {method}{shown.get((method, recording), '')}"
-            written[what] = f"{PICTURES}/{digest_value([compared.night, what])[:16]}.jpg"
-            sheet = contact_sheet(compared_rows(rollouts[method], episodes, recording, [HEAD]), title=what)
-            write_bytes_atomic(history / written[what], jpeg_bytes(sheet))
-    return written
-
-
-def _trends(nights: Sequence[Night]) -> list[Markup]:
-    """Headline metrics over the nights: a chart per metric and split, a line per method."""
-    grouped: dict[tuple[str, str, str], list[str]] = defaultdict(list)
-    for name in sorted({name for night in nights for name in night.metrics}):
-        what, group, _, metric = name.split("/", 3)
-        if metric.startswith(HEADLINES):
-            grouped[what, group, metric].append(name)
-    shown = []
-    for (what, group, metric), names in sorted(grouped.items())[:MOST_CHARTS]:
-        lines = []
-        for index, name in enumerate(names[:8]):
-            points = [(i, night.metrics[name]) for i, night in enumerate(nights, 1) if name in night.metrics]
-            x, means, low, high = zip(*((i, v.mean, v.low, v.high) for i, v in points), strict=True)
-            lines.append(Line(name.split("/")[2], x, means, low, high, colour=f"c{index}", markers=True))
-        ticks = range(1, len(nights) + 1, max(1, len(nights) // MOST_TICKS))
-        x_label = f"night ({nights[0].night} to {nights[-1].night})"
-        title = f"{words(metric)} ({what}, {group})"
-        shown.append(line_chart(lines, title=title, x_label=x_label, y_label=metric, x_ticks=ticks))
-    return shown

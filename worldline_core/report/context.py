@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from markupsafe import Markup
 from pydantic import Field
@@ -49,8 +49,8 @@ SPLIT_LABELS = {
 }
 """Labels of the splits, in the report's order."""
 HEADLINES = ("robot_iou_exact", "robot_iou", "end_effector_error_px")
-"""Metrics that head the report, the most trustworthy first: IoU with the recording's exact masks, with the segmenter's own masks of
-the truth; and for robots that no segmenter knows the distance of the predicted tools from the true ones."""
+"""Metrics that head the report, the most trustworthy first: IoU with exact masks, with the segmenter's own masks of the truth; for
+robots that no segmenter knows, the distance of the predicted tools from the true ones."""
 
 
 class ReportConfig(StrictModel):
@@ -202,12 +202,14 @@ class ReportContext:
         inputs: artifact folders by name: a step (`curate`), or a step and a variant (`rollout.stage2`).
         run_parts: times, devices and versions, which are not reproducible: written to `run/run.js`, outside of the digested pages,
             and put into their slots when a page is opened.
+        first_card: the first episode with videos, for the first page.
     """
 
     config: ReportConfig
     inputs: Mapping[str, Path]
     output: Path
     run_parts: dict[str, Markup] = field(default_factory=dict)
+    first_card: dict[str, Any] | None = None
 
     @cached_property
     def video_scores(self) -> VideoScores:

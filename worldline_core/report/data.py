@@ -26,7 +26,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.instructions import mentions_outcome
 from worldline_core.errors import DataError
 from worldline_core.pages.page import Table, duration, render, words
-from worldline_core.pictures import SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
+from worldline_core.pictures import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.store.artifact_files import JsonObject, linked_folder, read_json, read_rows, verify_artifact
 from worldline_core.store.atomic import write_bytes_atomic
@@ -35,10 +35,7 @@ from worldline_core.untrusted_text import cut, visible
 TITLE = "Data and filters"
 FINDINGS_FILE = "findings.parquet"
 UNKNOWN = "unknown"
-PICTURES = "pictures"
-PAGE_ROWS, ROWS_PER_SOURCE, MOMENTS, OVERLAYS = 12, 6, 6, 4
-SHEET_WIDTH = 1180
-MOST_INSTRUCTIONS, MOST_LEAKS = 15, 4
+PAGE_ROWS, MOMENTS, OVERLAYS, MOST_LEAKS = 12, 6, 4, 4
 LONGEST_CELL = 300
 """Characters of one cell of a Markdown table."""
 HUB_LICENSES = re.compile(
@@ -94,16 +91,11 @@ class DatasetFacts:
 
     @property
     def summary(self) -> str:
-        """Two sentences about size and outcomes."""
-        rows, outcomes = self.rows, Counter(row.outcome for row in self.rows)
-        distinct = {
-            name: len({getattr(row, name) for row in rows} - {""}) for name in ("embodiment", "scene", "instruction")
-        }
+        """A sentence about size, and one about outcomes."""
+        counts = [len({getattr(row, name) for row in self.rows} - {""}) for name in ("scene", "instruction")]
         return (
-            f"{recorded_time(rows)} in {self.num_episodes} episodes ({len(rows)} segments); "
-            + ", ".join(f"{count} {name}s" for name, count in distinct.items())
-            + f". Outcomes: {outcomes['success']} successes, {outcomes['failure']} failures, {outcomes['unknown']} unknown;"
-            " they are labels for evaluation and never reach a model."
+            f"{recorded_time(self.rows)} in {self.num_episodes} episodes ({len(self.rows)} segments), {counts[0]} scenes,"
+            f" {counts[1]} instructions. Outcomes are labels for evaluation and never reach a model."
         )
 
     @property
@@ -186,12 +178,6 @@ class DatasetFacts:
         return tables
 
     @property
-    def instructions(self) -> Table:
-        """The most frequent instructions."""
-        found = Counter(sorted(row.instruction for row in self.rows)).most_common(MOST_INSTRUCTIONS)
-        return Table(("Instruction", "Episodes"), [(text or "(none)", count) for text, count in found], [1])
-
-    @property
     def leakage(self) -> str:
         """Scenes that both sides of the split share, or that look alike on them."""
         learnt = {row.scene for row in self.rows if row.split in ("train", "validation")}
@@ -255,28 +241,18 @@ def sheet_rows(episodes: EpisodeSet, positions: Iterable[int]) -> tuple[list[She
 # The dataset card
 
 
-def write_card(folder: Path, output: Path, title: str | None = None) -> list[Path]:
+def write_card(folder: Path, output: Path, title: str | None = None) -> Path:
     """Write the card of a finished EpisodeSet; equal sets give equal bytes.
 
     Args:
-        output: gets README.md and pictures/.
+        output: gets README.md.
         title: default: "EpisodeSet" and the folder's name.
-
-    Returns: the files written.
 
     Raises: DataError when the folder is no EpisodeSet; ArtifactError when it is damaged.
     """
     verify_artifact(folder)
-    facts, episodes = DatasetFacts.read(folder), EpisodeSet.open(folder)
-    heading = title or f"EpisodeSet {folder.resolve().name}"
-    pictures: list[tuple[str, Path]] = []
-    for number, name in enumerate(facts.by_source):
-        own = [i for i, row in enumerate(facts.rows) if row.source == name and row.primary_view in row.views]
-        rows, _ = sheet_rows(episodes, choose_rows(facts.rows, own, ROWS_PER_SOURCE))
-        if rows:
-            pictures.append((name, output / PICTURES / f"source_{number:02d}.jpg"))
-            write_bytes_atomic(pictures[-1][1], jpeg_bytes(contact_sheet(rows, min_width=SHEET_WIDTH)))
-    text = render("report/card.md", facts=facts, heading=heading, pictures=pictures, plain=plain, table=markdown_table)
+    facts, heading = DatasetFacts.read(folder), title or f"EpisodeSet {folder.resolve().name}"
+    text = render("report/card.md", facts=facts, heading=heading, plain=plain, table=markdown_table)
     license_name = re.sub(r"[^a-z0-9.+-]+", "-", " and ".join(facts.licenses).lower()).strip("-") or UNKNOWN
     known = HUB_LICENSES.fullmatch(license_name)
     datasets = sorted({row.dataset for row in facts.rows if not row.dataset.startswith("..")})
@@ -290,7 +266,7 @@ def write_card(folder: Path, output: Path, title: str | None = None) -> list[Pat
     )
     card = DatasetCard(f"---\n{header.to_yaml()}\n---\n\n{text}\n")
     write_bytes_atomic(output / "README.md", str(card).encode())
-    return [output / "README.md", *(path for _, path in pictures)]
+    return output / "README.md"
 
 
 def plain(text: str) -> str:

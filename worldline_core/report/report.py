@@ -36,7 +36,7 @@ from worldline_core.report.results import (
     quality_section,
     training_section,
 )
-from worldline_core.report.videos import overview_video, videos_section
+from worldline_core.report.videos import videos_section
 from worldline_core.store.artifact_files import JsonObject
 from worldline_core.store.atomic import remove_unfinished
 
@@ -118,27 +118,13 @@ class HeadView(NamedTuple):
         """The first method of a kind with weights of this origin."""
         return next((m for m in self.scores.methods(self.group) if (m.kind, m.group) == (kind, group)), None)
 
-    def difference(self, second: Method | None, first: Method | None = None) -> tuple[float, float] | None:
-        """Interval of how much better a method (default: the main one) is than `second`, in paired recordings."""
-        names = (first or self.primary).name, "" if second is None else second.name
-        found = self.scores.difference(self.group, *names, f"{self.metric.name}@head")
+    def over(self, second: Method | None) -> tuple[float, float] | None:
+        """Interval of how much better the main method is than `second`, in paired recordings."""
+        name = "" if second is None else second.name
+        found = self.scores.difference(self.group, self.primary.name, name, f"{self.metric.name}@head")
         if found is None:
             return None
         return (-found["high"], -found["low"]) if self.metric.lower_is_better else (found["low"], found["high"])
-
-    def figure(self, method: Method, what: str) -> Figure | None:
-        """A method's value beside that of copying the first frame."""
-        copy = self.method("copy", "baseline")
-        mean, reference = (
-            m and self.scores.value(self.group, m.name, f"{self.metric.name}@head") for m in (method, copy)
-        )
-        if mean is None or reference is None:
-            return None
-        where = f"{method.long_label}; {SPLIT_LABELS[self.group]}, head view"
-        return Figure(
-            what, mean, "recordings", "copying the first frame", reference["mean"], self.difference(copy, method), where,
-            self.metric.unit, self.metric.lower_is_better,
-        )  # fmt: skip
 
 
 def head_view(context: ReportContext) -> HeadView | None:
@@ -151,9 +137,9 @@ def head_view(context: ReportContext) -> HeadView | None:
 
 
 def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
-    """The headline, one video, up to four figures beside their references, and the list of pages."""
+    """The headline, one video, up to three figures beside their references, and the list of pages."""
     view = head_view(context)
-    controls, own = (None, None) if view is None else video_figures(view)
+    controls = None if view is None else video_figure(view)
     planning = planning_figure(context)
     return render(
         "report/overview.html",
@@ -162,20 +148,28 @@ def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
         sections=sections,
         next=None,
         headline=headline(context, view, controls, planning),
-        figures=list(filter(None, (controls, planning, policy_figure(context), own))),
-        video=overview_video(context),
+        figures=list(filter(None, (controls, planning, policy_figure(context)))),
+        card=context.first_card,
         entries=list(zip(sections, PAGES.values(), strict=False)),
     )
 
 
-def video_figures(view: HeadView) -> tuple[Figure | None, Figure | None]:
-    """The main method, and this run's own method of the same kind, beside a copy of the first frame."""
+def video_figure(view: HeadView) -> Figure | None:
+    """The main method beside a copy of the first frame."""
     tools = view.metric.name == "end_effector_error_px"
     what = f"{'distance' if tools else 'overlap'} of the predicted {'tools' if tools else 'robot'}"
     what += " from the recorded ones" if tools else " with the recorded one (IoU)"
-    own = view.method(view.primary.kind, "run")
-    same = own and view.figure(own, f"the same for the {own.label} that this run trained itself")
-    return view.figure(view.primary, what), None if own == view.primary else same
+    copy = view.method("copy", "baseline")
+    mean, reference = (
+        m and view.scores.value(view.group, m.name, f"{view.metric.name}@head") for m in (view.primary, copy)
+    )
+    if mean is None or reference is None:
+        return None
+    where = f"{view.primary.long_label}; {SPLIT_LABELS[view.group]}, head view"
+    return Figure(
+        what, mean, "recordings", "copying the first frame", reference["mean"], view.over(copy), where,
+        view.metric.unit, view.metric.lower_is_better,
+    )  # fmt: skip
 
 
 def planning_figure(context: ReportContext) -> Figure | None:
@@ -229,7 +223,7 @@ def headline(context: ReportContext, view: HeadView | None, controls: Figure | N
     """The result in one or two short sentences; its numbers are on the cards below."""
     clauses: list[str] = []
     if view is not None and controls is not None:
-        shuffled = view.difference(view.method(f"{view.primary.kind}_shuffled", view.primary.group))
+        shuffled = view.over(view.method(f"{view.primary.kind}_shuffled", view.primary.group))
         follows = "follows the controls" if shuffled is None or shuffled[0] > 0 else "does not yet follow the controls"
         clauses.append(follows if controls.verdict == "better" else "does not yet beat a copy of the first frame")
     if planning is not None:

@@ -7,18 +7,16 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 from markupsafe import Markup, escape
 
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, metric_of
+from worldline_core.evaluation.metric_registry import METRICS, metric_of
 from worldline_core.evaluation.paired import EVALUATIONS
-from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.model.model_card import DESCRIPTIONS, Measurement, model_card, model_facts
-from worldline_core.pages.page import Line, Table, interval, interval_chart, line_chart, render, words
+from worldline_core.pages.page import Line, Table, interval, line_chart, render, words
 from worldline_core.report.context import (
     SPLIT_LABELS,
     ReportContext,
@@ -43,9 +41,6 @@ from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.training_state import PROBE_LOG
 
 ALL = "all"
-EDGE_BLOCKS = 5
-MODELS = (TRUE_METHOD, "stage2", "causal", "other")
-"""Kinds of methods with the true controls."""
 QUALITY = (
     "Mean over time for each trajectory, then over trajectories, with 95\u202f% bootstrap intervals over trajectories. Robot IoU,"
     " exact: a segmenter's mask of the prediction against the recording's exact mask. Robot IoU, segmenter: the same segmenter"
@@ -58,20 +53,17 @@ def quality_section(context: ReportContext) -> Section:
     scores = context.video_scores
     if not scores.groups:
         return Section("quality", "Video quality", missing="no video evaluation was given (input evaluate_video).")
-    names = {name for methods in scores.metrics.values() for found in methods.values() for name in found}
-    measured = {metric.name for metric in map(metric_of, names) if metric}
     return context.section(
         "quality",
         "Video quality",
         QUALITY,
-        asked=[METRICS[name] for name in ON_REQUEST if name in measured],
         instruments=[(s["description"], instrument_accuracy(scores, s)) for s in scores.summary["segmenters"]],
         unavailable=sorted(scores.summary["unavailable"].items()),
         groups=[
             (
                 SPLIT_LABELS[group].capitalize(),
                 [table for view in VIEWS for table in metric_tables(scores, group, view)],
-                quality_charts(scores, group),
+                *beside_the_main_method(scores, group),
             )
             for group in scores.groups
         ],
@@ -111,51 +103,39 @@ def metric_tables(scores: VideoScores, group: str, view: str) -> list[Table]:
     return tables
 
 
-def quality_charts(scores: VideoScores, group: str) -> list[Markup]:
-    """The headline and SSIM of the head view: the main method beside every other, and the drift of predictions along time."""
+def beside_the_main_method(scores: VideoScores, group: str) -> tuple[Table | None, list[Markup]]:
+    """The head view's headline: the main method minus every other; and charts of headline and SSIM along time."""
     primary = scores.primary(group)
+    metric = primary and scores.headline(group, primary.name)
     if primary is None:
-        return []
-    differences, drifts = list[Markup](), list[Markup]()
-    for metric in filter(None, (scores.headline(group, primary.name), METRICS["ssim"])):
-        dots, series = list[tuple[str, JsonObject, str]](), list[Line]()
+        return None, []
+    found = metric and {
+        m: scores.difference(group, primary.name, m.name, f"{metric.name}@head") for m in scores.methods(group)
+    }
+    rows = [(m.long_label, interval(value, 3, signed=True)) for m, value in (found or {}).items() if value]
+    headings = f"{primary.long_label} minus", metric.heading if metric else ""
+    table = Table(headings, rows, [1], "Paired over trajectories, head view") if rows else None
+    drifts = list[Markup]()
+    for drifting in filter(None, (metric, METRICS["ssim"])):
+        series = list[Line]()
         for m in scores.methods(group):
-            if found := scores.difference(group, primary.name, m.name, f"{metric.name}@head"):
-                dots.append((m.long_label, found, m.colour))
-            key = m.name, group, "head", metric.name
-            rows = [row for row in scores.by_frame if (row["method"], row["split"], row["view"], row["metric"]) == key]
-            if points := sorted((row["frame"], row["mean"]) for row in rows):
+            key = m.name, group, "head", drifting.name
+            shown = [row for row in scores.by_frame if (row["method"], row["split"], row["view"], row["metric"]) == key]
+            if points := sorted((row["frame"], row["mean"]) for row in shown):
                 series.append(Line(m.long_label, *zip(*points, strict=True), colour=m.colour, dashed=m.group == "run"))
-        if dots:
-            title = f"{primary.long_label} minus each other: {metric.title}"
-            side = "left" if metric.lower_is_better else "right"
-            value_label = f"paired difference, 95 % interval; {side} of zero, {primary.label} is better"
-            differences.append(interval_chart(dots, title=title, value_label=value_label))
         if series:
-            title = f"{metric.title} along the prediction"
-            drifts.append(line_chart(series, title=title, x_label="frame (0 is given)", y_label=metric.title))
-    return differences + drifts
-
-
-def block_costs(content: JsonObject) -> tuple[float, float] | None:
-    """Median seconds of a block of the long rollout, and the ratio of the last five to the first five; None for fewer than ten.
-
-    Processor seconds where they were recorded: other programs do not stretch them.
-    """
-    long = content.get("long_rollout") or {}
-    blocks = long.get("block_processor_seconds") or long.get("block_seconds") or []
-    if len(blocks) < 2 * EDGE_BLOCKS:
-        return None
-    return median(blocks), median(blocks[-EDGE_BLOCKS:]) / median(blocks[:EDGE_BLOCKS])
+            title = f"{drifting.title} along the prediction"
+            drifts.append(line_chart(series, title=title, x_label="frame (0 is given)", y_label=drifting.title))
+    return table, drifts
 
 
 def cost(context: ReportContext) -> Markup | None:
-    """Time per frame and per block; a slot, because times differ from run to run."""
+    """Time per frame; a slot, because times differ from run to run."""
     timed = {name: read_json(rollout.root / "run" / "speed.json") for name, rollout in context.rollouts.items()}
     timed = {name: content for name, content in timed.items() if content.get("seconds_per_frame") is not None}
-    rows = [(method(name), name.startswith("banks_"), content, block_costs(content)) for name, content in timed.items()]
+    rows = [(method(name), name.startswith("banks_"), content) for name, content in timed.items()]
     devices = sorted({str(content.get("device_name") or "unknown device") for content in timed.values()})
-    table = render("report/cost.html", rows=rows, devices=devices, edge=EDGE_BLOCKS)
+    table = render("report/cost.html", rows=rows, devices=devices)
     return context.slot("cost", table, "Recorded when the report was made; see run/run.js.") if rows else None
 
 
@@ -199,23 +179,13 @@ def planning_evaluation(summary: JsonObject) -> dict[str, object]:
     """Values of a planning evaluation for the template."""
     methods, order = summary["methods"], in_order(summary["methods"])
     budgets = sorted({int(n) for values in methods.values() for n in values["budgets"]})
-    cases, x = {"count": len(summary["banks"])}, [float(n) for n in budgets]
+    cases = {"count": len(summary["banks"])}
     success = {
         m.name: {
             int(n): share_interval({**cases, **found["success"]}) for n, found in methods[m.name]["budgets"].items()
         }
         for m in order
     }
-    series = [Line("direct execution", x, [summary["direct_execution"]["mean"]] * len(x), colour="c5", dashed=True)]
-    for m in order:
-        points = [(n, found["mean"], found["low"], found["high"]) for n, found in sorted(success[m.name].items())]
-        own, mean, low, high = zip(*points, strict=True)
-        bounds = (low, high) if m.kind in MODELS else ((), ())
-        series.append(Line(m.long_label, own, mean, *bounds, m.colour, dashed=m.group == "run", markers=True))
-    chart = line_chart(
-        series, title="Success of the chosen candidate, 95 % interval over banks", x_label="candidates N", y_label="success",
-        log_x=True, x_ticks=x, shares=True,
-    )  # fmt: skip
     families = sorted({bank["task_family"] for bank in summary["banks"].values()})
     most = f"N = {budgets[-1]}"
     return {
@@ -228,7 +198,6 @@ def planning_evaluation(summary: JsonObject) -> dict[str, object]:
             *(f"N = {n}" for n in budgets), f"Gain at {most}", "over the best shortcut",
             *(f"{words(family)}, {most}" for family in families),
         ],
-        "chart": chart,
     }  # fmt: skip
 
 
@@ -297,8 +266,7 @@ def training_section(context: ReportContext) -> Section:
         " the same clips, noise and noise levels, with the averaged weights. Tool error: how far the tools are from where the"
         " controls put them; a model that follows its controls is worse under another clip's."
     )
-    missing = [title for step, title in STAGES.items() if step not in given and step != "train_tokenizer"]
-    return context.section("training", "Training", lead, missing=missing, charts=charts)
+    return context.section("training", "Training", lead, charts=charts)
 
 
 def read_curves(file: Path) -> Curves:
@@ -399,14 +367,12 @@ def provenance_section(context: ReportContext) -> Section:
     )
 
 
-def written_card(context: ReportContext, name: str, folder: Path) -> str:
-    """The card that came with a model; else one from the run's artifacts, which is written to ``cards/<name>.md``."""
-    given = folder / "MODEL_CARD.md"
-    if given.is_file():
-        return given.read_text(encoding="utf-8", errors="replace")
-    if not (folder / DESCRIPTIONS[0]).is_file():
-        return "No card came with this model."
+def written_card(context: ReportContext, name: str, folder: Path) -> str | None:
+    """``cards/<name>.md``: the card that came with a model, or one from the run's artifacts; None for a tokenizer without one."""
+    given, file = folder / "MODEL_CARD.md", f"cards/{safe_stem(name)}.md"
+    if not given.is_file() and not (folder / DESCRIPTIONS[0]).is_file():
+        return None
     evaluations = [context.inputs[step] for step in EVALUATIONS if step in context.inputs]
-    text = model_card(folder, measurements(folder, evaluations))
-    write_bytes_atomic(context.output / "cards" / f"{safe_stem(name)}.md", text.encode())
-    return text.partition("\n---\n")[2]
+    made = None if given.is_file() else model_card(folder, measurements(folder, evaluations)).encode()
+    write_bytes_atomic(context.output / file, given.read_bytes() if made is None else made)
+    return file

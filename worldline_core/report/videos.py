@@ -6,10 +6,8 @@ Episodes are never picked by hand: shown are the best, the median and the worst 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,24 +18,11 @@ from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import DataError
 from worldline_core.evaluation.recordings import stride_of
 from worldline_core.pages.page import words
-from worldline_core.pictures import (
-    Picture,
-    SheetRow,
-    WrittenVideo,
-    draw_tag,
-    evenly_spaced,
-    side_by_side,
-    write_side_by_side,
-    write_video,
-)
-from worldline_core.report.context import SPLIT_LABELS, Method, ReportContext, Section, VideoScores, in_order
+from worldline_core.pictures import SheetRow, WrittenVideo, evenly_spaced, write_side_by_side
+from worldline_core.report.context import GROUPS, SPLIT_LABELS, Method, ReportContext, Section, VideoScores, in_order
 from worldline_core.rollout.rollout_set import RolloutSet
 
 TITLE = "Predicted videos"
-GROUP_CAPTIONS = {
-    "shipped": "Long-trained: the checkpoints that ship with the project",
-    "run": "This run: what its own training reached",
-}
 MOST_COLUMNS, IN_A_LINE = 6, 3
 """Width of one video: a phone shows three columns beside each other."""
 MOMENTS = 6
@@ -83,18 +68,11 @@ def choose_episodes(scores: VideoScores, available: Sequence[str]) -> list[Chose
     ]
 
 
-def chosen_episodes(context: ReportContext) -> list[ChosenEpisode]:
-    """The episodes shown in video; the first is the median of the held-out ones."""
-    if context.episodes is None or not context.rollouts:
-        return []
-    predicted = {name for rollout in context.rollouts.values() for name in rollout.episode_ids}
-    known = predicted & {row.episode_id for row in context.episodes.rows}
-    return choose_episodes(context.video_scores, sorted(known))
-
-
 def videos_section(context: ReportContext) -> Section:
     """A card for each chosen episode."""
-    episodes, chosen = context.episodes, chosen_episodes(context)
+    episodes, predicted = context.episodes, {n for rollout in context.rollouts.values() for n in rollout.episode_ids}
+    known = predicted & {row.episode_id for row in episodes.rows} if episodes else set[str]()
+    chosen = choose_episodes(context.video_scores, sorted(known)) if known else []
     if episodes is None or not chosen:
         missing = "no prediction of a given episode was given (inputs rollout.<method>, and filter or curate)."
         return Section("videos", TITLE, missing=missing)
@@ -104,7 +82,9 @@ def videos_section(context: ReportContext) -> Section:
             " The episodes are not chosen by hand: they are the median, the best and the worst by the first model's prediction of"
             " the robot."
         )
-    return context.section("videos", TITLE, lead, cards=[card(context, episodes, *item) for item in enumerate(chosen)])
+    cards = [card(context, episodes, *item) for item in enumerate(chosen)]
+    context.first_card = next((found for found in cards if found["panels"]), None)
+    return context.section("videos", TITLE, lead, cards=cards)
 
 
 def methods_of_group(context: ReportContext, episode_id: str, group: str) -> list[Method]:
@@ -121,7 +101,7 @@ def card(context: ReportContext, episodes: EpisodeSet, number: int, item: Chosen
 
     def panel(view: str) -> tuple[str, list[tuple[WrittenVideo, str]]]:
         written: list[tuple[WrittenVideo, str]] = []
-        for group, caption in GROUP_CAPTIONS.items():
+        for group in ("shipped", "run"):
             shown = [(m.label, context.rollouts[m.name]) for m in methods_of_group(context, name, group)]
             columns = {
                 label: VideoFrames(videos.clip(name, view)) for label, videos in shown if view in videos.views(name)
@@ -130,36 +110,13 @@ def card(context: ReportContext, episodes: EpisodeSet, number: int, item: Chosen
                 columns = {"true": VideoFrames(episodes.clip(position, view)), **columns}
                 path, height = context.media / f"episode{number}_{group}_{view}.mp4", context.config.tile_height
                 made = write_side_by_side(path, columns, row.fps, tile_height=height, most=IN_A_LINE)
-                written.append((made, f"{caption} ({words(view)} view, {made.num_frames} frames)."))
+                written.append((made, f"{GROUPS[group].capitalize()} ({words(view)} view, {made.num_frames} frames)."))
         return view, written
 
     # The report runs last and alone; encoder and resizing let go of the interpreter, so threads use the other cores.
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         panels = [found for found in pool.map(panel, [view for view in VIEWS if view in row.views]) if found[1]]
     return {"item": item, "row": row, "number": number, "panels": panels}
-
-
-def overview_video(context: ReportContext) -> dict[str, Any] | None:
-    """Truth beside the first model's prediction, one row per view, of the first chosen episode; None without one."""
-    episodes, chosen = context.episodes, chosen_episodes(context)[:1]
-    methods = [
-        m for item in chosen for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)
-    ]
-    if episodes is None or not methods:
-        return None
-    item, method = chosen[0], methods[0]
-    index, rollout = episodes.position(item.episode_id), context.rollouts[method.name]
-    row, rows = episodes.rows[index], list[Iterator[Picture]]()
-    count = row.video_frames
-    for view in [v for v in VIEWS if v in row.views and v in rollout.views(item.episode_id)]:
-        predicted = VideoFrames(rollout.clip(item.episode_id, view))
-        columns = {"recorded": VideoFrames(episodes.clip(index, view)), f"predicted, {method.label}": predicted}
-        tagged = partial(draw_tag, text=words(view))
-        rows.append(map(tagged, side_by_side(columns, tile_height=192, labels=not rows)))
-        count = min(count, len(predicted))
-    pictures = (np.concatenate(tiles, axis=0) for tiles in islice(zip(*rows, strict=False), count))
-    made = write_video(context.media / "overview.mp4", pictures, count, row.fps)
-    return {"video": made, "item": item, "row": row, "method": method}
 
 
 def compared_rows(rollout: RolloutSet, episodes: EpisodeSet, episode_id: str, views: Sequence[str]) -> list[SheetRow]:
