@@ -126,8 +126,9 @@ def pull(where: str, folder: Path) -> FileList:
             contents = _read_list(location, present)
             _check_names(contents.files, where)
             _raise_mismatch([name for name, file in contents.files.items() if present.get(name) != file.size], where)
-            for path in folder_files(unfinished):  # of an earlier, interrupted pull
-                if path.relative_to(unfinished).as_posix() not in contents.files:
+            for path in folder_files(unfinished, everything=True):  # of an earlier, interrupted pull
+                name = path.relative_to(unfinished)
+                if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
                     path.unlink()
             missing = [name for name, file in contents.files.items() if not file.fits(unfinished / name)]
             with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:

@@ -102,6 +102,17 @@ def test_a_list_is_read_up_to_its_bound_only(place: Path, tmp_path: Path, monkey
         push(tmp_path / "whole", str(place))
 
 
+def test_files_of_another_set_that_was_begun_here_are_removed(place: Path, tmp_path: Path) -> None:
+    (tmp_path / "back.partial/a").mkdir(parents=True)
+    for name in ("manifest.json", "a/b.bin", "index.parquet"):
+        (tmp_path / "back.partial" / name).write_text("of another set")
+    listed = pull(str(place), tmp_path / "back").files
+    found = {
+        path.relative_to(tmp_path / "back").as_posix() for path in (tmp_path / "back").rglob("*") if path.is_file()
+    }
+    assert found == set(listed)
+
+
 def test_two_who_pull_into_one_folder_at_once(place: Path, tmp_path: Path) -> None:
     def work(_: int) -> str:
         try:
