@@ -70,7 +70,7 @@ def test_a_state_of_another_run_or_other_episodes_is_refused(inputs, tmp_path, m
 
 def test_training_learns_and_the_controls_matter(world, model_config, tmp_path):
     save_checkpoint(tmp_path / "base", fresh(model_config), kind="base", action_contract=None)
-    values = trainer(45, batch_size=8, ema_decay=0.95)
+    values = trainer(45, batch_size=8, ema_decay=0.95, save_every_steps=0)
     config = stage2(45, trainer=values, weighting={"kind": "sample"}, action_dropout=0.0)
     result = train_stage2(config, {**world.inputs, "stage1": tmp_path / "base"}, tmp_path / "run")
     found = losses(tmp_path / "run")

@@ -268,8 +268,10 @@ class TrainingStates:
             TrainingError: the state before it could not be written.
         """
         from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageWriter
+        from torch.distributed.checkpoint.logger import _dcp_logger
         from torch.distributed.checkpoint.state_dict_saver import async_save
 
+        _dcp_logger.setLevel(logging.INFO)  # at DEBUG it describes every tensor twice
         if (failure := self.collect(wait=True)) is not None:
             raise self.failed(failure)
         begun = time.monotonic()
