@@ -7,27 +7,20 @@ backward pass, as the tokenizers and Stage III do.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import torch
-from torch import nn
-from torch._subclasses.fake_tensor import FakeTensor
+from torch import Tensor, nn
+from torch._guards import detect_fake_mode
+from torch._subclasses.fake_tensor import FakeTensor, in_kernel_invocation_manager
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.flop_counter import flop_registry
+from torch.utils.flop_counter import flop_registry, sdpa_backward_flop_count, sdpa_flop_count
 
 WHOLE = 8
 """Most layers of a model that is traced as it is."""
 SHALLOW = (4, 5)
 """Depths that the line of a deeper model goes through: with fewer layers its worst moment can be another one."""
-_ATEN = torch.ops.aten
-_OPERATIONS: dict[Any, Callable[..., float]] = {
-    **flop_registry,  # which knows a card's attention, but not a processor's
-    _ATEN._scaled_dot_product_flash_attention_for_cpu: flop_registry[_ATEN._scaled_dot_product_flash_attention],
-    _ATEN._scaled_dot_product_flash_attention_for_cpu_backward: flop_registry[
-        _ATEN._scaled_dot_product_flash_attention_backward
-    ],
-}
 
 
 class Held(NamedTuple):
@@ -38,16 +31,35 @@ class Held(NamedTuple):
     operations: float = 0.0
 
 
+class _Result(NamedTuple):
+    """What an operation returns: a value, one of its arguments, or a tensor like ``like``, on an argument's storage or its own."""
+
+    value: Any = None
+    argument: int | None = None
+    like: tuple[torch.Size, tuple[int, ...], torch.dtype, int, torch.device] | None = None
+
+
+class _Known(NamedTuple):
+    results: list[_Result]
+    form: type | None
+    """Of several results; None: a single one."""
+    operations: float
+
+
 class _Tracker(TorchDispatchMode):
     """Follows the storages that a computation allocates and frees, and counts its operations.
 
-    Decisions that depend on values (a loss is finite, a text is padded) see 0.5, 1 or True.
+    Decisions that depend on values (a loss is finite, a text is padded) see 0.5, 1 or True. What an operation returns for tensors of
+    some shapes is kept for the next time, which costs a third of what FakeTensorMode's own memory of it does.
     """
+
+    _known: ClassVar[dict[tuple[Any, ...], _Known]] = {}
 
     def __init__(self) -> None:
         super().__init__()
         self.live = self.most = 0
         self.operations = 0.0
+        self._shapes: Any = detect_fake_mode()
         self._followed: set[int] = set()
 
     @classmethod
@@ -59,32 +71,87 @@ class _Tracker(TorchDispatchMode):
     ) -> Any:
         if func is torch.ops.prim.device.default:
             return args[0].fake_device
-        if func is _ATEN._local_scalar_dense.default:
+        if func is torch.ops.aten._local_scalar_dense.default:
             return True if args[0].dtype == torch.bool else 0.5 if args[0].is_floating_point() else 1
+        given: list[FakeTensor] = []
+        key: list[Any] = [func]
+        repeatable = _describe((*args, *(kwargs or {}).items()), given, key) and torch.Tag.inplace_view not in func.tags
+        if (known := self._known.get(tuple(key)) if repeatable else None) is not None:
+            self.operations += known.operations
+            values = [self._again(result, given) for result in known.results]
+            return values[0] if known.form is None else known.form(values)
         returned = func(*args, **(kwargs or {}))
-        if (count := _OPERATIONS.get(func._overloadpacket)) is not None:
-            self.operations += count(*args, **(kwargs or {}), out_val=returned)
-        given = {storage._cdata for storage in _storages((*args, *(kwargs or {}).values()))}
-        for storage in _storages(returned if isinstance(returned, tuple | list) else (returned,)):
-            if storage._cdata not in self._followed and storage._cdata not in given:
-                self._followed.add(storage._cdata)
-                self.live += storage.nbytes()
-                self.most = max(self.most, self.live)
-                weakref.finalize(storage, self._freed, storage._cdata, storage.nbytes())
+        form = type(returned) if isinstance(returned, tuple | list) else None
+        results = [self._result(value, given) for value in (returned if form else (returned,))]
+        known = _Known(results, form, _operations(func, args, kwargs or {}, returned))
+        self.operations += known.operations
+        if repeatable:
+            self._known[tuple(key)] = known
         return returned
+
+    def _result(self, value: Any, given: list[FakeTensor]) -> _Result:
+        if not isinstance(value, FakeTensor):
+            return _Result(value)
+        if (same := next((n for n, tensor in enumerate(given) if tensor is value), None)) is not None:
+            return _Result(argument=same)
+        key = value.untyped_storage()._cdata
+        shared = next((n for n, tensor in enumerate(given) if tensor.untyped_storage()._cdata == key), None)
+        if shared is None:
+            self._follow(value.untyped_storage())
+        like = (value.shape, value.stride(), value.dtype, int(value.storage_offset()), value.fake_device)
+        return _Result(argument=shared, like=like)
+
+    def _again(self, result: _Result, given: list[FakeTensor]) -> Any:
+        if result.like is None:
+            return result.value if result.argument is None else given[result.argument]
+        shape, stride, dtype, offset, device = result.like
+        with in_kernel_invocation_manager(self._shapes):
+            tensor = torch.empty_strided(shape, stride, dtype=dtype, device="meta")
+            if result.argument is not None:
+                tensor.set_(given[result.argument].untyped_storage(), offset, shape, stride)
+        fake = FakeTensor(self._shapes, tensor, device)
+        if result.argument is None:
+            self._follow(fake.untyped_storage())
+        return fake
+
+    def _follow(self, storage: torch.UntypedStorage) -> None:
+        if storage._cdata not in self._followed:
+            self._followed.add(storage._cdata)
+            self.live += storage.nbytes()
+            self.most = max(self.most, self.live)
+            weakref.finalize(storage, self._freed, storage._cdata, storage.nbytes())
 
     def _freed(self, key: int, size: int) -> None:
         self._followed.remove(key)
         self.live -= size
 
 
-def _storages(values: Iterable[Any]) -> Iterator[torch.UntypedStorage]:
-    """Storages of the tensors among values and lists of them."""
+def _describe(values: Iterable[Any], given: list[FakeTensor], key: list[Any]) -> bool:
+    """Append tensors to ``given``, and to ``key`` what the result depends on; False where that is more than shapes."""
     for value in values:
         if isinstance(value, FakeTensor):
-            yield value.untyped_storage()
+            given.append(value)
+            key.append((value.dtype, value.shape, value.stride(), value.storage_offset(), value.fake_device))
         elif isinstance(value, list | tuple):
-            yield from _storages(value)
+            key.append(len(value))
+            if not _describe(value, given, key):
+                return False
+        elif isinstance(value, Tensor):
+            return False
+        else:
+            key.append((type(value), value))
+    return True
+
+
+def _operations(func: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], returned: Any) -> float:
+    """Multiplications and additions of products of matrices, convolutions and attention."""
+    packet = func._overloadpacket
+    if packet is torch.ops.aten._scaled_dot_product_flash_attention_for_cpu:
+        return sdpa_flop_count(*(value.shape for value in args[:3]))
+    if packet is torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward:
+        return sdpa_backward_flop_count(*(value.shape for value in args[:4]))
+    count = flop_registry.get(packet)
+    return 0.0 if count is None else count(*args, **kwargs, out_val=returned)
 
 
 def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> Held:
