@@ -58,24 +58,6 @@ def test_known_functions_of_time_come_back(tmp_path: Path) -> None:
     assert np.array_equal(head.K, [[20, 0, 7.5], [0, 21, 5.5], [0, 0, 1]])
 
 
-def test_the_error_of_resampling_is_measured(tmp_path: Path) -> None:
-    recording = robot(jitter_s=0.004, seed=3)
-    recording.write(tmp_path / "a.mcap")
-    loaded = load(toy.declared(tmp_path))
-    # Counted again here, from the times that were sent; pictures were numbered in order of time.
-    times = {
-        topic: np.sort([sent.time_ns or sent.log_ns - 2_000_000 for sent in recording.sent if sent.topic == topic])
-        for topic in (HEAD, WRIST, STATES, "/command", "/tf")
-    }
-    shown = {view: toy.number_of(loaded.frames(view)) for view in loaded.views}
-    grid = times[HEAD][shown["head"][0]] + np.round(np.arange(loaded.episode.num_frames) * 1e9 / 30).astype(np.int64)
-    distances = {topic: np.abs(sent[None] - grid[:, None]) for topic, sent in times.items()}
-    for view, topic in (("head", HEAD), ("right_wrist", WRIST)):
-        assert np.array_equal(shown[view], distances[topic].argmin(axis=1))
-    largest = max(distance.min(axis=1).max() for distance in distances.values()) / 1e6
-    assert loaded.episode.conventions["resampling_max_ms"] == pytest.approx(largest, abs=1e-5)
-
-
 def test_messages_out_of_order_are_sorted_and_those_sent_twice_count_once(tmp_path: Path) -> None:
     def swapped(sent: list[Sent]) -> list[Sent]:
         return [sent[i ^ 1] if i ^ 1 < len(sent) else sent[i] for i in range(len(sent))]

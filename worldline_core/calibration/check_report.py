@@ -137,7 +137,7 @@ def table_text(check: CalibrationCheck) -> str:
     rows = [tuple(name.lower() for name in COLUMNS), *(episode.row for episode in check.episodes)]
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-    return "\n".join([*lines, "", *conclusion_lines(check)])
+    return "\n".join([*lines, "", *conclusion_lines(check), "", f"pictures: {check.output / 'index.html'}"])
 
 
 def conclusion_lines(check: CalibrationCheck) -> list[str]:
@@ -158,8 +158,7 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
         if found.config_lines:
             lines += ["  what repairs it, in the configuration of this source:"]
             lines += [f"    {line}" for line in found.config_lines]
-    lines += _single_episodes(check)
-    return [*lines, "", f"pictures: {check.output / 'index.html'}"]
+    return [*lines, *_single_episodes(check)]
 
 
 def _single_episodes(check: CalibrationCheck) -> list[str]:
@@ -213,7 +212,6 @@ def as_json(check: CalibrationCheck) -> dict[str, Any]:
 
 
 def _conclusion_json(found: Conclusion) -> dict[str, Any]:
-    names = ("kind", "unit", "estimate", "size", "half_interval", "bound")
     return {
         "verdict": found.verdict,
         "mistake": found.best.mistake,
@@ -222,7 +220,7 @@ def _conclusion_json(found: Conclusion) -> dict[str, Any]:
         "notes": found.notes,
         "nearest": found.nearest,
         "camera_errors": [
-            {"view": e.view, "off": e in found.off} | {name: getattr(each, name) for name in names}
+            {"view": e.view, "off": e in found.off, "kind": each.kind, "unit": each.unit, "bound": each.bound}
             for e in found.camera_errors
             for each in e.kinds
         ],
@@ -242,9 +240,7 @@ def page(check: CalibrationCheck) -> str:
         episodes=episodes,
         meanings=MEANINGS,
         tones=TONES,
-        headline=source_headline,
-        votes=votes_text,
-        camera_errors=_camera_errors,
+        conclusions="\n".join(conclusion_lines(check)),
         table=Table(COLUMNS, [_page_row(episode) for episode in episodes]),
     )
 
@@ -253,17 +249,6 @@ def _page_row(episode: EpisodeCheck) -> list[object]:
     name, verdict, *rest = episode.row
     tag = Markup('<span class="tag {}">{}</span>').format(TONES[episode.verdict], verdict)
     return [name if episode.diagnosis is None else Markup('<a href="#{0}">{0}</a>').format(name), tag, *rest]
-
-
-def _camera_errors(found: Conclusion) -> Table:
-    """Each camera's estimated error, each kind whatever the others are."""
-    rows = []
-    for e, each in [(error, each) for error in found.camera_errors for each in error.kinds]:
-        values = ", ".join(f"{value:+.1f}" for value in each.estimate)
-        size = f"{each.size:.1f} +- {each.half_interval:.1f}"
-        off = "off" if e in found.off else ""
-        rows.append([e.view, each.kind, f"{values} {each.unit}", size, f"{each.bound:.1f}", off])
-    return Table(("View", "Error", "Estimate", "Size", "Unseen up to", ""), rows, numeric=range(3, 5))
 
 
 # Pictures
@@ -304,7 +289,8 @@ def diagnosis_picture(
             chosen = evenly_spaced(count, 2 * MOMENTS)
         else:
             # Image m belongs to state m as recorded, and to state m - lag of the repaired episode.
-            chosen = differing_moments(before, after, lag, count, MOMENTS)
+            common = [n for n in range(count) if 0 <= n - lag < after.num_frames]
+            chosen = [common[i] for i in evenly_spaced(len(common), MOMENTS)]
         if not chosen:
             continue
         arms = before.arms
@@ -359,25 +345,6 @@ def recorded_tracks(
         controls="state",
         camera_motion=("recorded",),
     )  # fmt: skip
-
-
-def differing_moments(first: EpisodeTracks, second: EpisodeTracks, shift: int, count: int, wanted: int) -> list[int]:
-    """Frames of the first reading at which the two differ most in the picture, spread over the clip.
-
-    Args:
-        shift: frame n of the first reading shows the image of frame n - shift of the second.
-        count: frames of the first reading that have images.
-    """
-    common = [n for n in range(count) if 0 <= n - shift < second.num_frames]
-    if len(common) <= wanted:
-        return common
-    index = np.asarray(common)
-    apart = np.linalg.norm(first.uv[index, 0] - second.uv[index - shift, 0], axis=-1)
-    apart[first.valid[index, 0] ^ second.valid[index - shift, 0]] = max(first.image_size)
-    apart[~first.valid[index, 0] & ~second.valid[index - shift, 0]] = 0.0
-    score = apart.max(axis=-1)
-    parts = np.array_split(np.arange(len(common)), wanted)
-    return [common[int(part[np.argmax(score[part])])] for part in parts]
 
 
 def _drawn(images: Mapping[int, np.ndarray], tracks: EpisodeTracks, view: str, lag: int) -> np.ndarray:

@@ -173,11 +173,8 @@ class _Messages:
             self.add(f"/{view}/{kind}", "CompressedImage", _image(image, f"{view}_camera", image_format))
 
 
-_PROTOBUF: dict[_Schema, Any] = {
-    "CompressedImage": CompressedImage,
-    "CameraCalibration": CameraCalibration,
-    "FrameTransform": FrameTransform,
-    "JointStates": JointStates,
+_PROTOBUF: dict[str, Any] = {
+    kind.DESCRIPTOR.name: kind for kind in (CompressedImage, CameraCalibration, FrameTransform, JointStates)
 }
 
 

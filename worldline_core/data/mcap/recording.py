@@ -397,8 +397,6 @@ def read_topics_episode(
         given = joints.names or tuple(f"joint_{number}" for number in range(1, joints.width + 1))
         state_names += [f"{arm.name}/{name}" for name in (*given, "gripper")]
     tools = recording.tool_poses(grid)
-    times = [each.times_ns for each in (*recording.images.values(), *recording.all_signals())]
-    times += recording.moving_times()
     episode = Episode(
         episode_id=episode_id,
         source=config.label,
@@ -421,7 +419,6 @@ def read_topics_episode(
         conventions={
             "layout": LAYOUT,
             "time": config.time,
-            "resampling_max_ms": round(max(np.abs(t[nearest(t, grid)] - grid).max() / 1e6 for t in times), 6),
             "gripper_overshoot": outside,
             "action": "commanded" if commands else f"{REPEATS_STATE}: no commands are recorded",
             **({"uncalibrated": "; ".join(f"{view}: {why}" for view, why in unknown.items())} if unknown else {}),
