@@ -83,7 +83,7 @@ class ReadingConfig(StrictModel):
 class LatentInput(ReadingConfig):
     """Latents cached by encode_latents.
 
-    ``resident``: keep the latents of all episodes on the training device, for sets that fit there:
+    ``resident``: keep the latents and action tracks of all episodes on the training device, for sets that fit there:
     a small model then never waits for reading.
     """
 

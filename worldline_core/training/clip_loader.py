@@ -17,12 +17,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from worldline_core.actions.action_maps import ControlDrawing, control_frames
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, drawn_size
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, TrackBatch, collate_tracks, drawn_size
 from worldline_core.errors import ConfigError, TrainingError, WorldLineError
 from worldline_core.model.text import ClipFacts, TextEncoder
-from worldline_core.training.clip_config import LatentInput, ReadingConfig
+from worldline_core.training.clip_config import ReadingConfig
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
 from worldline_core.training.clip_source import ClipSource
+from worldline_core.training.resident_tracks import ResidentTracks
 
 START_METHOD = "spawn"
 """Start method of loader processes: forked ones would share the threads and CUDA state of this one."""
@@ -100,7 +101,7 @@ class ClipLoader:
     """Turns clips into batches.
 
     Attributes:
-        source: where clips are read from.
+        source: where clips are read from. With resident latents, action tracks are resident, too.
         views: the model's slots.
         tracks: controls; the maps get the width that the tracks were made for.
         text: turns instructions into ids; its prompts may name a clip's duration and size.
@@ -126,6 +127,10 @@ class ClipLoader:
 
     def __post_init__(self) -> None:
         self._tracks: dict[str, EpisodeTracks] = {}
+        self._resident: ResidentTracks | None = None
+        if self.source.resident and self.tracks:
+            names = [row.episode_id for row in self.source.rows if row.episode_id in self.tracks]
+            self._resident = ResidentTracks(self.tracks, names, self.views, self.device, self.native_size)
 
     def batches(self, sampler: ClipSampler, reading: ReadingConfig) -> Callable[[int], Batch]:
         """A function that gives the batch of a micro-step, read ahead by the configured workers.
@@ -138,9 +143,7 @@ class ClipLoader:
         """
         self.source.require_length(sampler.longest, "clips.lengths")
         dataset = ClipDataset(self.source, sampler)
-        pinned = torch.device(self.device).type == "cuda" and not (
-            isinstance(reading, LatentInput) and reading.resident
-        )
+        pinned = torch.device(self.device).type == "cuda" and not self.source.resident
         ahead: tuple[int, Iterator[Tensor | WorldLineError]] | None = None
 
         def load(index: int) -> Batch:
@@ -208,13 +211,22 @@ class ClipLoader:
         """Controls that each latent frame takes (docs/method.md section 2): in each view the map at latent resolution, or the vector."""
         if self.tracks is None:
             raise ConfigError("Action maps need action tracks", where="ClipLoader")
-        for clip in clips:
-            if clip.episode_id not in self._tracks:
-                self._tracks[clip.episode_id] = self.tracks.tracks(clip.episode_id)
-        episodes = [self._tracks[clip.episode_id] for clip in clips]
-        frames = [[c.frames[n] for n in control_frames(c.num_frames, self.action_frames)] for c in clips]
-        samples = collate_tracks(episodes, views, self.native_size, frames).to(self.device)
+        if self._resident is not None:
+            samples, size = self._resident.batch(clips, self.action_frames, views), self._resident.image_size
+        else:
+            samples, size = self._collated(self.tracks, clips, views)
         sigma = self.tracks.sigma_px_ref if self.maps else None
         drawing = ControlDrawing(self.source.latent_shape[1:], sigma, self.native_size, self.action_frames)
         by_vector = torch.tensor([[view in clip.vectors for view in views] for clip in clips], device=self.device)
-        return drawing.draw(samples, drawn_size(episodes), by_vector)
+        return drawing.draw(samples, size, by_vector)
+
+    def _collated(
+        self, tracks: ActionTracks, clips: Sequence[Clip], views: tuple[str, ...]
+    ) -> tuple[TrackBatch, tuple[int, int]]:
+        """Track samples of clips, and the size of the frames that they are drawn in."""
+        for clip in clips:
+            if clip.episode_id not in self._tracks:
+                self._tracks[clip.episode_id] = tracks.tracks(clip.episode_id)
+        episodes = [self._tracks[clip.episode_id] for clip in clips]
+        frames = [[c.frames[n] for n in control_frames(c.num_frames, self.action_frames)] for c in clips]
+        return collate_tracks(episodes, views, self.native_size, frames).to(self.device), drawn_size(episodes)

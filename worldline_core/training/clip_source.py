@@ -94,6 +94,9 @@ class ClipSource(ABC):
                 got=f"{frames} frames", next_step=f"set encode_latents.clip_frames to {frames} and encode again, or ask for shorter ones",
             )  # fmt: skip
 
+    resident = False
+    """True where clips are kept on the training device."""
+
     @abstractmethod
     def read(self, clip: Clip, views: tuple[str, ...]) -> Shaped[Tensor, "v ..."]:
         """Some views of a clip.
@@ -180,6 +183,7 @@ class LatentStore(ClipSource):
                 for name in (name for name in shard.keys() if name.startswith(f"{row.episode_id}/")):  # noqa: SIM118
                     self._resident[name] = shard.get_tensor(name).to(device, torch.float16)
         self._shards.clear()
+        self.resident = True
         return self
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
@@ -189,7 +193,7 @@ class LatentStore(ClipSource):
             ArtifactError: the clip does not fit the store, or its shard is damaged.
         """
         selected, parts = self._stored_views(clip, views), self._parts(clip)
-        if self._resident:
+        if self.resident:
             frames = [self._resident[name][:, :, first:stop] for name, first, stop in parts]
         else:
             with self._shard(clip.episode_id) as shard:
