@@ -13,8 +13,12 @@ compile_new = $(if $(wildcard .venv/lib/*/site-packages/$(1)),,--compile-bytecod
 demo: install
 	$(RUN) worldline pipeline --preset demo
 
+# Temporary files of tests lie in memory where it has 4 GB for them: artifacts are flushed to the disk thousands of times.
+in_memory = $(shell df -kP /dev/shm 2>/dev/null | awk 'NR == 2 && $$4 > 4e6 {print "-p /dev/shm"}')
+
 # One process per core, one thread each; neighbours stay together, so that what a file sets up is set up once.
 test: install-scale
+	@export TMPDIR=$$(mktemp -d $(in_memory)); trap 'rm -rf "$$TMPDIR"' EXIT; \
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(RUN) pytest -n auto --dist worksteal
 
 # What takes long (CONTRIBUTING.md): servers, processes, trainings, the rehearsal of the full size, wheels. Two at a time, a file
