@@ -8,6 +8,7 @@ import yaml
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.embodiment import embodiment_names, load_embodiment, read_description
+from worldline_core.geometry.kinematics import ArmKinematics
 
 ARM = {
     "name": "right", "joints": ["pan", "lift"], "limits": [[-1.0, 1.0], [-2.0, 2.0]], "end_effector_link": "hand",
@@ -104,3 +105,12 @@ def test_limits_are_checked_joint_by_joint_and_never_for_the_gripper(tmp_path):
     toy.check_limits(state[:1], "episode 3")
     free = {**ARM, "limits": [[float("-inf"), float("inf")], [-2.0, 2.0]]}
     assert not load_embodiment(write(tmp_path, arms=[free])).outside_limits(state).any()
+
+
+def test_one_of_two_mounts_may_be_unknown_until_kinematics_are_needed(tmp_path):
+    described = {"format": "mjcf", "file": "toy.xml", "mounts": {"left": {}, "right": "unknown"}}
+    embodiment = load_embodiment(write(tmp_path, description=described))
+    with pytest.raises(ConfigError, match=r"mounts.right[\s\S]*worldline calibrate estimate"):
+        ArmKinematics(embodiment)
+    with pytest.raises(ConfigError, match="one mount of two"):
+        load_embodiment(write(tmp_path, description=described | {"mounts": {"left": "unknown", "right": "unknown"}}))

@@ -66,14 +66,26 @@ class Description(StrictModel):
         obtain: where a user gets a file that is not shipped.
         source: where the file comes from, with version and licence.
         mounts: the description is one arm and is placed once per entry, `T_world_root` each; its links and joints
-            are named by the entry, a slash, and their own name (`left/joint1`), under a common link `world`.
+            are named by the entry, a slash, and their own name (`left/joint1`), under a common link `world`. Of a pair one
+            may be `unknown`: `worldline calibrate estimate` finds it.
     """
 
     format: Literal["mjcf", "urdf"]
     file: str = Field(min_length=1)
     obtain: str | None = None
     source: str | None = None
-    mounts: dict[str, RigidOffset] = Field(default_factory=dict)
+    mounts: dict[str, RigidOffset | Literal["unknown"]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Description:
+        if (unknown := list(self.mounts.values()).count("unknown")) and (unknown, len(self.mounts)) != (1, 2):
+            raise ValueError("one mount of two may be unknown: the other one is the frame that it is found in")
+        return self
+
+    @property
+    def unknown_mount(self) -> str | None:
+        """The entry whose base is not known."""
+        return next((name for name, offset in self.mounts.items() if offset == "unknown"), None)
 
 
 class FingerJoint(StrictModel):
@@ -173,6 +185,21 @@ class Embodiment(StrictModel):
         if len(set(names)) != len(names):
             raise ValueError(f"arms named twice: {', '.join(names)}")
         return self
+
+    def known_mounts(self) -> dict[str, RigidOffset]:
+        """The description's mounts. Raises: ConfigError where one is unknown."""
+        known = {name: offset for name, offset in self.description.mounts.items() if isinstance(offset, RigidOffset)}
+        if (unknown := self.description.unknown_mount) is not None:
+            raise ConfigError(
+                "The place of an arm's base is unknown", where=f"embodiment {self.name}, description.mounts.{unknown}",
+                expected="translation and rotation_wxyz", got="unknown",
+                next_step="worldline calibrate estimate CONFIG finds it: write the line that it prints into the file",
+            )  # fmt: skip
+        return known
+
+    def with_mounts(self, mounts: Mapping[str, RigidOffset]) -> Embodiment:
+        """The same robot, whose arms stand elsewhere."""
+        return self.model_copy(update={"description": self.description.model_copy(update={"mounts": dict(mounts)})})
 
     @property
     def state_size(self) -> int:

@@ -192,7 +192,7 @@ def _compile(mujoco: Any, embodiment: Embodiment) -> Any:
     root = parse_xml(read_description(embodiment), embodiment.description_path)
     text = ET.tostring(bare_urdf(root) if embodiment.description.format == "urdf" else bare_mjcf(root), "unicode")
     spec = mujoco.MjSpec.from_string(text)
-    mounts = embodiment.description.mounts
+    mounts = embodiment.known_mounts()
     if not mounts:
         return spec.compile()
     stage = mujoco.MjSpec()

@@ -390,11 +390,13 @@ def _urdf_joints(joint: ET.Element, where: object) -> list[TreeJoint]:
 def read_tree(embodiment: Embodiment) -> TreeBody:
     """The tree of an embodiment's description, with its mounts.
 
-    Raises: UnavailableError, DataError: it cannot be read.
+    Raises:
+        UnavailableError, DataError: it cannot be read.
+        ConfigError: a mount is unknown.
     """
+    mounts = embodiment.known_mounts()
     text, path = read_description(embodiment), embodiment.description_path
     tree = read_urdf(text, path) if embodiment.description.format == "urdf" else read_mjcf(text, path)
-    mounts = embodiment.description.mounts
     return mounted(tree, {name: offset.matrix() for name, offset in mounts.items()}) if mounts else tree
 
 
