@@ -2,6 +2,7 @@
 
     python -m benchmarks.calibration mistakes [--splits test,ood_test] [--every 1]
     python -m benchmarks.calibration cameras [--foreign FOLDER] [--sources 8] [--episodes 6] [--seed 0]
+    python -m benchmarks.calibration bases --hidden FOLDER [--episodes 20]
     python -m benchmarks.calibration estimate [--hidden FOLDER] [--foreign FOLDER] [--episodes 20] [--spoil NAME]
 
 Recordings with an injected defect (injected_defects.json) are left out.
@@ -15,11 +16,13 @@ Recordings with an injected defect (injected_defects.json) are left out.
 - `estimate`: the cameras of sets of `benchmarks.hidden_cameras` and `benchmarks.foreign_robots`, taken away and estimated.
   `held`: how many of the 95 % intervals (rotation, translation, focal length, lag, place in the picture) hold the truth.
   With `--spoil` the sets are spoiled first, and nothing may be sure but what the spoiling leaves right.
+- `bases`: the second arm's base of the sets with two arms, taken away and estimated from the head view.
 """
 
 from __future__ import annotations
 
 import json
+import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -34,6 +37,7 @@ from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.camera_errors import KINDS, LAG, PARAMETERS, SCALE, moved_camera
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, diagnose_source
+from worldline_core.calibration.estimate.base_pose import place_second_arm, with_base
 from worldline_core.calibration.estimate.estimate import estimate_views
 from worldline_core.calibration.estimate.verdict import ViewEstimate
 from worldline_core.calibration.evidence import MIN_IMAGE_PAIRS
@@ -44,7 +48,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.geometry.cameras import inside_image, project_points
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.transforms import quaternion_xyzw_from_rotation, rigid_inverse
+from worldline_core.geometry.transforms import quaternion_xyzw_from_rotation, rigid_inverse, rotation_angle_deg
 
 LAGS = (-4, -3, -2, -1, 1, 2, 3, 4)
 OFFSETS_M = (-0.1, -0.06, -0.03, 0.03, 0.06, 0.1, 0.15)
@@ -442,6 +446,46 @@ def measure_estimates(sets: Iterator[tuple[str, ArmKinematics, Recorded]], spoil
         print(f"{kind}: {held[kind]} of {len(values)} intervals hold; 95 % of the errors are within {worst} intervals")
 
 
+def measure_bases(sets: Iterator[tuple[str, ArmKinematics, Recorded]]) -> None:
+    from benchmarks.hidden_cameras import with_unknown_base
+
+    def rows() -> Iterator[tuple[object, ...]]:
+        for name, kinematics, episodes in sets:
+            heads = [(e, {"head": f["head"]}) for e, f in episodes]
+            states = np.concatenate([e.state.astype(np.float64) for e, _ in episodes])
+            with tempfile.TemporaryDirectory() as folder:
+                robot, base = place_second_arm(
+                    iter(heads), with_unknown_base(episodes[0][0].embodiment, Path(folder)), len(heads)
+                )
+                placed = ArmKinematics(robot)
+            (found,) = estimate_views(iter(heads), placed, len(heads))
+            true, tools = (each.tool_poses(states).numpy()[:, 1] for each in (kinematics, placed))
+            off = true[0] @ rigid_inverse(tools[0])
+            there = np.array(base.placed.translation)
+            deg, mm = rotation_angle_deg(off[:3, :3]), 1e3 * np.linalg.norm((off @ np.append(there, 1.0))[:3] - there)
+            camera = episodes[0][0].cameras["head"]
+            a, b = (
+                project_points(t[:, :3, 3], c.K / c.width, c.T_base_camera)[0]
+                for t, c in ((true, camera), (tools, found.camera or camera))
+            )
+            shown = (np.abs(a - 0.5) < 0.5).all(axis=1)
+            apart = 100 * float(np.median(np.linalg.norm(a - b, axis=1)[shown]))
+            said = "; ".join([*found.reasons, *([base.reason] if base.reason else [])])
+            held = f"{base.half_interval_deg:.1f}", f"{base.half_interval_mm:.0f}"
+            yield (
+                name,
+                with_base(found, base).verdict,
+                f"{deg:.1f}",
+                held[0],
+                f"{mm:.0f}",
+                held[1],
+                f"{apart:.2f}",
+                said,
+            )
+
+    print_table(("set", "verdict", "deg", "95 %", "mm", "95 %", "second tool, % of the width", "reason"), rows())
+
+
 def estimate_errors(
     found: ViewEstimate, true: CameraTrack, tools: np.ndarray, arm: int | None
 ) -> dict[str, np.ndarray | float]:
@@ -471,7 +515,7 @@ def estimate_errors(
 
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("what", choices=("mistakes", "cameras", "estimate"))
+    parser.add_argument("what", choices=("mistakes", "cameras", "estimate", "bases"))
     parser.add_argument("--recordings", type=Path, default=RECORDINGS)
     parser.add_argument("--splits", default="test,ood_test")
     parser.add_argument("--every", type=int, default=1)
@@ -486,6 +530,13 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.what == "estimate":
         measure_estimates(hidden_sets(arguments.hidden, arguments.foreign, arguments.episodes), arguments.spoil)
+        return
+    if arguments.what == "bases":
+        measure_bases(
+            each
+            for each in hidden_sets(arguments.hidden, None, arguments.episodes)
+            if len(each[1].embodiment.arms) == 2
+        )
         return
     shipped = healthy(arguments.recordings, set(arguments.splits.split(",")), arguments.every)
     if arguments.what == "mistakes":

@@ -9,15 +9,19 @@ own focal length), and wrist cameras mounted some centimetres and degrees from w
 from __future__ import annotations
 
 import json
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 from unittest import mock
 
 import numpy as np
 
 from benchmarks.harness import command_line, read_recordings
 from worldline_core.data.episodes.episode import Episode
+from worldline_core.geometry.embodiment import Description, Embodiment, load_embodiment, read_description
+from worldline_core.geometry.kinematic_tree import parse_xml
 from worldline_core.recorder.bodies import BODIES, CENTRE, CameraMount
 from worldline_core.recorder.record import SPLIT_STREAM
 from worldline_core.recorder.rendering import SceneRenderer, prepare_rendering
@@ -89,6 +93,20 @@ def record(body: str, output: Path, episodes: int, seed: int) -> None:
 def read_set(facts_file: Path) -> list[tuple[Episode, dict[str, np.ndarray]]]:
     """(episode with the true cameras, uint8 (n, h, w, 3) frames by view) of each recording."""
     return read_recordings(facts_file, "frames", json.loads(facts_file.read_text())["body"], 8.0)
+
+
+def with_unknown_base(body: str, folder: Path) -> Embodiment:
+    """A body of two arms as a user describes it who has one arm's description and does not know where the second arm stands."""
+    robot = load_embodiment(body)
+    root = parse_xml(read_description(robot), robot.description_path)
+    world = cast(ET.Element, root.find("worldbody"))
+    left, right = world.findall("body")
+    world.remove(right)
+    place, turn = (tuple(map(float, left.attrib.pop(key).split())) for key in ("pos", "quat"))
+    path = folder / f"{body}_arm.xml"
+    path.write_text(ET.tostring(root, "unicode").replace('"left/', '"'))
+    description = {"format": "mjcf", "file": path.name, "mounts": {"left": {"translation": place, "rotation_wxyz": turn}, "right": "unknown"}}  # fmt: skip
+    return robot.model_copy(update={"description": Description.model_validate(description), "description_path": path})
 
 
 def main() -> None:

@@ -14,20 +14,29 @@ from benchmarks import calibration as benchmark
 from benchmarks import hidden_cameras
 from flows.command_line import main
 from worldline_core.calibration.camera_errors import moved_camera
-from worldline_core.calibration.estimate import estimate
+from worldline_core.calibration.estimate import base_pose, estimate
 from worldline_core.calibration.estimate.estimate import camera_file, estimate_views
+from worldline_core.calibration.estimate.estimate_report import estimate_text
 from worldline_core.calibration.estimate.mount_search import mounts_around
 from worldline_core.calibration.estimate.recordings import recorded_views
 from worldline_core.calibration.estimate.refine import fit_still
 from worldline_core.calibration.estimate.still_camera import agreement, tools_apart
-from worldline_core.calibration.estimate.verdict import ViewEstimate, cause_of_disagreement, clearest_step, full_size
+from worldline_core.calibration.estimate.verdict import (
+    BasePose,
+    SourceEstimate,
+    ViewEstimate,
+    cause_of_disagreement,
+    clearest_step,
+    full_size,
+)
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.sources.calibration_file import add_calibrated_view, mounted_camera, read_calibration
 from worldline_core.errors import DataError
-from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.embodiment import RigidOffset, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.transforms import rigid_inverse, rotation_angle_deg
 
 Loaded = list[tuple[Episode, dict[str, np.ndarray]]]
 BANKS = benchmark.RECORDINGS.parent / "banks"
@@ -91,6 +100,36 @@ def test_a_still_camera_is_found_and_what_is_wrong_with_a_set_is_named(hidden: L
     assert abs(found.lag_frames + (3 if "late" in spoil else 0)) < 0.3
     tools = np.concatenate([robot.tool_poses(episode.state.astype(np.float64)).numpy() for episode, _ in hidden])
     assert benchmark.estimate_errors(found, hidden[0][0].cameras["head"], tools, None)["tool"] < 3
+
+
+@pytest.mark.slow
+def test_a_second_arm_s_base_is_found_from_a_camera_of_each_arm(bank: Loaded, tmp_path: Path) -> None:
+    robot = hidden_cameras.with_unknown_base(bank[0][0].embodiment, tmp_path)
+    left = robot.description.mounts["left"]
+    apart = robot.with_mounts({"left": RigidOffset(), "right": RigidOffset(translation=(base_pose.APART_M, 0.0, 0.0))})
+    recorded = recorded_views(iter(bank[:3]), ArmKinematics(apart), 3)["head"]
+    arms = base_pose.each_arm(recorded)
+    true = ArmKinematics(load_embodiment(bank[0][0].embodiment)).link_poses(bank[0][0].state[:1].astype(np.float64))
+    views = list(zip(*(arm.still_views(fine=True) for arm in arms), strict=True))
+    size, camera = views[0][0].camera, bank[0][0].cameras["head"]
+    bases = [true[f"{side}/base"][0].numpy() for side in ("left", "right")]
+    seen = [replace(camera.resized(size.width, size.height), T_base_camera=rigid_inverse(T) @ camera.T_base_camera[:1]) for T in bases]  # fmt: skip
+    started = [moved_camera(c, np.array([0.03, 0.02, s * 0.03, 0.02, s * 0.02, 0.02, s * 0.05, 0])) for s, c in zip((1, -1), seen, strict=True)]  # fmt: skip
+    fitted = base_pose.refine_pair(views, arms, (started[0], started[1]), 0.0)
+    found = base_pose.base_pose("head", "right", left.matrix(), arms, fitted)
+    off = rigid_inverse(bases[1]) @ found.placed.matrix()
+    assert tools_apart(started[1], seen[1], arms[1]) > 0.03 > 0.02 > tools_apart(fitted.cameras[1], seen[1], arms[1])
+    assert np.linalg.norm(off[:3, 3]) < found.half_interval_mm / 1e3
+    assert rotation_angle_deg(off[:3, :3]) < found.half_interval_deg and found.reason is not None, "episodes are few"
+
+
+@pytest.mark.parametrize(("interval_mm", "line"), [(80.0, True), (900.0, False)], ids=["sure", "not sure"])
+def test_a_found_base_is_printed_as_the_line_for_the_robot_s_file(interval_mm, line):
+    base = BasePose("head", "right", RigidOffset(translation=(0.1, -0.3, 0.0)), 5.0, interval_mm, 1.0, 10.0)
+    found = SourceEstimate("mine", (), Path(), None, base)
+    written = "right: {translation: [0.1, -0.3, 0.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0]}"
+    assert (written in estimate_text(found)) is line and ("not sure" in estimate_text(found)) is not line
+    assert found.sure is line
 
 
 def test_an_episode_whose_video_cannot_be_read_is_left_out(bank: Loaded, kinematics: ArmKinematics) -> None:

@@ -249,6 +249,18 @@ class StillView:
         other._by_blur, other._maps = {}, {}
         return other
 
+    @property
+    def covered(self) -> np.ndarray:
+        """Bool (n, r, c): cells in which the arms are predicted to move, and those beside them."""
+        cover = (self._predicted(np.zeros(PARAMETERS))[3] > 0.1).astype(np.uint8)
+        return np.stack([cv2.dilate(cells, np.ones((3, 3), np.uint8)) for cells in cover]).astype(bool)
+
+    def without(self, cells: np.ndarray) -> StillView:
+        """The same without what moves in some cells (n, r, c)."""
+        other = copy(self)
+        other.measured, other._by_blur, other._maps = self.measured * ~cells[..., None], {}, {}
+        return other
+
     def equations(self, theta: np.ndarray, blur: float) -> Equations:
         """Normal equations at `theta`, on maps with this blur [cells]."""
         size, key = PARAMETERS + 1, theta.tobytes()

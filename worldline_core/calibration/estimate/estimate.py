@@ -22,9 +22,17 @@ from worldline_core.calibration.check import (
     episodes_of_config,
     episodes_of_sources,
 )
+from worldline_core.calibration.estimate.base_pose import place_second_arm, with_base
 from worldline_core.calibration.estimate.estimate_config import CAMERAS, EstimateConfig
-from worldline_core.calibration.estimate.estimate_report import as_json, headline, page, view_picture
-from worldline_core.calibration.estimate.recordings import MaskRobot, RecordedView, recorded_views
+from worldline_core.calibration.estimate.estimate_report import (
+    as_json,
+    base_text,
+    headline,
+    mount_line,
+    page,
+    view_picture,
+)
+from worldline_core.calibration.estimate.recordings import LoadedViews, MaskRobot, RecordedView, recorded_views
 from worldline_core.calibration.estimate.still_camera import estimate_still, refine_with_masks
 from worldline_core.calibration.estimate.verdict import (
     SourceEstimate,
@@ -41,7 +49,8 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import DataError
-from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.pictures import evenly_spaced, jpeg_bytes
 from worldline_core.progress import Progress, with_progress
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
@@ -54,7 +63,7 @@ PICTURES = 3
 
 
 def estimate_views(
-    loaded: Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]],
+    loaded: LoadedViews,
     kinematics: ArmKinematics,
     count: int,
     mask_robot: MaskRobot | None = None,
@@ -130,8 +139,8 @@ def estimate_cameras(config: EstimateConfig, inputs: Mapping[str, Path], output:
     del inputs  # they are in the configuration, and in the cache key
     found = _estimate_source(episodes_of_sources([config.source], config.reader), config.description_paths, (), output)
     verdicts = {view.view: view.verdict for view in found.views}
-    for view in found.views:
-        logger.info("%s", headline(view))
+    for line in filter(None, (base_text(found), mount_line(found), *map(headline, found.views))):
+        logger.info("%s", line)
     return {"views": verdicts, "reasons": {view.view: list(view.reasons) for view in found.views if view.reasons}}
 
 
@@ -147,19 +156,24 @@ def _estimate_source(
     if unknown := set(views) - set(first.views):
         raise DataError("No such view", expected=", ".join(first.views), got=", ".join(sorted(unknown)))
     wanted = tuple(views) or tuple(v for v in first.views if v not in first.episode.cameras) or first.views
-    kinematics = KinematicsByName(descriptions).get(first.episode.embodiment)
 
-    def loaded() -> Iterator[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]]:
+    def loaded(shown: Sequence[str]) -> LoadedViews:
         with Progress("calibrate estimate: reading", len(chosen), "episode") as progress:
             for item in chosen:
                 found = item.load()
-                yield found.episode, {view: episode_images(found, view) for view in wanted if view in found.views}
+                yield found.episode, {view: episode_images(found, view) for view in shown if view in found.views}
                 progress.advance()
 
-    estimates = estimate_views(loaded(), kinematics, len(chosen), mask_robot)
+    robot, base = load_embodiment(first.episode.embodiment, descriptions.get(first.episode.embodiment)), None
+    if robot.description.unknown_mount is not None:
+        robot, base = place_second_arm(loaded(first.views), robot, len(chosen))
+    kinematics = ArmKinematics(robot)
+    estimates = estimate_views(loaded(wanted), kinematics, len(chosen), mask_robot)
+    if base is not None:
+        estimates = [with_base(each, base) for each in estimates]
     pictures = dict(_pictures(estimates, chosen, kinematics, folder))
     cameras = folder / CAMERAS if any(each.verdict == "sure" for each in estimates) else None
-    found = SourceEstimate(chosen[0].source, tuple(estimates), folder, cameras)
+    found = SourceEstimate(chosen[0].source, tuple(estimates), folder, cameras, base)
     if cameras is not None:
         write_json_atomic(cameras, camera_file(estimates))
     write_json_atomic(folder / "estimate.json", as_json(found))

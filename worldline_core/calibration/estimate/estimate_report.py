@@ -14,7 +14,7 @@ from worldline_core.pages.page import render
 from worldline_core.pictures import Picture, SheetRow, contact_sheet, draw_tag, scale_frames, scaled_size
 
 if TYPE_CHECKING:
-    from worldline_core.calibration.estimate.verdict import SourceEstimate, ViewEstimate
+    from worldline_core.calibration.estimate.verdict import BasePose, SourceEstimate, ViewEstimate
     from worldline_core.data.episodes.episode import Episode
     from worldline_core.geometry.kinematics import ArmKinematics
 
@@ -37,9 +37,31 @@ def interval_text(estimate: ViewEstimate) -> str:
     return ", ".join(f"{each.kind} ± {each.half_interval:.1f} {each.unit}" for each in estimate.intervals)
 
 
+def base_text(found: SourceEstimate) -> str:
+    """The found base in one line; empty where none was unknown."""
+    if (base := found.base) is None:
+        return ""
+    place = ", ".join(f"{value:.3f}" for value in base.placed.translation)
+    verdict = f"not sure: {base.reason}" if base.reason else "sure"
+    return (
+        f"base of {base.mount}: at {place} m by {base.view}, 95 %: ± {base.half_interval_mm:.0f} mm,"
+        f" ± {base.half_interval_deg:.1f} deg; {verdict}"
+    )
+
+
+def mount_line(found: SourceEstimate) -> str:
+    """The line for the robot's file; empty where no base is sure."""
+    if (base := found.base) is None or base.reason is not None:
+        return ""
+    place, turn = ([round(v, 5) for v in values] for values in (base.placed.translation, base.placed.rotation_wxyz))
+    return f"{base.mount}: {{translation: {place}, rotation_wxyz: {turn}}}"
+
+
 def estimate_text(found: SourceEstimate) -> str:
     """The lines for the terminal."""
     lines = [f"source {found.source}"]
+    lines += ["", base_text(found)] if found.base is not None else []
+    lines += [f"  in the robot's file, under mounts: {line}"] if (line := mount_line(found)) else []
     for each in found.views:
         lines += ["", headline(each)]
         lines += [f"  95 %: {interval_text(each)}"] if each.intervals else []
@@ -64,7 +86,18 @@ def as_json(found: SourceEstimate) -> dict[str, Any]:
         "source": found.source,
         "sure": found.sure,
         "cameras": None if found.cameras is None else found.cameras.name,
+        "base": None if found.base is None else _base_json(found.base),
         "views": [_view_json(each) for each in found.views],
+    }
+
+
+def _base_json(base: BasePose) -> dict[str, Any]:
+    return {
+        "mount": base.mount,
+        "view": base.view,
+        "reason": base.reason,
+        **base.placed.model_dump(),
+        "intervals_95": {"rotation_deg": base.half_interval_deg, "translation_mm": base.half_interval_mm},
     }
 
 
@@ -127,4 +160,5 @@ def page(found: SourceEstimate, pictures: Mapping[str, str]) -> str:
         pictures=pictures,
         headline=headline,
         intervals=interval_text,
+        base=[line for line in (base_text(found), mount_line(found)) if line],
     )

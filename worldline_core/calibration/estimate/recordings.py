@@ -24,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 MaskRobot = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Masks (n, h, w) of the robot in pictures (n, h, w, 3), given the tools' places (n, a, 2) [px]: `Segmenter.segment`."""
+LoadedViews = Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]]
+"""Episodes with their images by view, which are gone through once."""
 FINE_WIDTH, MASKED_WIDTH = 2 * GRAY_WIDTH, 320
 CHANGE_FROM, TEXTURE_FROM, SURE_ABOVE, LEAST_TRUST = 2.0, 2.0, 6.0, 0.15
 """Grey levels; and the trust in flow where nothing is to be seen."""
@@ -146,7 +148,7 @@ def certainty(motion: Motion) -> np.ndarray:
 
 
 def recorded_views(
-    loaded: Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]],
+    loaded: LoadedViews,
     kinematics: ArmKinematics,
     count: int,
     *,

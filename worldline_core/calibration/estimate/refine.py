@@ -34,12 +34,20 @@ SETTLED = 0.02
 
 @dataclass(frozen=True, eq=False)
 class FittedCamera:
-    """A camera, the frames by which its pictures trail, and the information (8, 8) and log-likelihood there."""
+    """A camera, the frames by which its pictures trail, and the equations there."""
 
     camera: CameraTrack
     lag: float
-    information: np.ndarray
-    likelihood: float
+    equations: Equations
+
+    @property
+    def information(self) -> np.ndarray:
+        """(8, 8)."""
+        return self.equations.information
+
+    @property
+    def likelihood(self) -> float:
+        return self.equations.likelihood
 
     @property
     def focal(self) -> float:
@@ -55,26 +63,34 @@ def fit_still(
     Args:
         shared: variance that more episodes do not reduce, in variances of one episode.
     """
-    return climb(lambda camera, lag, blur: equations_at(views, camera, lag, blur, shared), start, lag, blurs, rounds)
+    found = climb(lambda camera, lag, blur: equations_at(views, camera, lag, blur, shared), start, lag, blurs, rounds)
+    return FittedCamera(*found)
 
 
-def climb(
-    equations: Callable[[CameraTrack, float, float], Equations],
-    start: CameraTrack,
+def climb[C](
+    equations: Callable[[C, float, float], Equations],
+    start: C,
     lag: float,
     blurs: Sequence[float],
     rounds: int,
-) -> FittedCamera:
-    """The camera and lag of the largest likelihood near a start; `equations` are those of a camera, a lag and a blur."""
+    moved: Callable[[C, np.ndarray], C] = moved_camera,
+    largest: np.ndarray = LARGEST_STEP,
+) -> tuple[C, float, Equations]:
+    """The camera and lag of the largest likelihood near a start, and the equations there.
+
+    Args:
+        equations: those of a camera, a lag and a blur; the lag is the last parameter.
+        moved, largest: a camera changed by the parameters, and their largest step.
+    """
     camera, now = start, equations(start, lag, blurs[0])
     for number, blur in enumerate(blurs):
         now = equations(camera, lag, blur) if number else now
         damping = DAMPING
         for _ in range(rounds):
-            scale = np.diag(np.maximum(np.diag(now.information), LARGEST_STEP**-2.0))
+            scale = np.diag(np.maximum(np.diag(now.information), largest**-2.0))
             change = np.linalg.solve(now.information + damping * scale, now.gradient)
-            change /= max(1.0, float(np.abs(change / LARGEST_STEP).max()))
-            tried, late = moved_camera(camera, change), lag + float(change[LAG])
+            change /= max(1.0, float(np.abs(change / largest).max()))
+            tried, late = moved(camera, change), lag + float(change[-1])
             then = equations(tried, late, blur)
             if then.likelihood > now.likelihood - TOLERATED:
                 gained = float(change @ now.information @ change)
@@ -85,27 +101,35 @@ def climb(
                 break
             else:
                 damping = max(10 * damping, 0.03)
-    return FittedCamera(camera, lag, now.information, now.likelihood)
+    return camera, lag, now
 
 
 def equations_at(views: Sequence[StillView], camera: CameraTrack, lag: float, blur: float, shared: float) -> Equations:
-    """Normal equations of all episodes at a camera, with the prior of focal length and lag.
+    """Normal equations of all episodes at a camera, with the prior of focal length and lag."""
+    return with_prior(summed_equations(views, camera, lag, blur), camera, lag, inflation(len(views), shared))
 
-    Episodes share errors, so the information is too large by `inflation`: the prior is made as much stronger.
-    """
+
+def summed_equations(views: Sequence[StillView], camera: CameraTrack, lag: float, blur: float) -> Equations:
+    """Normal equations of all episodes at a camera."""
     theta = np.zeros(PARAMETERS)
     theta[LAG] = lag
     found = [view.at(camera).equations(theta, blur) for view in views]
     information = sum((each.information for each in found), np.zeros((PARAMETERS, PARAMETERS)))
     gradient = sum((each.gradient for each in found), np.zeros(PARAMETERS))
-    likelihood = sum(each.likelihood for each in found)
-    focal = float(np.log(camera.K[0, 0] / camera.width / USUAL_FOCAL))
-    for index, value, deviation in ((FOCAL, focal, FOCAL_PRIOR), (LAG, lag, LAG_PRIOR)):
-        weight = inflation(len(views), shared) / deviation**2
-        information[index, index] += weight
-        gradient[index] -= weight * value
-        likelihood -= weight * value**2 / 2
-    return Equations(information, gradient, likelihood)
+    return Equations(information, gradient, sum(each.likelihood for each in found))
+
+
+def with_prior(found: Equations, camera: CameraTrack, lag: float, strength: float) -> Equations:
+    """Equations, whose last parameters are focal length and lag, with the prior of both.
+
+    Episodes share errors, so the information is too large by `inflation`: the prior is made as much stronger.
+    """
+    weight = np.zeros(len(found.gradient))
+    weight[-2:] = strength / np.array([FOCAL_PRIOR, LAG_PRIOR]) ** 2
+    value = np.zeros(len(weight))
+    value[-2:] = np.log(camera.K[0, 0] / camera.width / USUAL_FOCAL), lag
+    likelihood = found.likelihood - float(weight @ value**2) / 2
+    return Equations(found.information + np.diag(weight), found.gradient - weight * value, likelihood)
 
 
 def inflation(episodes: int, shared: float) -> float:

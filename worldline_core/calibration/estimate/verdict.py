@@ -35,6 +35,7 @@ from worldline_core.calibration.observation import tool_travel
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.discovery.cameras import watch
 from worldline_core.geometry.cameras import Resize, project_points
+from worldline_core.geometry.embodiment import RigidOffset
 
 ZOOM_ERROR = 0.15
 """Standard deviation of the focal length, and of the distance with it, that flow of a close robot leaves; from known cameras."""
@@ -65,6 +66,8 @@ USUAL_AGREEMENT, CLEAR_AGREEMENT, LARGEST_SCATTER = 0.7, 0.8, 1.7
 of another robot, unless mirrored pictures agree better than the second."""
 AGREEMENT_SPREAD = 0.15
 """Standard deviation of the agreements of episodes that one camera fits."""
+LARGEST_BASE_DEG, LARGEST_BASE_MM = 20.0, 300.0
+"""95 % intervals above which a base is not known."""
 
 Verdict = Literal["sure", "unsure"]
 
@@ -96,18 +99,49 @@ class ViewEstimate:
     episodes: int = 0
 
 
+@dataclass(frozen=True, eq=False)
+class BasePose:
+    """Where the second arm's base stands, by one view.
+
+    Attributes:
+        mount: the unknown mount, and where it is found to be.
+        half_interval_deg, half_interval_mm: 95 % intervals of the pose between the bases.
+        halves_deg, halves_mm: between the poses that two halves of the episodes give.
+    """
+
+    view: str
+    mount: str
+    placed: RigidOffset
+    half_interval_deg: float
+    half_interval_mm: float
+    halves_deg: float
+    halves_mm: float
+
+    @property
+    def reason(self) -> str | None:
+        """Why it is not known well enough; None where it is."""
+        if self.half_interval_deg > LARGEST_BASE_DEG or self.half_interval_mm > LARGEST_BASE_MM:
+            return "more motion of both arms is needed, in depth and over the whole picture"
+        if self.halves_deg > self.half_interval_deg or self.halves_mm > self.half_interval_mm:
+            return f"two halves of the episodes differ by {self.halves_deg:.1f} deg and {self.halves_mm:.0f} mm"
+        return None
+
+
 @dataclass(frozen=True)
 class SourceEstimate:
-    """The estimated cameras of a source, and the folder that they were written to; `cameras` is None where none is sure."""
+    """The estimated cameras of a source, and the folder that they were written to; `cameras` is None where none is sure, `base` where
+    the description says where both arms stand."""
 
     source: str
     views: tuple[ViewEstimate, ...]
     output: Path
     cameras: Path | None
+    base: BasePose | None = None
 
     @property
     def sure(self) -> bool:
-        return all(view.verdict == "sure" for view in self.views)
+        placed = self.base is None or self.base.reason is None
+        return placed and all(view.verdict == "sure" for view in self.views)
 
 
 def too_few(recorded: RecordedView) -> str | None:

@@ -304,9 +304,10 @@ def fit_wrist(
     evidence: Sequence[WristEvidence], start: CameraTrack, lag: float, prior_at: CameraTrack, prior: np.ndarray
 ) -> FittedCamera:
     """The camera that explains all episodes best from a start; `prior` are the standard deviations of its pose from another's."""
-    return climb(
+    found = climb(
         lambda camera, lag, blur: _equations(evidence, camera, lag, blur, prior_at, prior), start, lag, BLURS, ROUNDS
     )
+    return FittedCamera(*found)
 
 
 def _equations(
