@@ -11,7 +11,8 @@ from flows.pipeline import STORE, chain
 from tasks.estimate_cameras import estimate_cameras
 from tasks.execution.prefect_artifacts import run_chain
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
-from worldline_core.calibration.estimate.estimate_config import CAMERAS, EstimateConfig
+from worldline_core.calibration.estimate.estimate_config import CAMERAS, ESTIMATE, EstimateConfig
+from worldline_core.data.episodes.conventions import with_image_lags
 from worldline_core.evaluation.recordings import HEAD
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 
@@ -31,8 +32,13 @@ def fit(config: Path, overrides: tuple[str, ...] = (), artifacts: Path = STORE) 
 
 
 def with_cameras(settings: PipelineConfig, cameras: Path) -> PipelineConfig:
-    """The run with a calibration file of its one source: controls are drawn into its views, the others take the commands."""
-    source = settings.curate.sources[0].model_copy(update={"calibration": str(cameras)})
+    """The run with the estimate of its one source: controls are drawn into the views of the calibration file, the others take the
+    commands, and pictures are read as late as they were measured to be.
+    """
+    source = settings.curate.sources[0]
+    lags = json.loads((cameras.parent / ESTIMATE).read_text())["image_lags"]
+    update = {"calibration": str(cameras), "conventions": with_image_lags(source.conventions, lags)}
+    source = source.model_copy(update=update)
     curate = settings.curate.model_copy(update={"sources": (source,)})
     drawn = settings.render_actions or PipelineConfig.load("tiny").render_actions
     segmenter = settings.train_segmenter if HEAD in json.loads(cameras.read_text())["views"] else None

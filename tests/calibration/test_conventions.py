@@ -21,11 +21,13 @@ from worldline_core.data.episodes.conventions import (
     along_tool_z,
     apply_conventions,
     image_frames,
+    with_image_lags,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.open import repair
+from worldline_core.errors import ConfigError
 
 COUNT = 12
 K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1]])
@@ -209,3 +211,22 @@ def test_lines_are_what_a_configuration_reads() -> None:
     for wrong, said in (({"intrinsics_size": (0, 640)}, "no image size"), ({"extrinsic": "base_to_camera"}, "extra")):
         with pytest.raises(ValidationError, match=said):
             RecordedConventions.model_validate(wrong)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "lags", "expected"),
+    [
+        ({}, {"head": 0}, {}),
+        ({"image_lag_frames": 1}, {"head": -3, "left_wrist": -3}, {"image_lag_frames": -2}),
+        ({}, {"head": 2, "left_wrist": 0}, {"image_lag_frames": 2, "views": ("head",)}),
+        ({}, {"head": 2, "left_wrist": 1}, None),
+        ({"image_lag_frames": 1}, {"head": 2, "left_wrist": 0}, None),
+        ({"image_lag_frames": 1, "views": ("head",)}, {"head": 1}, None),
+    ],
+)
+def test_measured_lags_become_one_line_or_an_error(recorded, lags, expected):
+    if expected is None:
+        with pytest.raises(ConfigError, match="head by"):
+            with_image_lags(RecordedConventions(**recorded), lags)
+    else:
+        assert with_image_lags(RecordedConventions(**recorded), lags) == RecordedConventions(**expected)

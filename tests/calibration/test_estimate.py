@@ -289,7 +289,7 @@ def test_the_command_writes_cameras_pages_and_pictures(tmp_path, bank, monkeypat
         main(["calibrate", "estimate", str(tmp_path / "my.yaml"), "--view", "head", "--output", str(tmp_path / "out")])
     said, page = capsys.readouterr().out, (tmp_path / "out" / "index.html").read_text()
     assert ended.value.code == 1
-    assert "image_lag_frames: 2, views: [head]" in said and "<b>too little</b>" in said
+    assert "conventions.image_lag_frames: 2" in said and "<b>too little</b>" in said
     assert "<b>too little</b>" not in page and "head.jpg" in page
     assert (tmp_path / "out" / "head.jpg").is_file()
     assert read_calibration(tmp_path / "out" / "cameras.json").views.keys() == {"head"}

@@ -17,6 +17,7 @@ from flows.fit import with_cameras
 from flows.fit_command import overrides_of
 from worldline_core.calibration.estimate.estimate_config import EstimateConfig
 from worldline_core.config import read_config
+from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.sources.open import open_source
 from worldline_core.discovery.configuration import write_config
 from worldline_core.discovery.look import discover
@@ -66,11 +67,13 @@ def test_cameras_are_estimated_where_a_robot_is_known_and_no_file_is_named(own: 
     assert EstimateConfig.of(config.curate, {}) is not None
     camera = {"width": 64, "height": 48, "K": [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], "T": np.eye(4).tolist()}
     (here / "cameras.json").write_text(json.dumps({"views": {"right_wrist": {}}}))
+    (here / "estimate.json").write_text(json.dumps({"image_lags": {"head": -2, "right_wrist": -2}}))
     assert with_cameras(config, here / "cameras.json").train_segmenter is None
     views = {"head": camera | {"maps": "camera_to_base", "axes": "opencv"}}
     (here / "cameras.json").write_text(json.dumps({"views": views}))
     found = with_cameras(config, here / "cameras.json")
     assert found.render_actions is not None and config.render_actions is None
+    assert found.curate.sources[0].conventions == RecordedConventions(image_lag_frames=-2)
     assert found.train_segmenter is not None and found.train_segmenter.labels == "kinematic"
     assert EstimateConfig.of(found.curate, {}) is None
     source = open_source(found.curate.sources[0], here / "raw")

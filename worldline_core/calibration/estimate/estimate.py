@@ -23,7 +23,7 @@ from worldline_core.calibration.check import (
     episodes_of_sources,
 )
 from worldline_core.calibration.estimate.base_pose import place_second_arm, with_base
-from worldline_core.calibration.estimate.estimate_config import CAMERAS, EstimateConfig
+from worldline_core.calibration.estimate.estimate_config import CAMERAS, ESTIMATE, EstimateConfig
 from worldline_core.calibration.estimate.estimate_report import (
     as_json,
     base_text,
@@ -176,7 +176,7 @@ def _estimate_source(
     found = SourceEstimate(chosen[0].source, tuple(estimates), folder, cameras, base)
     if cameras is not None:
         write_json_atomic(cameras, camera_file(estimates))
-    write_json_atomic(folder / "estimate.json", as_json(found))
+    write_json_atomic(folder / ESTIMATE, as_json(found))
     write_bytes_atomic(folder / "index.html", page(found, pictures).encode())
     return found
 

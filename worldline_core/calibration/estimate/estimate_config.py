@@ -16,6 +16,8 @@ from worldline_core.data.sources.open import SourceConfig
 
 CAMERAS = "cameras.json"
 """The calibration file in the task's artifact; not there where no camera is sure."""
+ESTIMATE = "estimate.json"
+"""Everything that was estimated, with intervals and reasons."""
 
 
 class EstimateConfig(StrictModel):

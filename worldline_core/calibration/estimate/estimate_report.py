@@ -10,6 +10,8 @@ import numpy as np
 
 from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip
 from worldline_core.calibration.check_report import SIGMA_PX_REF, TILE_HEIGHT, recorded_tracks
+from worldline_core.data.episodes.conventions import RecordedConventions, with_image_lags
+from worldline_core.errors import ConfigError
 from worldline_core.pages.page import render
 from worldline_core.pictures import Picture, SheetRow, contact_sheet, draw_tag, scale_frames, scaled_size
 
@@ -17,6 +19,9 @@ if TYPE_CHECKING:
     from worldline_core.calibration.estimate.verdict import BasePose, SourceEstimate, ViewEstimate
     from worldline_core.data.episodes.episode import Episode
     from worldline_core.geometry.kinematics import ArmKinematics
+
+LEAST_LAG = 0.75
+"""Frames; what is less is left as it is."""
 
 
 def headline(estimate: ViewEstimate) -> str:
@@ -57,6 +62,12 @@ def mount_line(found: SourceEstimate) -> str:
     return f"{base.mount}: {{translation: {place}, rotation_wxyz: {turn}}}"
 
 
+def image_lags(found: SourceEstimate) -> dict[str, int]:
+    """Frames by which the pictures of each sure view trail the states; less than 0.75 is none."""
+    lags = {each.view: each.lag_frames for each in found.views if each.verdict == "sure"}
+    return {view: round(lag) if abs(lag) >= LEAST_LAG else 0 for view, lag in lags.items()}
+
+
 def estimate_text(found: SourceEstimate) -> str:
     """The lines for the terminal."""
     lines = [f"source {found.source}"]
@@ -69,9 +80,11 @@ def estimate_text(found: SourceEstimate) -> str:
         if each.rival_agreement is not None:
             lines.append(f"  the best camera elsewhere agrees by {each.rival_agreement:.2f}")
         lines += [f"  note: {note}" for note in each.notes]
-        if each.verdict == "sure" and abs(each.lag_frames) >= 0.75:
-            lag = f"{{image_lag_frames: {round(each.lag_frames)}, views: [{each.view}]}}"
-            lines.append(f"  in the configuration of this source: conventions: {lag}")
+    try:
+        late = with_image_lags(RecordedConventions(), image_lags(found)).config_lines()
+    except ConfigError as error:
+        late = (f"{error.what}: {error.got}",)
+    lines += ["", "in the configuration of this source:", *late] if late else []
     lines += ["", f"pictures: {found.output / 'index.html'}"]
     if found.cameras is not None:
         lines.append(f"cameras: {found.cameras}")
@@ -86,6 +99,7 @@ def as_json(found: SourceEstimate) -> dict[str, Any]:
         "source": found.source,
         "sure": found.sure,
         "cameras": None if found.cameras is None else found.cameras.name,
+        "image_lags": image_lags(found),
         "base": None if found.base is None else _base_json(found.base),
         "views": [_view_json(each) for each in found.views],
     }

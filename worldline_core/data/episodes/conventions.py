@@ -7,7 +7,7 @@ all arrays of one frame from one instant, gripper 0 closed .. 1 open.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import OPENGL_AXES
 from worldline_core.geometry.transforms import (
     quaternion_xyzw_from_rotation,
@@ -152,6 +153,26 @@ class RecordedConventions(StrictModel):
             text = f"[{', '.join(str(v) for v in value)}]" if isinstance(value, tuple) else str(value)
             lines.append(f"{prefix}.{name}: {text}")
         return tuple(lines)
+
+
+def with_image_lags(conventions: RecordedConventions, lags: Mapping[str, int]) -> RecordedConventions:
+    """The conventions of a source whose pictures were measured to trail the states by so many frames more, by view. Where all
+    measured views trail alike, the others do as well: the states are early.
+
+    Raises: ConfigError where views need different lags.
+    """
+    late = set(lags.values()) - {0}
+    if not late:
+        return conventions
+    views = None if len(set(lags.values())) == 1 else tuple(view for view, lag in lags.items() if lag)
+    if len(late) > 1 or conventions.views is not None or (views and conventions.image_lag_frames):
+        raise ConfigError(
+            "Views trail the states by different numbers of frames", where="curate.sources[].conventions", expected="one lag",
+            got=", ".join(f"{view} by {conventions.image_lag(view) + lag}" for view, lag in lags.items()),
+            next_step="shift the pictures where they are recorded, or leave views out",
+        )  # fmt: skip
+    lag = conventions.image_lag_frames + late.pop()
+    return conventions.model_copy(update={"image_lag_frames": lag, "views": views})
 
 
 def image_frames(num_frames: int, conventions: RecordedConventions, view: str) -> slice:
