@@ -46,7 +46,7 @@ from worldline_core.data.episodes.conventions import RecordedConventions, applic
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.geometry.cameras import inside_image, project_points
-from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.embodiment import Embodiment, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.transforms import quaternion_xyzw_from_rotation, rigid_inverse, rotation_angle_deg
 
@@ -451,39 +451,33 @@ def measure_bases(sets: Iterator[tuple[str, ArmKinematics, Recorded]]) -> None:
 
     def rows() -> Iterator[tuple[object, ...]]:
         for name, kinematics, episodes in sets:
-            heads = [(e, {"head": f["head"]}) for e, f in episodes]
-            states = np.concatenate([e.state.astype(np.float64) for e, _ in episodes])
             with tempfile.TemporaryDirectory() as folder:
-                robot, base = place_second_arm(
-                    iter(heads), with_unknown_base(episodes[0][0].embodiment, Path(folder)), len(heads)
-                )
-                placed = ArmKinematics(robot)
-            (found,) = estimate_views(iter(heads), placed, len(heads))
-            true, tools = (each.tool_poses(states).numpy()[:, 1] for each in (kinematics, placed))
-            off = true[0] @ rigid_inverse(tools[0])
-            there = np.array(base.placed.translation)
-            deg, mm = rotation_angle_deg(off[:3, :3]), 1e3 * np.linalg.norm((off @ np.append(there, 1.0))[:3] - there)
-            camera = episodes[0][0].cameras["head"]
-            a, b = (
-                project_points(t[:, :3, 3], c.K / c.width, c.T_base_camera)[0]
-                for t, c in ((true, camera), (tools, found.camera or camera))
-            )
-            shown = (np.abs(a - 0.5) < 0.5).all(axis=1)
-            apart = 100 * float(np.median(np.linalg.norm(a - b, axis=1)[shown]))
-            said = "; ".join([*found.reasons, *([base.reason] if base.reason else [])])
-            held = f"{base.half_interval_deg:.1f}", f"{base.half_interval_mm:.0f}"
-            yield (
-                name,
-                with_base(found, base).verdict,
-                f"{deg:.1f}",
-                held[0],
-                f"{mm:.0f}",
-                held[1],
-                f"{apart:.2f}",
-                said,
-            )
+                robot = with_unknown_base(episodes[0][0].embodiment, Path(folder))
+                yield name, *_base_errors(kinematics, robot, episodes)
 
     print_table(("set", "verdict", "deg", "95 %", "mm", "95 %", "second tool, % of the width", "reason"), rows())
+
+
+def _base_errors(kinematics: ArmKinematics, robot: Embodiment, episodes: Recorded) -> tuple[str, ...]:
+    heads = [(e, {"head": f["head"]}) for e, f in episodes]
+    states = np.concatenate([e.state.astype(np.float64) for e, _ in episodes])
+    found_robot, base = place_second_arm(iter(heads), robot, len(heads))
+    placed = ArmKinematics(found_robot)
+    (found,) = estimate_views(iter(heads), placed, len(heads))
+    true, tools = (each.tool_poses(states).numpy()[:, 1] for each in (kinematics, placed))
+    off = true[0] @ rigid_inverse(tools[0])
+    there = np.array(base.placed.translation)
+    deg, mm = rotation_angle_deg(off[:3, :3]), 1e3 * np.linalg.norm((off @ np.append(there, 1.0))[:3] - there)
+    camera = episodes[0][0].cameras["head"]
+    a, b = (
+        project_points(t[:, :3, 3], c.K / c.width, c.T_base_camera)[0]
+        for t, c in ((true, camera), (tools, found.camera or camera))
+    )
+    shown = (np.abs(a - 0.5) < 0.5).all(axis=1)
+    apart = 100 * float(np.median(np.linalg.norm(a - b, axis=1)[shown]))
+    reasons = "; ".join([*found.reasons, *([base.reason] if base.reason else [])])
+    errors = (f"{deg:.1f}", f"{base.half_interval_deg:.1f}", f"{mm:.0f}", f"{base.half_interval_mm:.0f}")
+    return with_base(found, base).verdict, *errors, f"{apart:.2f}", reasons
 
 
 def estimate_errors(
