@@ -10,7 +10,8 @@ dense speed; the plan counts on a share of it. Without `--device cuda` the same 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import torch
@@ -67,7 +68,6 @@ def main() -> None:
     parser.add_argument("--blocks", type=int, default=8)
     parser.add_argument("--compile", action="store_true", help="torch.compile of each layer but its attention")
     arguments = parser.parse_args()
-    require_device(arguments.device)
     config = PipelineConfig.load(arguments.preset)
     if config.distill is None or config.train_stage2 is None:
         raise SystemExit(f"{arguments.preset} distils nothing")
@@ -77,8 +77,10 @@ def main() -> None:
     model, source = stage2_model_config(config.train_stage2, sheet.model), sheet.source(distilled)
     views = tuple(distilled.views)
     view_sets = list(dict.fromkeys((views[:1], views)))
-    with ThreadPoolExecutor(1) as pool:
+    with ProcessPoolExecutor(2, get_context("fork")) as pool:  # before CUDA begins
         costs = dict(zip(view_sets, block_costs(distilled, model, source, view_sets, pool)(), strict=True))
+
+    require_device(arguments.device)
 
     def rows() -> Iterator[Sequence[object]]:
         for shown, cost in costs.items():

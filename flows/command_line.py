@@ -405,6 +405,7 @@ def _serve(arguments: argparse.Namespace) -> None:
         decoder=config.decoder,
         device=config.device,
         bfloat16=config.bfloat16,
+        compiled=config.compile,
         steps=config.steps,
     )
     server = make_server(world, config, token)

@@ -138,6 +138,16 @@ def test_controls_matter_and_zero_differs_from_shuffled(inputs, predicted, tmp_p
     assert len(seen) == 6
 
 
+@pytest.mark.slow
+def test_compiled_layers_predict_the_same(inputs, tmp_path):
+    few = {"bfloat16": False, "seeds": (42,), "embodiments": ("ur5e_pair",)}
+    plain = rolled(CONFIG, inputs, tmp_path / "plain", **few).frames("a-1", "head", 42).astype(int)
+    with torch._dynamo.config.patch(recompile_limit=100):
+        compiled = rolled(CONFIG, inputs, tmp_path / "compiled", compile=True, **few).frames("a-1", "head", 42)
+        assert torch._dynamo.utils.counters["stats"]["unique_graphs"] > 0
+    assert np.abs(compiled - plain).max() <= 2
+
+
 def test_copying_needs_no_checkpoint_and_repeats_the_first_frame(inputs, tmp_path):
     config = RolloutConfig(method="copy", sampler=CopyFirstFrameConfig(), max_episodes_per_embodiment=1)
     given = {name: path for name, path in inputs.items() if name != "checkpoint"}

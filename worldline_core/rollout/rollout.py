@@ -176,6 +176,7 @@ def _load(
         device=config.device,
         bfloat16=config.bfloat16,
         weights=config.weights,
+        compiled=config.compile,
         **sampler.model_dump(exclude={"kind", "timed_blocks"}),
     )
     if world.contract.fps not in rates:

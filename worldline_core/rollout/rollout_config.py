@@ -134,6 +134,7 @@ class RolloutConfig(StrictModel):
         bfloat16: compute in mixed precision.
         weights: type of the model's weights in memory, and of those of a Wan autoencoder, which then computes in bfloat16
             too: half the memory, without any copy in float32.
+        compile: torch.compile of each layer but its attention, for a GPU.
     """
 
     method: str = Field(default="worldline", min_length=1)
@@ -152,6 +153,7 @@ class RolloutConfig(StrictModel):
     crf: int = Field(default=8, ge=0, le=51)
     bfloat16: bool = True
     weights: Literal["float32", "bfloat16"] = "float32"
+    compile: bool = False
     device: str = "cpu"
 
     @model_validator(mode="after")

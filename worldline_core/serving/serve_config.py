@@ -24,6 +24,7 @@ class ServeConfig(StrictModel):
         tokenizer: its tokenizer's folder; by default the one found by the checkpoint.
         decoder: folder of a small decoder for the latents of its tokenizer.
         steps: Euler steps; by default the model's own.
+        compile: torch.compile of each layer but its attention, for a GPU.
         episodes: EpisodeSet whose recordings sessions may start from.
         output: where sessions of the page are saved.
         host: address to listen at. Anything but loopback needs a token (environment variable WORLDLINE_TOKEN).
@@ -41,6 +42,7 @@ class ServeConfig(StrictModel):
     device: str = "cpu"
     bfloat16: bool = True
     steps: int | None = Field(None, ge=1)
+    compile: bool = False
     episodes: Path = SHIPPED / "recordings"
     output: Path = Path("artifacts") / "play"
     host: str = "127.0.0.1"
