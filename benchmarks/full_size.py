@@ -23,12 +23,13 @@ from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig
 from worldline_core.model.tokenizers import VideoTokenizer, require_device, tokenizer_outline
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline.cards import CARDS, UTILISATION, find_card
-from worldline_core.pipeline.memory_estimate import Sources, to_bfloat16
+from worldline_core.pipeline.memory_estimate import Sources
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.rollout_speed import block_costs
 from worldline_core.pipeline.size_sheet import SizeSheet
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
 from worldline_core.rollout.simulation import Session
+from worldline_core.training.processes import hold_weights
 from worldline_core.training.stage2 import stage2_model_config
 
 
@@ -46,7 +47,7 @@ def measured(
         images = torch.rand(1, len(views), 3, *source.image_size) * 2 - 1
         drawn = source.grid if config.takes_maps else (1, 1)
         maps = torch.rand(1, len(views), config.control_channels, 1 + spec.block_size, *drawn)
-    to_bfloat16(model)
+    hold_weights(model, "bf16", "bf16")
     if compiled:
         model.compile_blocks()
     sampler = BlockCausalSimulator(model, spec, noise=Noise([0]), views=views, bfloat16=True)
