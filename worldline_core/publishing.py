@@ -40,6 +40,7 @@ from worldline_core.store.store import folder_lock
 FILE_LIST = "worldline_files.json"
 MAX_LIST_BYTES = 64 << 20
 _FILES_AT_ONCE = 8
+_PIECE_BYTES = 1 << 20
 _HUB_LOCATION = re.compile(r"hf://datasets/(?P<id>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?/?")
 
 
@@ -132,7 +133,11 @@ def pull(where: str, folder: Path) -> FileList:
                     path.unlink()
             missing = [name for name, file in contents.files.items() if not file.fits(unfinished / name)]
             with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-                list(pool.map(lambda name: _fetch(location / name, unfinished / name), missing))
+                list(
+                    pool.map(
+                        lambda name: _fetch(location / name, unfinished / name, contents.files[name].size), missing
+                    )
+                )
             _raise_mismatch([name for name in missing if not contents.files[name].fits(unfinished / name)], where)
         set_files(unfinished)  # a set that refers to folders beside it would read what others put there
         verify_artifact(unfinished)
@@ -198,12 +203,13 @@ def _evaluation_only(row: EpisodeRow) -> bool:
     return marked or says_droid(row.source, row.embodiment)
 
 
-def _check_names(names: Iterable[str], where: object) -> None:
-    """Raises: ArtifactError for a name that leads out of the folder, or to a file of this module's."""
+def _check_names(names: Mapping[str, object], where: object) -> None:
+    """Raises: ArtifactError for a name that leads out of the folder, to a file of this module's, or below another file."""
     for name in names:
         path = PurePosixPath(name)
         plain = name.isprintable() and "\\" not in name and path.as_posix() == name and not path.is_absolute()
-        if not plain or ".." in path.parts or path.parts[:1] in ((), (VOLATILE_FOLDER,), (FILE_LIST,)):
+        taken = path.parts[:1] in ((), (VOLATILE_FOLDER,), (FILE_LIST,)) or any(str(p) in names for p in path.parents)
+        if not plain or taken or ".." in path.parts:
             what, expected = "A file name of the set is unsafe or taken", "relative names of printable characters"
             raise ArtifactError(what, where=where, expected=expected, got=repr(name))
 
@@ -257,15 +263,27 @@ def _read_list(location: AnyPath, present: Mapping[str, int]) -> FileList:
     if present[FILE_LIST] > MAX_LIST_BYTES:
         raise ArtifactError("List of files is too large", where=source, expected=f"at most {MAX_LIST_BYTES} bytes")
     try:
-        return FileList.model_validate_json(file_system(source).cat_file(str(source)))
+        return FileList.model_validate_json(b"".join(_pieces(source, present[FILE_LIST])))
     except ValidationError as error:
         got = error.errors(include_url=False)[0]["msg"]
         raise ArtifactError("List of files is damaged or of another version", where=source, got=got) from error
 
 
-def _fetch(source: AnyPath, target: Path) -> None:
+def _pieces(source: AnyPath, size: int) -> Iterator[bytes]:
+    """The content of a file, until one byte more than it should have: a server may send without end."""
+    # Of the hub's files only block size 0 is read as a stream; others are requested by range, which a server may ignore.
+    options = {"block_size": 0} if str(source).startswith("hf://") else {}
+    left = size + 1
+    with file_system(source).open(str(source), "rb", **options) as stream:
+        while left and (piece := stream.read(min(_PIECE_BYTES, left))):
+            left -= len(piece)
+            yield piece
+
+
+def _fetch(source: AnyPath, target: Path, size: int) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
-    file_system(source).get_file(str(source), str(target))
+    with target.open("wb") as stream:
+        stream.writelines(_pieces(source, size))
 
 
 def _send(location: AnyPath, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:

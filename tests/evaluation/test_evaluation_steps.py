@@ -176,6 +176,7 @@ def test_policy_accuracy_against_recorded_outcomes(recordings, tmp_path):
     over = summary["methods"]["good"]["all"]["over_shortcut"]
     best = max(found["all"]["mean"] for found in summary["shortcuts"].values())
     assert summary["shortcuts"][over["shortcut"]]["all"]["mean"] == best == 1.0 - over["gain"]["mean"]
+    assert summary["shortcuts"]["one_verdict"]["all"]["mean"] == 0.5 <= best  # a gain is never over less than guessing
     evidence = pq.read_table(tmp_path / "decisions.parquet")["evidence"][0].as_py()
     assert "head_view_confirms_target_displacement" in json.loads(evidence)[0]
 

@@ -12,6 +12,7 @@ import json
 import re
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -39,7 +40,7 @@ class Hub:
 
     Attributes:
         refuse: the status to answer instead, or None, by method and path.
-        instead: a body to answer instead, an address to redirect to, or None.
+        instead: a body to answer instead, pieces to send as long as they are taken, an address to redirect to, or None.
     """
 
     repositories: dict[str, Repository] = field(default_factory=dict)
@@ -47,7 +48,7 @@ class Hub:
     requests: list[tuple[str, str]] = field(default_factory=list)
     tokens: set[str] = field(default_factory=set)
     refuse: Callable[[str, str], int | None] = lambda method, path: None
-    instead: Callable[[str, str], bytes | str | None] = lambda method, path: None
+    instead: Callable[[str, str], bytes | Iterator[bytes] | str | None] = lambda method, path: None
     url: str = ""
 
     def count(self, method: str, part: str) -> int:
@@ -75,6 +76,15 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
         def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
             del format, args
 
+        def endless(self, pieces: Iterator[bytes]) -> None:
+            self.send_response(200)
+            self.send_header("Transfer-Encoding", "chunked")
+            self.end_headers()
+            self.close_connection = True
+            with suppress(ConnectionError):
+                for piece in pieces:
+                    self.wfile.write(b"%x\r\n%s\r\n" % (len(piece), piece))
+
         def answer(self, content: Any = None, status: int = 200, headers: dict[str, str] | None = None) -> None:
             data = content if isinstance(content, bytes) else json.dumps({} if content is None else content).encode()
             self.send_response(status)
@@ -99,8 +109,10 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
             body_instead = hub.instead(self.command, path)
             if isinstance(body_instead, str):
                 return self.answer(b"", 302, {"Location": body_instead})
-            if body_instead is not None:
+            if isinstance(body_instead, bytes):
                 return self.answer(body_instead)
+            if body_instead is not None:
+                return self.endless(body_instead)
             if self.command == "PUT" and path.startswith("/lfs/"):
                 return self.put_object(path.removeprefix("/lfs/"), body)
             if path == "/api/repos/create":

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -153,10 +154,26 @@ def test_odd_answers_end_in_one_message(hub: Any, folder: Path, tmp_path: Path, 
     for part, answer in ODD_ANSWERS:
         with subtests.test(part=part, answer=answer[:80]):
             hub.instead = lambda method, path, p=part, body=answer: body if re.search(p, path) else None
-            with pytest.raises(
-                ArtifactError, match=r"did not finish|No finished EpisodeSet|List of files is|not those of"
-            ):
+            with pytest.raises(ArtifactError, match=r"did not finish the pull|No finished EpisodeSet|List of files is"):
                 pull(PLACE, tmp_path / "back")
+
+
+@pytest.mark.parametrize("end", ["worldline_files.json", ".mp4"])
+def test_no_more_is_read_than_is_listed(hub: Any, folder: Path, tmp_path: Path, end: str) -> None:
+    push(folder, PLACE)
+    sent = 0
+
+    def pieces() -> Iterator[bytes]:
+        nonlocal sent
+        while sent < 1 << 30:
+            sent += 1 << 20
+            yield b"x" * (1 << 20)
+
+    hub.instead = lambda method, path: pieces() if method == "GET" and path.endswith(end) else None
+    with pytest.raises(ArtifactError, match=r"List of files is damaged|not those of the set"):
+        pull(PLACE, tmp_path / "back")
+    assert sent < 64 << 20  # what the connection's buffers hold
+    assert max(path.stat().st_size for path in (tmp_path / "back.partial").rglob("*")) < 1 << 20
 
 
 def test_the_token_is_sent_to_the_hub_alone(hub: Any, folder: Path, tmp_path: Path) -> None:

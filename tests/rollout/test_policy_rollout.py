@@ -26,7 +26,7 @@ def run(inputs, output, act, **changes):
 
 
 def actions(observation, rows=80):
-    """As a policy plans: from where it is told that the robot is, a little further with every action."""
+    """A chunk that starts at the robot's state and moves on a little with every action."""
     return {"actions": observation["state"][None] + 0.002 * np.arange(1, rows + 1)[:, None] * (np.arange(14) % 7 < 6)}
 
 

@@ -357,7 +357,7 @@ def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(
         assert sent[-1]["frames"] == 13
 
 
-def test_a_block_is_computed_ahead_where_nobody_waits_for_it(
+def test_the_next_block_is_computed_ahead_in_a_session_alone(
     small_world: WorldLine, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Wishes that go on, that change at the last tick, and that change after a way back."""

@@ -26,7 +26,7 @@ def write_corpus(folder: Path, *, healthy: int, each: int, seed: int) -> tuple[l
 
 
 def outcomes(curated: Path, filtered: Path) -> dict[str, str]:
-    """How each episode id ended, from the artifacts of curation and of the filters.
+    """Outcome of each episode, from the artifacts of curation and of the filters.
 
     A recording that Stage II alone leaves out counts as kept: the synthetic ones have no calibration that fits.
     """

@@ -55,7 +55,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class Layout:
-    """How recordings are laid out, and what can be wrong with them.
+    """Layout of recordings, and the damage that it can have.
 
     Attributes:
         add: (root, number, random, **settings) -> id and files, by name, of one healthy recording.

@@ -262,8 +262,8 @@ def tree_scores(
 def verdicts_without_video(
     episodes: EpisodeSet, tracks: ActionTracks | None, rows: Sequence[EpisodeRow], tasks: Mapping[str, str]
 ) -> dict[str, dict[str, bool]]:
-    """Whether each attempt succeeds, by the shortcut's name: trees that saw attempts of its task from other starts, with commands, placed
-    paths, or the score of a rule alone. Without any to learn from, it fails.
+    """Success of each attempt, by the shortcut's name: trees that saw attempts of its task from other starts, with commands, placed
+    paths, or the score of a rule alone; and `one_verdict`, the commonest outcome, for all. Without any to learn from, an attempt fails.
 
     Args:
         rows: attempts that ended in success or failure. tasks: by episode.
@@ -276,7 +276,8 @@ def verdicts_without_video(
     of_start = {start: tasks[own[0].episode_id] for start, own in starts.items()}
     makers = {name: make for name, make in FEATURES.items() if make is not less_mean}
     makers |= {name: partial(_as_feature, rule) for name, rule in RULES.items()}
-    found: dict[str, dict[str, bool]] = {}
+    commonest = 2 * sum(row.outcome == "success" for row in rows) > len(rows)
+    found: dict[str, dict[str, bool]] = {"one_verdict": dict.fromkeys((row.episode_id for row in rows), commonest)}
     for name, make in makers.items():
         made = {start: made for start, own in facts.items() if (made := make(own)) is not None}
         scores = tree_scores(made, ends, of_start)

@@ -121,7 +121,7 @@ class PolicyConfig(StrictModel):
         return OpenpiPolicy(self.url, api_key=key, deadline_s=self.deadline_s)
 
     def observation(self, pictures: Mapping[str, np.ndarray], state: np.ndarray, prompt: str) -> dict[str, Any]:
-        """What the policy is sent: pictures ``uint8 (H, W, 3)`` of the views that it names, a state ``(j)``, an instruction."""
+        """Observation for the policy: pictures ``uint8 (H, W, 3)`` of the views that it names, a state ``(j)``, an instruction."""
         images = {self.image_keys[view]: picture for view, picture in pictures.items() if view in self.image_keys}
         if self.form == "aloha":
             images = {

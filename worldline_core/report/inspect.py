@@ -114,7 +114,7 @@ def describe(kind: str, folder: Path) -> list[str]:
 
 @dataclass
 class _Page:
-    """What is written of an artifact with pictures, and notes on what cannot be shown."""
+    """Files written for an artifact with pictures, and notes on what cannot be shown."""
 
     folder: Path
     output: Path

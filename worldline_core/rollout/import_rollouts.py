@@ -203,7 +203,7 @@ def _check(
 def _departures(
     layout: VideoLayout, name: str, rate: float, count: int, recorded: int, size: tuple[int, int]
 ) -> Iterator[str]:
-    """What of a video is not as its layout has it."""
+    """Differences of a video from its layout."""
     if layout.fps is not None and abs(rate / layout.fps - 1) > _RATE_TOLERANCE:
         yield f"{name}: {rate:g} frames per second, the layout has {layout.fps:g}"
     frames = recorded if layout.frames == "whole" else layout.frames

@@ -1,7 +1,7 @@
 """The step rollout_policy: a policy of openpi's protocol drives the simulator from recorded first frames on.
 
 The loop is that of WorldArena's policy evaluator (tsinghua-fib-lab/WorldArena, `embodied_task/worldarena_track2`: `docs/DETAILS.md`,
-`length.py`) for models of joints: the policy sees the last picture and is told the last command, in the beginning the first
+`length.py`) for models of joints: the policy gets the last picture and the last command, in the beginning the first
 one of the recording. Every ``down_sample``-th of its actions is queued, the model takes a step's worth at a time, and where less is
 left the rest is dropped and the policy asked again. A video has ``length_scale`` times as many frames as every ``down_sample``-th
 of its recording, rounded up.
@@ -30,7 +30,7 @@ from worldline_core.rollout.worldline import WorldLine
 
 
 class UnusableCommandsError(DataError):
-    """What the policy commands cannot be a robot's."""
+    """The policy's commands are far beyond the robot's limits."""
 
 
 def rollout_policy(config: PolicyRolloutConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -112,11 +112,11 @@ def _drive(
         add({view: picture[None] for view, picture in simulation.pictures[0].items()})
         while (done := simulation.num_frames) < length:
             if len(queue) < step:
-                told = config.policy.observation(
+                observation = config.policy.observation(
                     simulation.pictures[0], simulation.commands[0, -1], start.instruction
                 )  # fmt: skip
                 least = (step - 1) * config.down_sample + 1
-                queue = policy.chunk(told, rows=least, columns=columns)[:: config.down_sample]
+                queue = policy.chunk(observation, rows=least, columns=columns)[:: config.down_sample]
                 asked += 1
             try:
                 (clip,) = simulation.step(queue[:step])

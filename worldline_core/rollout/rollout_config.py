@@ -207,7 +207,7 @@ NAME_FIELD = re.compile(r"\{(\w+)\}|(\*)")
 
 @dataclass(frozen=True)
 class VideoLayout:
-    """How a benchmark or another simulator writes its videos of one view.
+    """Layout in which a benchmark or another simulator writes its videos of one view.
 
     Attributes:
         name, episode_id: as of :class:`ImportRolloutsConfig`, where it says nothing else.

@@ -114,7 +114,7 @@ class Node:
 
 
 class Block(NamedTuple):
-    """What is computed of a block.
+    """A computed block.
 
     Attributes:
         hands: after each of the commands that were not there yet.

@@ -28,7 +28,7 @@ OF_FIRST, OF_SECOND = np.r_[0:6, 12:14], np.r_[6:14]
 LARGEST_STEPS = np.concatenate([LARGEST_STEP[:FOCAL], LARGEST_STEP])
 ROUNDS = 8
 DEVIATIONS_95 = 2.8
-"""Of a vector of three."""
+"""Standard deviations within which 95 % of vectors of three normal components lie."""
 
 APART_M = 1000.0
 """Between the arms as they are read: which point belongs to which arm is seen from its place."""

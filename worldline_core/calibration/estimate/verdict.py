@@ -101,7 +101,7 @@ class ViewEstimate:
 
 @dataclass(frozen=True, eq=False)
 class BasePose:
-    """Where the second arm's base stands, by one view.
+    """Pose of the second arm's base, by one view.
 
     Attributes:
         mount: the unknown mount, and where it is found to be.
@@ -119,7 +119,7 @@ class BasePose:
 
     @property
     def reason(self) -> str | None:
-        """Why it is not known well enough; None where it is."""
+        """The reason against it; None where it is known well enough."""
         if self.half_interval_deg > LARGEST_BASE_DEG or self.half_interval_mm > LARGEST_BASE_MM:
             return "more motion of both arms is needed, in depth and over the whole picture"
         if self.halves_deg > self.half_interval_deg or self.halves_mm > self.half_interval_mm:
