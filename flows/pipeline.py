@@ -21,6 +21,7 @@ from tasks.record import record
 from tasks.render_actions import render_actions
 from tasks.report import report
 from tasks.rollout import rollout
+from tasks.train_judge import train_judge
 from tasks.train_segmenter import train_segmenter
 from tasks.train_stage1 import train_stage1
 from tasks.train_stage2 import train_stage2
@@ -74,6 +75,9 @@ def prepare_models(c: PipelineConfig, data: Inputs) -> Inputs:
         models["tokenizer"] = train_tokenizer.submit(c.train_tokenizer, episodes=data["episodes"])
     if c.train_segmenter is not None and (masked := c.masks_of(data)):
         models["segmenter"] = train_segmenter.submit(c.train_segmenter, **masked)
+    if c.train_judge is not None:
+        seen = {"episodes": data["episodes"], "tokenizer": models.get("tokenizer")}
+        models["judge"] = train_judge.submit(c.train_judge, **seen)
     return models
 
 
@@ -106,14 +110,15 @@ def predict(c: PipelineConfig, data: Inputs, banks: Inputs, models: Inputs, trai
 
 def evaluate(c: PipelineConfig, data: Inputs, banks: Inputs, models: Inputs, predicted: Inputs) -> Inputs:
     """Video metrics, policy evaluation and planning. Recorded outcomes of banks (sealed) are opened after the choice alone."""
-    segmenter, scores = models.get("segmenter"), {}
+    segmenter, judge, scores = models.get("segmenter"), models.get("judge"), {}
     shown, planned = (c.rollouts_of(predicted, banks=banks) for banks in (False, True))
     inputs = {**data, "segmenter": segmenter, "rollouts": shown}
     if shown and c.evaluate_video is not None:
         scores["evaluate_video"] = evaluate_video.submit(c.evaluate_video.of_methods(shown), **inputs)
     if shown and c.evaluate_policy is not None:
-        scores["evaluate_policy"] = evaluate_policy.submit(c.evaluate_policy, **inputs)
+        scores["evaluate_policy"] = evaluate_policy.submit(c.evaluate_policy, **inputs, judge=judge)
     if planned and c.evaluate_planning is not None:
         inputs = {"banks": banks["episodes"], "tracks": banks["tracks"], "sealed": banks["sealed"], "rollouts": planned}
-        scores["evaluate_planning"] = evaluate_planning.submit(c.evaluate_planning, **inputs, segmenter=segmenter)
+        instruments = {"segmenter": segmenter, "judge": judge}
+        scores["evaluate_planning"] = evaluate_planning.submit(c.evaluate_planning, **inputs, **instruments)
     return scores

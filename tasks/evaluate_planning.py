@@ -9,7 +9,7 @@ evaluate_planning = ArtifactTask(
     function="worldline_core.evaluation.planning.evaluate_planning:evaluate_planning",
     config="worldline_core.evaluation.evaluation_config:PlanningConfig",
     inputs=("banks", "rollouts.*"),
-    optional_inputs=("tracks", "segmenter", "sealed"),
+    optional_inputs=("tracks", "segmenter", "judge", "sealed"),
 )
 
 if __name__ == "__main__":

@@ -5,11 +5,11 @@ from tasks.execution.artifact_task import ArtifactTask
 evaluate_policy = ArtifactTask(
     name="evaluate_policy",
     summary="evidence, rules, accuracy against the recorded outcome",
-    version=9,
+    version=10,
     function="worldline_core.evaluation.policy.evaluate_policy:evaluate_policy",
     config="worldline_core.evaluation.evaluation_config:PolicyEvaluationConfig",
     inputs=("episodes", "rollouts.*"),
-    optional_inputs=("tracks", "segmenter"),
+    optional_inputs=("tracks", "segmenter", "judge"),
 )
 
 if __name__ == "__main__":

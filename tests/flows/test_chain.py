@@ -56,6 +56,14 @@ def test_the_chain_is_the_one_that_the_readme_draws(calls: dict[str, TaskCall]) 
     assert load_chain() is chain
 
 
+def test_a_trained_judge_judges_and_chooses() -> None:
+    changes = ("train_judge={}", "evaluate_policy.judge=learned", "evaluate_planning.selector=learned")
+    calls = outline(chain, PipelineConfig.load("tiny", None, changes))
+    assert {"episodes", "tokenizer"} == set(calls["train_judge"].inputs)
+    for name in ("evaluate_policy", "evaluate_planning"):
+        assert calls[name].inputs["judge"] is calls["train_judge"]
+
+
 def test_every_task_loads() -> None:
     for name in task_names():
         task = find_task(name)

@@ -149,7 +149,7 @@ def write_policy_scores(folder: Path) -> None:
         {
             "method": method, "episode_id": f"e{number}", "seed": 42, "split": "test", "task_family": "lift",
             "outcome": outcomes[number % 2], "predicted": outcomes[(number + (number >= right)) % 2],
-            "answers": 2, "malformed_answers": 0,
+            "answers": 2, "malformed_answers": 0, "undecided": method == "stage2" and number < 4,
         }
         for method, right in (("true", 9), ("shipped_stage2", 8), ("stage2", 6))
         for number in range(10)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -38,21 +38,14 @@ class VLMConfig(StrictModel):
 SegmenterName = Literal["learned", "colour", "sam3"]
 
 
-class SegmenterConfig(StrictModel):
-    """Size and training of the learned segmenter."""
+class _NetworkTraining(StrictModel):
+    """How a small network of the evaluation is trained."""
 
-    labels: Literal["exact", "kinematic"] = Field(
-        default="exact",
-        description="masks to learn: exact ones; kinematic: also of episodes without, where the head camera is known",
-    )
-    widths: tuple[int, ...] = Field(
-        default=(8, 24, 48, 96), min_length=2, description="channels, finest resolution first; multiples of 8"
-    )
+    WEIGHT_DECAY: ClassVar[float] = 1e-4
+
     steps: int = Field(default=1000, ge=1)
     batch_size: int = Field(default=24, ge=1)
     learning_rate: float = Field(default=3e-3, gt=0)
-    image_size: ImageSize | None = Field(default=None, description="(height, width) to resize to; none: as stored")
-    frame_stride: int = Field(default=2, ge=1, description="every n-th frame of a training episode is used")
     checkpoint_every: int = Field(default=200, ge=1)
     seed: int = Field(default=42, ge=0)
 
@@ -63,7 +56,9 @@ class SegmenterConfig(StrictModel):
             steps=self.steps,
             batch_size=self.batch_size,
             seed=self.seed,
-            optimizer=OptimizerConfig(learning_rate=self.learning_rate, betas=(0.9, 0.999), weight_decay=1e-4),
+            optimizer=OptimizerConfig(
+                learning_rate=self.learning_rate, betas=(0.9, 0.999), weight_decay=self.WEIGHT_DECAY
+            ),
             ema_decay=0.995,
             log_every=1,
             save_every_steps=self.checkpoint_every,
@@ -76,6 +71,46 @@ class SegmenterConfig(StrictModel):
             return (step + 1) / warmup
         progress = (step - warmup) / max(1, self.steps - warmup)
         return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
+
+
+class SegmenterConfig(_NetworkTraining):
+    """Size and training of the learned segmenter."""
+
+    labels: Literal["exact", "kinematic"] = Field(
+        default="exact",
+        description="masks to learn: exact ones; kinematic: also of episodes without, where the head camera is known",
+    )
+    widths: tuple[int, ...] = Field(
+        default=(8, 24, 48, 96), min_length=2, description="channels, finest resolution first; multiples of 8"
+    )
+    image_size: ImageSize | None = Field(default=None, description="(height, width) to resize to; none: as stored")
+    frame_stride: int = Field(default=2, ge=1, description="every n-th frame of a training episode is used")
+
+
+class JudgeConfig(_NetworkTraining):
+    """Size, training and calibration of the learned judge."""
+
+    WEIGHT_DECAY: ClassVar[float] = 0.05
+
+    image_size: ImageSize = Field(default=(64, 96), description="(height, width) of what it sees: that of predictions")
+    widths: tuple[int, ...] = Field(
+        default=(32, 64, 96, 128), min_length=1, description="channels, from half resolution on; multiples of 8"
+    )
+    steps: int = Field(default=3000, ge=1)
+    learning_rate: float = Field(default=2e-3, gt=0)
+    disturbance: float = Field(
+        default=0.3,
+        ge=0,
+        description="noise on the codes of frames that pass the input tokenizer, as of train_tokenizer",
+    )
+    least_right: float = Field(
+        default=0.97, gt=0.5, le=1, description="of the verdicts on validation recordings outside of the undecided band"
+    )
+
+    @property
+    def trainer(self) -> TrainerConfig:
+        """The training loop; validation recordings are judged with every checkpoint."""
+        return super().trainer.model_copy(update={"validate_every": self.checkpoint_every})
 
 
 class VideoEvaluationConfig(StrictModel):
@@ -148,7 +183,7 @@ class TrustConfig(StrictModel):
 class PolicyEvaluationConfig(StrictModel):
     """Judge and trajectories of evaluate_policy."""
 
-    judge: Literal["measured", "qwen3_vl", "openai"] = "measured"
+    judge: Literal["measured", "learned", "qwen3_vl", "openai"] = "measured"
     vlm: VLMConfig = VLMConfig()
     segmenter: SegmenterName = Field(default="learned", description="used by the measured judge")
     sam3_weights: Path | None = None
@@ -180,7 +215,7 @@ class PolicyEvaluationConfig(StrictModel):
 class PlanningConfig(StrictModel):
     """Selector and budgets of evaluate_planning."""
 
-    selector: Literal["measured", "qwen3_vl", "openai"] = "measured"
+    selector: Literal["measured", "learned", "qwen3_vl", "openai"] = "measured"
     vlm: VLMConfig = VLMConfig()
     segmenter: SegmenterName = Field(default="learned", description="used by the measured selector")
     sam3_weights: Path | None = None

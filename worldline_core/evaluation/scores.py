@@ -33,6 +33,7 @@ _TYPES = {
     **dict.fromkeys(
         ("value", "mean", "confidence", "doubt", "disagreement", "new_controls", "new_setup", "trust"), pa.float64()
     ),
+    "undecided": pa.bool_(),
 }
 """Columns of the tables that evaluations write; all others are strings."""
 

@@ -17,7 +17,7 @@ from worldline_core.model.checkpoint import DESCRIPTION, CheckpointInfo, read_ch
 from worldline_core.store.artifact_files import read_json, read_manifest, verify_artifact
 
 UNKNOWN = "not stated"
-DESCRIPTIONS = (DESCRIPTION, "tokenizer.json", "segmenter.json", "teacher.json")
+DESCRIPTIONS = (DESCRIPTION, "tokenizer.json", "segmenter.json", "judge.json", "teacher.json")
 """Files that describe a model, one in each folder of weights."""
 
 

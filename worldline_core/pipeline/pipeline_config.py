@@ -15,6 +15,7 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.evaluation_config import (
+    JudgeConfig,
     PlanningConfig,
     PolicyEvaluationConfig,
     SegmenterConfig,
@@ -42,6 +43,7 @@ class ModelPaths(StrictModel):
     base: Path | None = None
     teacher: Path | None = None
     segmenter: Path | None = None
+    judge: Path | None = None
     stage2: Path | None = Field(
         default=None, description="long-trained Stage II checkpoint to report beside this run's"
     )
@@ -116,6 +118,7 @@ class PipelineConfig(StrictModel):
     encode_latents: EncodeLatentsConfig
     train_tokenizer: TokenizerConfig | None = Field(default=None, description="null: models.tokenizer is used")
     train_segmenter: SegmenterConfig | None = Field(default=None, description="null: models.segmenter is used")
+    train_judge: JudgeConfig | None = Field(default=None, description="null: models.judge is used, if any")
     train_stage1: Stage1Config | None = Field(default=None, description="null: Stage II starts from models.base")
     train_stage2: Stage2Config
     distill: DistillConfig
@@ -225,6 +228,16 @@ class PipelineConfig(StrictModel):
     def _references_exist(self) -> PipelineConfig:
         if self.models.tokenizer is None and self.train_tokenizer is None:
             raise ValueError("models.tokenizer or train_tokenizer: one of the two is needed")
+        learned = {
+            "evaluate_policy.judge": self.evaluate_policy and self.evaluate_policy.judge,
+            "evaluate_planning.selector": self.evaluate_planning and self.evaluate_planning.selector,
+        }
+        if (
+            self.models.judge is None
+            and self.train_judge is None
+            and (asks := [k for k in learned if learned[k] == "learned"])
+        ):
+            raise ValueError(f"{', '.join(asks)}: learned: models.judge or train_judge: one of the two is needed")
         for config in (self.curate, self.curate_banks):
             for number, name in ({} if config is None else config.recordings).items():
                 if name not in self.record:

@@ -170,6 +170,7 @@ def policy_evaluation(summary: JsonObject) -> dict[str, object]:
             group: words(SPLIT_LABELS.get(group, group)).capitalize()
             for group in sorted(groups, key=lambda g: (g != ALL, g not in SPLIT_LABELS, g))
         },
+        "undecided": any(results[m.name][ALL]["undecided"]["share"] for m in methods),
         "ranked": in_order(summary.get("policies", ())),
         "trusted": predicting(summary.get("trust", {}).get("methods", ())),
     }

@@ -20,6 +20,7 @@ from pydantic import StrictBool, StrictInt
 
 from worldline_core.errors import DataError
 from worldline_core.evaluation.policy.evidence import route
+from worldline_core.evaluation.policy.learned_judge import LearnedJudge
 from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
@@ -107,15 +108,16 @@ def shown_video(video: Trajectory) -> CandidateVideo:
     return CandidateVideo(frames, indices, video.fps, video.num_frames, points)
 
 
-class MeasuredSelector:
-    """Scores each video by the measured judge's facts with soft thresholds; a comparison takes the best scores."""
+class ScoringSelector:
+    """Scores each video by itself; a comparison takes the best scores."""
 
-    name = "measured"
-
-    def __init__(self, segmenter: Segmenter) -> None:
-        self.segmenter = segmenter
+    def __init__(self) -> None:
         # Smaller budgets show the same videos again.
         self._scores: dict[tuple[str, str], CandidateScore] = {}
+
+    def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
+        """0..1, how likely this candidate completes the task."""
+        raise NotImplementedError
 
     def compare(self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int) -> Comparison:
         """The highest scores; of equals, those shown first."""
@@ -126,10 +128,37 @@ class MeasuredSelector:
         """0..100."""
         key = (instruction, candidate.digest)
         if key not in self._scores:
-            measured = measure(self.segmenter, instruction, route(instruction), candidate.frames, candidate.points)
-            value = UNSEEN_SCORE if measured is None else measured.score()
-            self._scores[key] = CandidateScore(round(100.0 * value, 3))
+            self._scores[key] = CandidateScore(round(100.0 * self.likelihood(instruction, candidate), 3))
         return self._scores[key]
+
+
+class MeasuredSelector(ScoringSelector):
+    """Likelihood by the measured judge's facts with soft thresholds."""
+
+    name = "measured"
+
+    def __init__(self, segmenter: Segmenter) -> None:
+        super().__init__()
+        self.segmenter = segmenter
+
+    def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
+        """What cannot be measured scores as what cannot be seen."""
+        measured = measure(self.segmenter, instruction, route(instruction), candidate.frames, candidate.points)
+        return UNSEEN_SCORE if measured is None else measured.score()
+
+
+class LearnedSelector(ScoringSelector):
+    """Likelihood by the learned judge."""
+
+    name = "learned"
+
+    def __init__(self, judge: LearnedJudge) -> None:
+        super().__init__()
+        self.judge = judge
+
+    def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
+        """Raises: DataError for a task that the judge does not know."""
+        return self.judge.probability(instruction, candidate.frames, candidate.indices, candidate.total_frames)
 
 
 class _ComparisonAnswer(Answer):

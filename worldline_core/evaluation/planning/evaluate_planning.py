@@ -26,6 +26,7 @@ from worldline_core.evaluation.evaluation_config import PlanningConfig
 from worldline_core.evaluation.planning.bracket import (
     CandidateVideo,
     Choice,
+    LearnedSelector,
     MeasuredSelector,
     Selector,
     VLMSelector,
@@ -33,6 +34,7 @@ from worldline_core.evaluation.planning.bracket import (
     shown_order,
     shown_video,
 )
+from worldline_core.evaluation.policy.learned_judge import open_learned_judge
 from worldline_core.evaluation.recordings import open_rollouts, open_tracks, trajectory_of
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
@@ -69,14 +71,14 @@ _CHOICE_COLUMNS = ("method", "bank", "run", "budget", "episode_id", "trace")
 def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Choose in every bank, for every method and budget; then open the labels.
 
-    Inputs: banks, rollouts.<method>; tracks and segmenter where the selector uses them.
+    Inputs: banks, rollouts.<method>; tracks, segmenter and judge where the selector uses them.
     Output: choices.parquet, scores.parquet (metric ``success@N``), summary.json. Shortcuts are methods ``shortcut_<name>``.
     """
     episodes = EpisodeSet.open(inputs["banks"])
     rollouts = open_rollouts(inputs)
     tracks = open_tracks(inputs)
     banks = list_banks(episodes.rows)
-    selector = open_selector(config, inputs.get("segmenter"))
+    selector = open_selector(config, inputs)
 
     def choose_in_bank(method: str, bank: str) -> list[dict[str, Any]]:
         load = candidate_loader(config.views, episodes, tracks, rollouts.get(method), method, banks[bank])
@@ -138,10 +140,13 @@ def list_banks(rows: list[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
     return ordered
 
 
-def open_selector(config: PlanningConfig, segmenter: Path | None) -> Selector:
-    """The selector of a config."""
+def open_selector(config: PlanningConfig, inputs: Mapping[str, Path]) -> Selector:
+    """The selector of a config, from the inputs ``segmenter`` or ``judge``."""
+    if config.selector == "learned":
+        return LearnedSelector(open_learned_judge(inputs.get("judge")))
     if config.selector == "measured":
-        return MeasuredSelector(open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights))
+        opened = open_segmenter(config.segmenter, learned=inputs.get("segmenter"), sam3=config.sam3_weights)
+        return MeasuredSelector(opened)
     return VLMSelector(open_vlm(config.selector, config.vlm))
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -25,10 +25,12 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
-from worldline_core.evaluation.policy.judge import Judge, VLMJudge, confidence_of, judge_trajectory
+from worldline_core.evaluation.policy.judge import Judge, Judgement, VLMJudge, confidence_of, judge_trajectory
+from worldline_core.evaluation.policy.learned_judge import open_learned_judge
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.trust import assess_trust
 from worldline_core.evaluation.recordings import (
+    Trajectory,
     open_rollouts,
     open_tracks,
     rows_of,
@@ -61,14 +63,14 @@ _ALL = "all"
 _LABELS = ("episode_id", "embodiment", "split", "scene", "task_family", "instruction", "outcome")
 _COLUMNS = (
     "method", "episode_id", "embodiment", "split", "scene", "task_family", "seed", "start", "instruction",
-    "outcome", "predicted", "confidence", "evidence_family", "decided_by", "answers", "malformed_answers", "evidence",
+    "outcome", "predicted", "undecided", "confidence", "evidence_family", "decided_by", "answers", "malformed_answers", "evidence",
 )  # fmt: skip
 
 
 def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Judge every method's videos and compare with the recorded outcomes.
 
-    Inputs: episodes, rollouts.<method>; tracks and segmenter where the judge uses them.
+    Inputs: episodes, rollouts.<method>; tracks, segmenter and judge where the judge uses them.
     Output: scores.parquet (metric ``correct``), decisions.parquet (every verdict with its evidence), summary.json.
     """
     episodes, rollouts, tracks = EpisodeSet.open(inputs["episodes"]), open_rollouts(inputs), open_tracks(inputs)
@@ -83,12 +85,12 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
             "Trust in verdicts needs the controls", where="evaluate_policy.trust", expected="the input tracks",
             next_step="run render_actions and give its folder as --input tracks=FOLDER",
         )  # fmt: skip
-    judge = open_judge(config, inputs.get("segmenter"))
+    judge_name, judge = open_judge(config, inputs)
 
     def judge_video(row: EpisodeRow, rollout: RolloutSet | None, seed: int) -> dict[str, Any]:
         video = trajectory_of(episodes, row, config.views, rollout=rollout, seed=seed, tracks=tracks)
         seen = video.num_frames * (1 if rollout is None else stride_of(rollout, row))
-        return {"num_frames": seen, **asdict(judge_trajectory(judge, video))}
+        return {"num_frames": seen, **asdict(judge(video))}
 
     judged: list[dict[str, Any]] = []
     for row in with_progress(chosen, "evaluate_policy", "recording"):
@@ -110,7 +112,7 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     tasks = {verdict["episode_id"]: verdict["task"] for verdict in verdicts}
     shortcuts = verdicts_without_video(episodes, tracks, judged_rows, tasks)
     summary = summarise_decisions(verdicts, shortcuts, **resampling)
-    summary |= {"judge": judge.name, "interval": "95 % bootstrap over trajectories"}
+    summary |= {"judge": judge_name, "interval": "95 % bootstrap over trajectories"}
     summary["shorter_than_recording"] = dict(too_short)
     if config.compare_policies:
         summary["policies"] = policy_agreement(verdicts, **resampling)
@@ -121,7 +123,7 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     if config.trust and tracks:
         assess_trust(output, config.trust, episodes, tracks, **resampling)
     overall = {name: found[_ALL]["accuracy"]["mean"] for name, found in summary["methods"].items()}
-    return counts | {"trajectories": summary["trajectories"], "judge": judge.name, "accuracy": overall}
+    return counts | {"trajectories": summary["trajectories"], "judge": judge_name, "accuracy": overall}
 
 
 def choose_trajectories(
@@ -150,19 +152,27 @@ def choose_trajectories(
     return sorted(chosen, key=lambda row: row.episode_id)
 
 
-def open_judge(config: PolicyEvaluationConfig, segmenter: Path | None) -> Judge:
-    """The judge that the config names."""
+def open_judge(
+    config: PolicyEvaluationConfig, inputs: Mapping[str, Path]
+) -> tuple[str, Callable[[Trajectory], Judgement]]:
+    """Name and verdicts of the judge that the config names, from the inputs ``segmenter`` or ``judge``."""
+    if config.judge == "learned":
+        learned = open_learned_judge(inputs.get("judge"))
+        return learned.name, learned.judge
+    judge: Judge
     if config.judge == "measured":
-        opened = open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights)
-        return MeasuredEvidenceJudge(opened)
-    return VLMJudge(open_vlm(config.judge, config.vlm))
+        opened = open_segmenter(config.segmenter, learned=inputs.get("segmenter"), sam3=config.sam3_weights)
+        judge = MeasuredEvidenceJudge(opened)
+    else:
+        judge = VLMJudge(open_vlm(config.judge, config.vlm))
+    return judge.name, partial(judge_trajectory, judge)
 
 
 def _decision(row: EpisodeRow, method: str, seed: int, verdict: Mapping[str, Any]) -> dict[str, Any]:
     """A row of the decisions; ``whole`` where the video shows the recording to its end."""
     return {
         **{label: getattr(row, label) for label in _LABELS},
-        **{key: verdict[key] for key in ("decided_by", "answers", "malformed_answers")},
+        **{key: verdict[key] for key in ("decided_by", "answers", "malformed_answers", "undecided")},
         "method": method,
         "seed": seed,
         "policy": row.source,
@@ -220,13 +230,13 @@ def summarise_decisions(
     """Accuracy of every method and group, and differences between methods.
 
     Args:
-        rows: verdicts with method, episode_id, seed, split, task_family, outcome, predicted, answers, malformed_answers.
+        rows: verdicts with method, episode_id, seed, split, task_family, outcome, predicted, undecided, answers, malformed_answers.
         shortcuts: success by shortcut and episode, without any video.
 
     Returns:
         {"trajectories", "methods": {method: {group: {"accuracy": interval, "seeds": {...}, "confusion": {...}, "over_shortcut": {"shortcut",
-        "gain": interval}}}}, "shortcuts": {shortcut: {group: interval}}, "differences": [...]}; groups are "all", each split, each family,
-        and split/family; a gain is over the shortcut that is right most often there, recording by recording.
+        "gain": interval}, "undecided": {"share", "accuracy_of_decided"}}}}, "shortcuts": {shortcut: {group: interval}}, "differences": [...]}; groups are "all", each split, each family,
+        and split/family; an undecided verdict counts as the nearer side; a gain is over the shortcut that is right most often there, recording by recording.
     """
     outcomes = {row["episode_id"]: row["outcome"] == "success" for row in rows}
     correct = {
@@ -254,8 +264,15 @@ def summarise_decisions(
             for name, values in correct.items():
                 found = bootstrap_mean([values[episode] for episode in own], resamples=resamples, seed=seed)
                 by_group[name][group] = asdict(found)
+        decided = [row for row in members if not row["undecided"]]
         methods[method][group] = {
             "accuracy": asdict(accuracy),
+            "undecided": {
+                "share": 1.0 - len(decided) / len(members),
+                "accuracy_of_decided": float(np.mean([row["predicted"] == row["outcome"] for row in decided]))
+                if decided
+                else None,
+            },
             "over_shortcut": {"shortcut": best, "gain": gain},
             "seeds": {str(name): value for name, value in _accuracy(members, "seed").items()},
             "confusion": confusion,

@@ -98,12 +98,15 @@ def confidence_of(judgement: Mapping[str, Any]) -> float | None:
     return min(1.0, max(0.0, stated[-1] if judgement["success"] and by_evidence else min(stated)))
 
 
-Pass = Literal["first_pass", "verification", "reconciliation", "motion"]
+Pass = Literal["first_pass", "verification", "reconciliation", "motion", "learned"]
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """The decision, the pass that made it (the last one for a failure), and what was stated in every pass."""
+    """The decision, the pass that made it (the last one for a failure), and what was stated in every pass.
+
+    ``undecided``: the judge states no verdict, and ``success`` is only the side that is nearer.
+    """
 
     success: bool
     family: EvidenceFamily
@@ -111,6 +114,7 @@ class Judgement:
     malformed_answers: int
     answers: int
     statements: list[dict[str, Any]]
+    undecided: bool = False
 
 
 def judge_trajectory(judge: Judge, trajectory: Trajectory) -> Judgement:

@@ -9,7 +9,6 @@ blocky, and shows faint copies of a moving arm. Masks follow the geometry only.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Annotated, Any, cast
 
 import numpy as np
 import torch
-from einops import rearrange
 from jaxtyping import Float
 from pydantic import BaseModel, Field, ValidationError
 from safetensors.torch import save
@@ -28,6 +26,7 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, DataError
+from worldline_core.evaluation.augmentation import change_colours, degrade, mix_ghosts, move, uniform
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frames_to_unit
 from worldline_core.evaluation.recordings import HEAD
@@ -42,7 +41,6 @@ WEIGHTS_FILE = "model.safetensors"
 DESCRIPTION_FILE = "segmenter.json"
 _BATCH = 64
 _GROUPS = 8
-_BLOCK = 8
 
 
 class UNet(nn.Module):
@@ -299,91 +297,10 @@ def augment(
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, "n 3 h w"], Float[Tensor, "n h w"]]:
     """Random geometry, colours and degradation; ``ghosts`` are other frames of the same videos. Intensities [0, 1]."""
-    frames = _mix_ghosts(frames, ghosts, generator)
-    frames, masks = _geometry(frames, masks, generator)
-    frames = _colours(frames, generator)
+    frames = mix_ghosts(frames, ghosts, generator)
+    moved = move(torch.cat([frames, masks[:, None]], dim=1), generator, mirror=True)
+    frames, masks = moved[:, :3], (moved[:, 3] > 0.5).to(masks.dtype)
+    frames = change_colours(frames, generator)
     frames = degrade(frames, generator)
-    noise = torch.randn(frames.shape, generator=generator) * _uniform(frames, 0.0, 0.03, generator)
+    noise = torch.randn(frames.shape, generator=generator) * uniform(frames, 0.0, 0.03, generator)
     return (frames + noise).clamp(0, 1), masks
-
-
-def degrade(frames: Float[Tensor, "n 3 h w"], generator: torch.Generator) -> Float[Tensor, "n 3 h w"]:
-    """Each frame by chance sharp, blurred, or rebuilt from few 8x8 cosine coefficients (as a patch tokenizer would)."""
-    choice = torch.rand(len(frames), generator=generator)
-    result = frames.clone()
-    blurred, rebuilt = choice < 0.35, choice > 0.65
-    if blurred.any():
-        result[blurred] = _blur(frames[blurred], generator)
-    if rebuilt.any():
-        result[rebuilt] = _truncate_blocks(frames[rebuilt], generator)
-    return result
-
-
-def _uniform(frames: Tensor, low: float, high: float, generator: torch.Generator) -> Tensor:
-    return low + (high - low) * torch.rand(len(frames), 1, 1, 1, generator=generator)
-
-
-def _mix_ghosts(frames: Tensor, ghosts: Tensor, generator: torch.Generator) -> Tensor:
-    """A quarter of the frames shows a faint second exposure."""
-    strength = _uniform(frames, 0.0, 0.35, generator) * (torch.rand(len(frames), 1, 1, 1, generator=generator) < 0.25)
-    return frames * (1 - strength) + ghosts * strength
-
-
-def _geometry(frames: Tensor, masks: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Mirror, scale 0.85..1.2, shift 8 %, turn 6 degrees."""
-    count, _, height, width = frames.shape
-    draw = torch.rand(5, count, generator=generator)
-    scale = 0.85 + 0.35 * draw[0]
-    angle = (2 * draw[1] - 1) * math.radians(6)
-    mirror = torch.where(draw[2] < 0.5, -1.0, 1.0)
-    aspect = width / height
-    cosine, sine = torch.cos(angle) / scale, torch.sin(angle) / scale
-    # normalised coordinates: a turn in pixels needs the aspect ratio on its off-diagonal terms
-    top = torch.stack([mirror * cosine, -sine / aspect, 0.16 * (draw[3] - 0.5)], dim=-1)
-    bottom = torch.stack([mirror * sine * aspect, cosine, 0.16 * (draw[4] - 0.5)], dim=-1)
-    grid = functional.affine_grid(torch.stack([top, bottom], dim=1), [count, 3, height, width], align_corners=False)
-    frames = functional.grid_sample(frames, grid, mode="bilinear", padding_mode="reflection", align_corners=False)
-    moved = functional.grid_sample(
-        masks[:, None], grid, mode="bilinear", padding_mode="reflection", align_corners=False
-    )
-    return frames, (moved[:, 0] > 0.5).to(masks.dtype)
-
-
-def _colours(frames: Tensor, generator: torch.Generator) -> Tensor:
-    """Brightness, contrast, gamma, saturation, tint; one frame in eight has its channels permuted."""
-    permuted = torch.rand(len(frames), generator=generator) < 0.125
-    order = torch.randperm(3, generator=generator)
-    frames = torch.where(permuted[:, None, None, None], frames[:, order], frames)
-    frames = frames.clamp(min=1e-3) ** _uniform(frames, 0.7, 1.45, generator)
-    grey = frames.mean(dim=1, keepdim=True)
-    frames = grey + (frames - grey) * _uniform(frames, 0.4, 1.5, generator)
-    middle = frames.mean(dim=(1, 2, 3), keepdim=True)
-    frames = middle + (frames - middle) * _uniform(frames, 0.7, 1.35, generator)
-    tint = 1 + 0.15 * (2 * torch.rand(len(frames), 3, 1, 1, generator=generator) - 1)
-    return (frames * tint + _uniform(frames, -0.12, 0.12, generator)).clamp(0, 1)
-
-
-def _blur(frames: Tensor, generator: torch.Generator) -> Tensor:
-    """Gaussian blur, one sigma of 0.4..2 px for all of them."""
-    sigma = 0.4 + 1.6 * float(torch.rand((), generator=generator))
-    offsets = torch.arange(-4, 5, dtype=frames.dtype)
-    kernel = torch.exp(-offsets.square() / (2 * sigma**2))
-    kernel = kernel / kernel.sum()
-    padded = functional.pad(frames, (4, 4, 4, 4), mode="replicate")
-    rows = functional.conv2d(padded, kernel.view(1, 1, 9, 1).expand(3, 1, 9, 1), groups=3)
-    return functional.conv2d(rows, kernel.view(1, 1, 1, 9).expand(3, 1, 1, 9), groups=3)
-
-
-def _truncate_blocks(frames: Tensor, generator: torch.Generator) -> Tensor:
-    """Keep the cosine coefficients (i, j) with i + j <= k of every 8x8 block, k = 1..4."""
-    height, width = frames.shape[-2:]
-    padded = functional.pad(frames, (0, -width % _BLOCK, 0, -height % _BLOCK), mode="replicate")
-    index = torch.arange(_BLOCK, dtype=frames.dtype)
-    basis = torch.cos(math.pi * (index[None] + 0.5) * index[:, None] / _BLOCK) * math.sqrt(2 / _BLOCK)
-    basis[0] /= math.sqrt(2)
-    limit = int(torch.randint(1, 5, (), generator=generator))
-    kept = ((index[:, None] + index[None]) <= limit).to(frames.dtype)
-    blocks = rearrange(padded, "n c (h p) (w q) -> n c h w p q", p=_BLOCK, q=_BLOCK)
-    coefficients = torch.einsum("ip,nchwpq,jq->nchwij", basis, blocks, basis) * kept
-    blocks = torch.einsum("ip,nchwij,jq->nchwpq", basis, coefficients, basis)
-    return rearrange(blocks, "n c h w p q -> n c (h p) (w q)")[..., :height, :width]

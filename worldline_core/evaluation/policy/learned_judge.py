@@ -1,0 +1,569 @@
+"""The learned judge, a small network on a few frames of all views, and the step train_judge, which fits it to recorded outcomes.
+
+It sees pictures and the instruction alone: the first frame and late ones, for every pixel how much of it is of the two things that the
+instruction names by colour, and the other words. It gives the probability that the task was done. Where that lies within a band
+around one half it is undecided; the band is fitted on validation recordings. Training frames are augmented to look like unseen
+scenes and like predicted frames, and mirrored together with their views.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from einops import rearrange, repeat
+from jaxtyping import Float
+from pydantic import BaseModel, Field, ValidationError
+from safetensors.torch import save
+from scipy.optimize import minimize
+from torch import Tensor, nn
+from torch.nn import functional
+
+from worldline_core.config import ImageSize
+from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import VideoFrames
+from worldline_core.errors import ArtifactError, DataError
+from worldline_core.evaluation.augmentation import change_colours, degrade, mix_ghosts, move, uniform
+from worldline_core.evaluation.evaluation_config import JudgeConfig
+from worldline_core.evaluation.policy.evidence import route
+from worldline_core.evaluation.policy.judge import Judgement
+from worldline_core.evaluation.recordings import HEAD, Pictures, Trajectory
+from worldline_core.evaluation.segmenters.coloured_things import HUES_DEG, own_colour, thing_share
+from worldline_core.model.checkpoint import check_fit, fill, read_weights
+from worldline_core.model.tokenizers import (
+    VideoTokenizer,
+    frames_to_video,
+    load_tokenizer,
+    resized_frames,
+    video_to_frames,
+)
+from worldline_core.progress import with_progress
+from worldline_core.store.artifact_files import read_json
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+from worldline_core.training.train_tokenizer import disturb
+from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
+
+logger = logging.getLogger(__name__)
+
+WEIGHTS_FILE = "model.safetensors"
+DESCRIPTION_FILE = "judge.json"
+POSITIONS = (0.0, 0.75, 0.9, 1.0)
+"""Frames that it sees, 0 the first, 1 the last."""
+_THINGS = 2
+_CHANNELS = 3 + _THINGS
+_GROUPS = 8
+_WORDS = 64
+"""Length of the vector that an instruction and a view become."""
+_MIRRORED = [VIEWS.index(view) for view in ("head", "right_wrist", "left_wrist")]
+_OUTCOMES = ("success", "failure")
+
+
+def instruction_words(instruction: str) -> tuple[str, ...]:
+    """Words of an instruction in order, without those of colours: these the pictures show."""
+    return tuple(word for word in re.findall(r"[a-z]+", instruction.lower()) if word not in HUES_DEG)
+
+
+def named_colours(instruction: str) -> list[str]:
+    """The first colours that the instruction names."""
+    return [word for word in re.findall(r"[a-z]+", instruction.lower()) if word in HUES_DEG][:_THINGS]
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is seen of one video.
+
+    Attributes:
+        pictures: uint8 (views, frames, 5, h, w), zeros of views that are not there; channels are RGB and the shares of two things.
+        shown: bool (views,).
+    """
+
+    pictures: np.ndarray
+    shown: np.ndarray
+
+
+def look_at(instruction: str, frames: Mapping[str, np.ndarray]) -> Look:
+    """Frames at `POSITIONS` by view, uint8 (frames, h, w, 3), and in them the things that the instruction names by colour."""
+    height, width = next(iter(frames.values())).shape[1:3]
+    pictures = np.zeros((len(VIEWS), len(POSITIONS), _CHANNELS, height, width), np.uint8)
+    colours = named_colours(instruction)
+    for number, view in enumerate(VIEWS):
+        if view not in frames:
+            continue
+        pictures[number, :, :3] = rearrange(frames[view], "t h w c -> t c h w")
+        for channel, colour in enumerate(colours, start=3):
+            own = own_colour(frames.get(HEAD, frames[view])[:1], colour)
+            pictures[number, :, channel] = np.round(255 * thing_share(frames[view], colour, own))
+    return Look(pictures, np.array([view in frames for view in VIEWS]))
+
+
+def frame_numbers(available: Sequence[int], num_frames: int) -> list[int]:
+    """Places in ``available`` (frames of a video, by number) of those nearest to `POSITIONS`."""
+    numbers = np.asarray(available)
+    return [int(np.argmin(np.abs(numbers - position * (num_frames - 1)))) for position in POSITIONS]
+
+
+class OutcomeNetwork(nn.Module):
+    """Convolutions on the frames of one view at a time, stacked; the instruction and the view scale and shift the features.
+
+    Args:
+        widths: channels at half, quarter, ... resolution; multiples of 8.
+        words: size of the vocabulary.
+    """
+
+    def __init__(self, widths: tuple[int, ...], words: int) -> None:
+        super().__init__()
+        self.condition = nn.Linear(words + len(VIEWS), _WORDS)
+        stacked = len(POSITIONS) * _CHANNELS + 2
+        self.blocks = nn.ModuleList(
+            _Block(cin, cout) for cin, cout in zip((stacked, *widths[:-1]), widths, strict=True)
+        )
+        self.view = nn.Linear(2 * widths[-1], 2 * _WORDS)
+        self.head = nn.Sequential(
+            nn.Linear(len(VIEWS) * 2 * _WORDS + len(VIEWS) + words, 2 * _WORDS),
+            nn.SiLU(),
+            nn.Linear(2 * _WORDS, 1),
+        )
+
+    def forward(
+        self,
+        pictures: Float[Tensor, "b views frames 5 h w"],
+        shown: Float[Tensor, "b views"],
+        words: Float[Tensor, "b words"],
+    ) -> Float[Tensor, " b"]:
+        """Logits of success; pictures in [0, 1]."""
+        batch, views, _, _, height, width = pictures.shape
+        stacked = rearrange(2 * pictures - 1, "b views frames c h w -> (b views) (frames c) h w")
+        rows, columns = torch.linspace(-1, 1, height), torch.linspace(-1, 1, width)
+        places = torch.stack([repeat(rows, "h -> h w", w=width), repeat(columns, "w -> h w", h=height)])
+        places = repeat(places.to(stacked), "c h w -> n c h w", n=len(stacked))
+        features = torch.cat([stacked, places], dim=1)
+        which = repeat(torch.eye(views).to(words), "v w -> (b v) w", b=batch)
+        condition = functional.silu(self.condition(torch.cat([repeat(words, "b w -> (b v) w", v=views), which], dim=1)))
+        for block in self.blocks:
+            features = block(features, condition)
+        pooled = torch.cat([features.mean(dim=(2, 3)), features.amax(dim=(2, 3))], dim=1)
+        seen = rearrange(functional.silu(self.view(pooled)), "(b v) c -> b v c", v=views) * shown[..., None]
+        return self.head(torch.cat([rearrange(seen, "b v c -> b (v c)"), shown, words], dim=1))[:, 0]
+
+
+class _Block(nn.Module):
+    """Halve the resolution, then a residual pair of convolutions that the condition modulates; at first the pair adds nothing.
+
+    One norm: on a CPU it takes longer than a convolution.
+    """
+
+    def __init__(self, cin: int, cout: int) -> None:
+        super().__init__()
+        self.down = nn.Conv2d(cin, cout, 3, stride=2, padding=1)
+        self.first = nn.Conv2d(cout, cout, 3, padding=1)
+        self.second = nn.Conv2d(cout, cout, 3, padding=1)
+        self.norm = nn.GroupNorm(_GROUPS, cout)
+        self.modulation = nn.Linear(_WORDS, 2 * cout)
+        for convolution in (self.down, self.first):
+            nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
+        nn.init.zeros_(self.second.weight)
+
+    def forward(self, features: Tensor, condition: Tensor) -> Tensor:
+        """Features of half the size."""
+        features = functional.silu(self.norm(self.down(features)))
+        scale, shift = self.modulation(condition)[..., None, None].chunk(2, dim=1)
+        inner = functional.silu(self.first(features) * (1 + scale) + shift)
+        return features + self.second(inner)
+
+
+class _Described(BaseModel):
+    """A judge's description."""
+
+    widths: tuple[Annotated[int, Field(ge=_GROUPS, le=1 << 12, multiple_of=_GROUPS)], ...] = Field(
+        min_length=1, max_length=8
+    )
+    image_size: ImageSize
+    words: tuple[str, ...] = Field(max_length=1 << 16)
+    verbs: tuple[str, ...]
+    scale: float = Field(gt=0, lt=1e6)
+    bias: float = Field(gt=-1e6, lt=1e6)
+    margin: float = Field(ge=0, le=0.5)
+
+
+class LearnedJudge:
+    """A trained network, calibrated; a verdict is decided where its probability is farther than ``margin`` from one half."""
+
+    name = "learned"
+
+    def __init__(self, network: OutcomeNetwork, described: _Described) -> None:
+        self.network = network.eval().requires_grad_(False)
+        self.described = described
+
+    def knows(self, instruction: str) -> bool:
+        """False where no word of it is a verb of the training instructions: then its words say nothing about the task."""
+        return not {*self.described.verbs}.isdisjoint(instruction_words(instruction))
+
+    def probability(
+        self, instruction: str, frames: Mapping[str, Pictures | np.ndarray], available: Sequence[int], num_frames: int
+    ) -> float:
+        """Probability of success.
+
+        Args:
+            frames: by view, the ``available`` frames of the video, by number; only those that are looked at are decoded.
+
+        Raises: DataError for an instruction of which it knows no verb.
+        """
+        if not self.knows(instruction):
+            raise DataError(
+                "The learned judge does not know this task", got=repr(instruction),
+                expected="one of the verbs " + ", ".join(self.described.verbs),
+                next_step="train a judge on recordings of it (train_judge), or choose another judge",
+            )  # fmt: skip
+        chosen = frame_numbers(available, num_frames)
+        small = {
+            view: resized_frames(np.asarray(video[chosen]), self.described.image_size) for view, video in frames.items()
+        }
+        look = look_at(instruction, small)
+        with torch.no_grad():
+            logit = self.network(
+                torch.from_numpy(look.pictures)[None] / 255.0,
+                torch.from_numpy(look.shown)[None].float(),
+                multi_hot(instruction, self.described.words)[None],
+            )
+        return float(torch.sigmoid(self.described.scale * logit + self.described.bias))
+
+    def judge(self, trajectory: Trajectory) -> Judgement:
+        """The nearer side, undecided within the band; of a task that it does not know, undecided failure."""
+        count, family = trajectory.num_frames, route(trajectory.instruction)
+        if not self.knows(trajectory.instruction):
+            stated = {"pass": "learned", "confidence": 0.5, "observations": "no verb of the instruction is known"}
+            return Judgement(False, family, "learned", 0, 1, [stated], undecided=True)
+        value = self.probability(trajectory.instruction, trajectory.frames, range(count), count)
+        stated = {"pass": "learned", "confidence": max(value, 1.0 - value), "probability": value}
+        undecided = abs(value - 0.5) <= self.described.margin
+        return Judgement(value > 0.5, family, "learned", 0, 1, [stated], undecided=undecided)
+
+    @classmethod
+    def load(cls, folder: Path) -> LearnedJudge:
+        """Open a trained judge.
+
+        Raises: ArtifactError for a missing or damaged folder, or weights of another network.
+        """
+        description_path, weights_path = folder / DESCRIPTION_FILE, folder / WEIGHTS_FILE
+        missing = [path.name for path in (description_path, weights_path) if not path.is_file()]
+        if missing:
+            raise ArtifactError(
+                "Not a trained judge", where=folder, expected=f"{DESCRIPTION_FILE} and {WEIGHTS_FILE}",
+                got=f"missing {missing}", next_step="run train_judge",
+            )  # fmt: skip
+        try:
+            described = _Described.model_validate(read_json(description_path))
+            tensors = read_weights(weights_path, None)
+            with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
+                network = OutcomeNetwork(described.widths, len(described.words))
+            check_fit({name: tuple(t.shape) for name, t in network.state_dict().items()}, tensors, weights_path)
+            fill(network.to_empty(device="cpu"), tensors, where=weights_path, dtype=torch.float32)
+        except (ArtifactError, ValidationError) as error:
+            raise ArtifactError(
+                "The judge cannot be read", where=folder, got=str(error), next_step="train it again"
+            ) from error
+        return cls(network, described)
+
+
+def open_learned_judge(folder: Path | None) -> LearnedJudge:
+    """Raises: ArtifactError without a folder, or as `LearnedJudge.load`."""
+    if folder is None:
+        raise ArtifactError(
+            "The learned judge has no weights", expected="an input named judge",
+            next_step="give the folder of a judge, run train_judge, or choose the measured one",
+        )  # fmt: skip
+    return LearnedJudge.load(folder)
+
+
+def multi_hot(instruction: str, vocabulary: Sequence[str]) -> Float[Tensor, " words"]:
+    """1 for each word of the vocabulary that the instruction has; others are dropped."""
+    own = {*instruction_words(instruction)}
+    return torch.tensor([float(word in own) for word in vocabulary])
+
+
+@dataclass(frozen=True)
+class JudgedVideo:
+    """A recording: what is seen of it as it is, and as it comes out of a tokenizer where there is one."""
+
+    name: str
+    instruction: str
+    success: bool
+    looks: tuple[Look, ...]
+
+
+@dataclass(frozen=True)
+class OutcomeBatch:
+    """Arguments of `OutcomeNetwork.forward`, and 1 for success."""
+
+    names: tuple[str, ...]
+    pictures: Float[Tensor, "b views frames 5 h w"]
+    shown: Float[Tensor, "b views"]
+    words: Float[Tensor, "b words"]
+    success: Float[Tensor, " b"]
+
+
+class OutcomeObjective(Objective[OutcomeBatch]):
+    """Cross entropy."""
+
+    def __init__(self, network: OutcomeNetwork) -> None:
+        self.network = network
+
+    def loss(self, batch: OutcomeBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+        """Loss of one batch."""
+        del generator, step
+        logits = self.network(batch.pictures, batch.shown, batch.words).float()
+        return functional.binary_cross_entropy_with_logits(logits, batch.success), {}
+
+
+Drawing = Sequence[tuple[Sequence[JudgedVideo], Sequence[JudgedVideo]]]
+"""By task, successes and failures."""
+
+
+def by_task(videos: Sequence[JudgedVideo]) -> Drawing:
+    """Videos of each task, an instruction without its colours, in which both outcomes occur or one."""
+    tasks: dict[tuple[str, ...], tuple[list[JudgedVideo], list[JudgedVideo]]] = defaultdict(lambda: ([], []))
+    for video in videos:
+        tasks[instruction_words(video.instruction)][not video.success].append(video)
+    return [ends for _, ends in sorted(tasks.items())]
+
+
+def outcome_batch(drawing: Drawing, vocabulary: Sequence[str], config: JudgeConfig, index: int) -> OutcomeBatch:
+    """Augmented videos of one step, evenly over tasks and outcomes: a pure function of the seed and the step."""
+    random = np.random.default_rng([config.seed, index])
+    chosen: list[JudgedVideo] = []
+    for _ in range(config.batch_size):
+        ends = [end for end in drawing[int(random.integers(len(drawing)))] if end]
+        end = ends[int(random.integers(len(ends)))]
+        chosen.append(end[int(random.integers(len(end)))])
+    looks = [video.looks[int(random.integers(len(video.looks)))] for video in chosen]
+    batch = _batch(chosen, looks, vocabulary)
+    pictures, shown = augment(batch.pictures, batch.shown, step_generator(config.seed, index, "cpu"))
+    return OutcomeBatch(batch.names, pictures, shown, batch.words, batch.success)
+
+
+def _batch(videos: Sequence[JudgedVideo], looks: Sequence[Look], vocabulary: Sequence[str]) -> OutcomeBatch:
+    return OutcomeBatch(
+        tuple(video.name for video in videos),
+        torch.from_numpy(np.stack([look.pictures for look in looks])) / 255.0,
+        torch.from_numpy(np.stack([look.shown for look in looks])).float(),
+        torch.stack([multi_hot(video.instruction, vocabulary) for video in videos]),
+        torch.tensor([float(video.success) for video in videos]),
+    )
+
+
+def augment(
+    pictures: Float[Tensor, "b views frames 5 h w"], shown: Float[Tensor, "b views"], generator: torch.Generator
+) -> tuple[Float[Tensor, "b views frames 5 h w"], Float[Tensor, "b views"]]:
+    """Half of the videos mirrored, left and right wrist with them; each view moved; a third of them degraded after the first frame, as
+    predictions are; half of them with the colours of another scene; a few wrist views hidden."""
+    batch, views, frames = pictures.shape[:3]
+    mirrored = torch.rand(batch, generator=generator) < 0.5
+    pictures, shown = pictures.clone(), shown.clone()
+    pictures[mirrored], shown[mirrored] = pictures[mirrored][:, _MIRRORED].flip(-1), shown[mirrored][:, _MIRRORED]
+    stacked = rearrange(pictures, "b v t c h w -> (b v) (t c) h w")
+    pictures = rearrange(move(stacked, generator, mirror=False), "(b v) (t c) h w -> b v t c h w", v=views, t=frames)
+    worse = torch.rand(batch, generator=generator) < 1 / 3
+    if worse.any():
+        sharp = pictures[worse, :, 1:]
+        late, ghosts = (rearrange(part, "b v t c h w -> (b v t) c h w") for part in (sharp, sharp.roll(1, dims=2)))
+        late = degrade(mix_ghosts(late, ghosts, generator), generator).clamp(0, 1)
+        pictures[worse, :, 1:] = rearrange(late, "(b v t) c h w -> b v t c h w", v=views, t=frames - 1)
+    other = torch.rand(batch, generator=generator) < 0.5
+    if other.any():
+        scenes = rearrange(pictures[other, :, :, :3], "b v t c h w -> b c (v t h) w")
+        scenes = change_colours(scenes, generator)
+        scenes = scenes + torch.randn(scenes.shape, generator=generator) * uniform(scenes, 0.0, 0.03, generator)
+        pictures[other, :, :, :3] = rearrange(scenes.clamp(0, 1), "b c (v t h) w -> b v t c h w", v=views, t=frames)
+    hidden = torch.rand(batch, views, generator=generator) < torch.tensor([0.0, 0.05, 0.05])
+    shown = shown * ~hidden
+    return pictures * shown[:, :, None, None, None, None], shown
+
+
+@torch.no_grad()
+def logits_of(
+    network: OutcomeNetwork, videos: Sequence[JudgedVideo], vocabulary: Sequence[str]
+) -> tuple[Tensor, Tensor]:
+    """Logits (n,) of all looks at the videos, and 1 where the video is a success."""
+    shown = [(video, look) for video in videos for look in video.looks]
+    logits, success = [], []
+    for start in range(0, len(shown), 32):
+        pairs = shown[start : start + 32]
+        batch = _batch([video for video, _ in pairs], [look for _, look in pairs], vocabulary)
+        logits.append(network(batch.pictures, batch.shown, batch.words).float())
+        success.append(batch.success)
+    return torch.cat(logits), torch.cat(success)
+
+
+def calibrate(logits: np.ndarray, success: np.ndarray) -> tuple[float, float]:
+    """Scale and bias of the logits under which outcomes are likeliest (Platt 1999)."""
+
+    def loss(values: np.ndarray) -> float:
+        shifted = np.exp(values[0]) * logits + values[1]
+        return float(np.logaddexp(0.0, np.where(success > 0.5, -shifted, shifted)).mean() + 1e-3 * (values**2).sum())
+
+    scale, bias = minimize(loss, np.zeros(2)).x
+    return float(np.exp(scale)), float(bias)
+
+
+def undecided_margin(probability: np.ndarray, success: np.ndarray, least_right: float) -> float:
+    """The smallest distance from one half beyond which ``least_right`` of the verdicts are right; 0.5, all undecided, without any."""
+    distance = np.abs(probability - 0.5)
+    order = np.argsort(-distance, kind="stable")
+    right = ((probability > 0.5) == (success > 0.5))[order].cumsum() / np.arange(1, len(order) + 1)
+    good = np.flatnonzero(right >= least_right)
+    if not len(good):
+        return 0.5
+    last = int(good[-1])
+    return 0.0 if last == len(order) - 1 else float(distance[order[last + 1]])
+
+
+def train_judge(config: JudgeConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    """Train on the outcomes of the training split, calibrate on the validation split.
+
+    Inputs: episodes; tokenizer, with which half of the videos are seen as it gives them back. Output: model.safetensors, judge.json
+    (what it knows, its calibration and its undecided band), metrics.jsonl (losses).
+
+    Raises: DataError when a split has no recorded outcomes of both kinds.
+    """
+    episodes = EpisodeSet.open(inputs["episodes"])
+    tokenizer = load_tokenizer(inputs["tokenizer"]) if "tokenizer" in inputs else None
+    rows = {split: [episodes.rows[n] for n in episodes.select(split=split)] for split in ("train", "validation")}
+    ended = {split: [row for row in own if judgeable(row)] for split, own in rows.items()}
+    for split, own in ended.items():
+        if {row.outcome for row in own} != {*_OUTCOMES}:
+            raise DataError(
+                f"The split {split} does not have both outcomes", where=episodes.root,
+                expected="recordings that ended in success, and others that ended in failure",
+                got=f"{len(rows[split])} recordings, outcomes {sorted({row.outcome for row in own}) or 'unknown'}",
+                next_step="draw splits over scenes (curate.splits: {by: scene, validation: 0.1}), or set train_judge to null",
+            )  # fmt: skip
+    videos = {
+        split: [
+            load_video(episodes, row, config, tokenizer)
+            for row in with_progress(own, f"train_judge {split}", "episode")
+        ]
+        for split, own in ended.items()
+    }
+    return fit_judge(config, videos["train"], videos["validation"], output) | {
+        "found": len(episodes),
+        "kept": len(videos["train"]) + len(videos["validation"]),
+        "left_out": {
+            "in other splits": len(episodes) - sum(map(len, rows.values())),
+            f"without a recorded success or failure, an instruction, or {len(POSITIONS)} frames": sum(
+                map(len, rows.values())
+            )
+            - sum(map(len, ended.values())),
+        },
+    }
+
+
+def judgeable(row: EpisodeRow) -> bool:
+    """True for a recording with an outcome, an instruction and as many pictures as are looked at."""
+    long_enough = row.video_frames >= len(POSITIONS)
+    return row.outcome in _OUTCOMES and bool(instruction_words(row.instruction)) and long_enough
+
+
+def fit_judge(
+    config: JudgeConfig, training: Sequence[JudgedVideo], validation: Sequence[JudgedVideo], output: Path
+) -> dict[str, Any]:
+    """Train and calibrate on loaded videos; writes the judge."""
+    vocabulary = sorted({word for video in training for word in instruction_words(video.instruction)})
+    verbs = sorted({instruction_words(video.instruction)[0] for video in training})
+    torch.manual_seed(config.seed)
+    network = OutcomeNetwork(config.widths, len(vocabulary))
+    drawing = by_task(training)
+
+    def validate() -> dict[str, float]:
+        logits, success = logits_of(network, validation, vocabulary)
+        loss = functional.binary_cross_entropy_with_logits(logits, success)
+        return {"loss": float(loss), "accuracy": float(((logits > 0) == (success > 0.5)).float().mean())}
+
+    result = train(
+        config.trainer,
+        groups=[ParameterGroup("judge", dict(network.named_parameters()))],
+        objective=OutcomeObjective(network),
+        load=lambda index: outcome_batch(drawing, vocabulary, config, index),
+        validate=validate,
+        output=output,
+        identity={"config": config.model_dump(mode="json"), "episodes": [video.name for video in training]},
+        title="judge",
+        schedule=config.schedule,
+    )
+    # Calibrated as it is written: in half precision.
+    halves = {name: value.detach().cpu().to(torch.float16).contiguous() for name, value in result.average.items()}
+    network.load_state_dict({name: value.float() for name, value in halves.items()})
+    logits, success = (values.double().numpy() for values in logits_of(network.eval(), validation, vocabulary))
+    scale, bias = calibrate(logits, success)
+    probability = 1.0 / (1.0 + np.exp(-(scale * logits + bias)))
+    margin = undecided_margin(probability, success, config.least_right)
+    right, decided = (probability > 0.5) == (success > 0.5), np.abs(probability - 0.5) > margin
+    if not decided.any():
+        logger.warning("The judge is undecided about every validation recording: train it longer, or on more")
+    metrics = {
+        "videos": len(training),
+        "steps": config.steps,
+        "validation": {
+            "videos": len(validation),
+            "accuracy": float(right.mean()),
+            "decided": float(decided.mean()),
+            "accuracy_of_decided": float(right[decided].mean()) if decided.any() else None,
+        },
+    }
+    write_bytes_atomic(output / WEIGHTS_FILE, save(halves))
+    described = _Described(
+        widths=config.widths, image_size=config.image_size, words=tuple(vocabulary), verbs=tuple(verbs),
+        scale=scale, bias=bias, margin=margin,
+    )  # fmt: skip
+    facts = {"kind": "learned_judge", **described.model_dump(mode="json"), "training": config.model_dump(mode="json")}
+    write_json_atomic(output / DESCRIPTION_FILE, facts | metrics)
+    return metrics
+
+
+def load_video(
+    episodes: EpisodeSet, row: EpisodeRow, config: JudgeConfig, tokenizer: VideoTokenizer | None
+) -> JudgedVideo:
+    """What is seen of a recording."""
+    index = episodes.position(row.episode_id)
+    videos = {view: VideoFrames(episodes.clip(index, view)) for view in VIEWS if view in row.views}
+    count = min(len(video) for video in videos.values())
+    chosen = frame_numbers(range(count), count)
+    frames: dict[str, np.ndarray] = {}
+    again: dict[str, np.ndarray] = {}
+    generator = step_generator(config.seed, index, "cpu")
+    for view, video in videos.items():
+        if tokenizer is None:
+            frames[view] = resized_frames(video[chosen], config.image_size)
+            continue
+        whole = resized_frames(np.stack(list(video)), config.image_size)
+        frames[view] = whole[chosen]
+        again[view] = tokenized(tokenizer, whole[:count], chosen, config.disturbance, generator)
+    looks = [look_at(row.instruction, own) for own in (frames, again) if own]
+    return JudgedVideo(row.episode_id, row.instruction, row.outcome == "success", tuple(looks))
+
+
+@torch.no_grad()
+def tokenized(
+    tokenizer: VideoTokenizer, frames: np.ndarray, chosen: Sequence[int], disturbance: float, generator: torch.Generator
+) -> np.ndarray:
+    """The chosen frames as the tokenizer gives them back from disturbed codes, the first one as it is: uint8 (n, h, w, 3).
+
+    Only the first frame and groups of frames about the chosen ones are coded.
+    """
+    group = tokenizer.temporal_compression
+    ends = torch.randint(0, group, (len(chosen) - 1,), generator=generator).tolist()
+    lasts = [min(len(frames) - 1, number + later) for number, later in zip(chosen[1:], ends, strict=True)]
+    numbers = [max(1, last - group + 1 + k) for last in lasts for k in range(group)]
+    video = frames_to_video(frames[[0, *numbers]])[None]
+    again = tokenizer.decode(disturb(tokenizer.encode(video), disturbance, generator), video[:, :, 0])
+    decoded = video_to_frames(again[0])
+    slots = [1 + n * group + numbers[n * group : (n + 1) * group].index(number) for n, number in enumerate(chosen[1:])]
+    return np.concatenate([frames[:1], decoded[slots]])
