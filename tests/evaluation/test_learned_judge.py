@@ -108,6 +108,19 @@ def test_what_a_judge_lacks_is_named(attempts, tmp_path, project_root):
         PipelineConfig.load("tiny", None, ("evaluate_policy.judge=learned",))
 
 
+@pytest.mark.parametrize(
+    "change",
+    [{"widths": [8, 10**9]}, {"words": ["lift"]}, {"margin": float("nan")}, {"scale": -1}, {"image_size": [10**9, 2]}],
+    ids=str,
+)
+def test_a_description_that_fits_no_weights_is_refused(change, judge):
+    path, kept = judge / "judge.json", (judge / "judge.json").read_text()
+    path.write_text(json.dumps(json.loads(kept) | change))
+    with pytest.raises(ArtifactError, match="judge cannot be read"):
+        learned_judge.LearnedJudge.load(judge)
+    path.write_text(kept)
+
+
 def test_recordings_without_validation_are_refused(recordings, tmp_path):
     with pytest.raises(DataError, match=r"split train does not have both outcomes[\s\S]*curate\.splits"):
         learned_judge.train_judge(CONFIG, recordings.inputs, tmp_path)

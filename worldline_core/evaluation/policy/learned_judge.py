@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from einops import rearrange, repeat
 from jaxtyping import Float
+from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError
 from safetensors.torch import save
 from scipy.optimize import minimize
@@ -208,7 +209,7 @@ class LearnedJudge:
         return not {*self.described.verbs}.isdisjoint(instruction_words(instruction))
 
     def probability(
-        self, instruction: str, frames: Mapping[str, Pictures | np.ndarray], available: Sequence[int], num_frames: int
+        self, instruction: str, frames: Mapping[str, Pictures | NDArray[Any]], available: Sequence[int], num_frames: int
     ) -> float:
         """Probability of success.
 
