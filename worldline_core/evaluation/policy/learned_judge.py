@@ -9,10 +9,11 @@ scenes and like predicted frames, and mirrored together with their views.
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -66,6 +67,10 @@ _WORDS = 64
 """Length of the vector that an instruction and a view become."""
 _MIRRORED = [VIEWS.index(view) for view in ("head", "right_wrist", "left_wrist")]
 _OUTCOMES = ("success", "failure")
+_FORGET = 0.03
+"""Share of a task's running loss that each of its videos renews."""
+_LEAST_LOSS = 0.1
+"""What a task counts that is always judged rightly."""
 
 
 def instruction_words(instruction: str) -> tuple[str, ...]:
@@ -303,52 +308,72 @@ class JudgedVideo:
 
 @dataclass(frozen=True)
 class OutcomeBatch:
-    """Arguments of `OutcomeNetwork.forward`, and 1 for success."""
+    """Arguments of `OutcomeNetwork.forward`, 1 for success, and the number of each video's task."""
 
     names: tuple[str, ...]
     pictures: Float[Tensor, "b views frames 5 h w"]
     shown: Float[Tensor, "b views"]
     words: Float[Tensor, "b words"]
     success: Float[Tensor, " b"]
+    tasks: tuple[int, ...] = ()
 
 
 class OutcomeObjective(Objective[OutcomeBatch]):
-    """Cross entropy."""
+    """Cross entropy; keeps the running mean of it for each task, by which tasks are drawn."""
 
-    def __init__(self, network: OutcomeNetwork) -> None:
+    def __init__(self, network: OutcomeNetwork, tasks: int) -> None:
         self.network = network
+        self.losses = [math.log(2)] * tasks
 
     def loss(self, batch: OutcomeBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """Loss of one batch."""
         del generator, step
         logits = self.network(batch.pictures, batch.shown, batch.words).float()
-        return functional.binary_cross_entropy_with_logits(logits, batch.success), {}
+        losses = functional.binary_cross_entropy_with_logits(logits, batch.success, reduction="none")
+        for task, value in zip(batch.tasks, losses.tolist(), strict=True):
+            self.losses[task] += _FORGET * (value - self.losses[task])
+        return losses.mean(), {}
+
+    def state(self) -> dict[str, Any]:
+        """Losses by task."""
+        return {"losses": self.losses}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue with saved losses."""
+        self.losses = state["losses"]
 
 
-Drawing = Sequence[tuple[Sequence[JudgedVideo], Sequence[JudgedVideo]]]
-"""By task, successes and failures."""
+Drawing = Sequence[Sequence[Sequence[JudgedVideo]]]
+"""By task, successes and failures, those that there are."""
 
 
 def by_task(videos: Sequence[JudgedVideo]) -> Drawing:
-    """Videos of each task, an instruction without its colours, in which both outcomes occur or one."""
+    """Videos of each task, an instruction without its colours."""
     tasks: dict[tuple[str, ...], tuple[list[JudgedVideo], list[JudgedVideo]]] = defaultdict(lambda: ([], []))
     for video in videos:
         tasks[instruction_words(video.instruction)][not video.success].append(video)
-    return [ends for _, ends in sorted(tasks.items())]
+    return [[end for end in ends if end] for _, ends in sorted(tasks.items())]
 
 
-def outcome_batch(drawing: Drawing, vocabulary: Sequence[str], config: JudgeConfig, index: int) -> OutcomeBatch:
-    """Augmented videos of one step, evenly over tasks and outcomes: a pure function of the seed and the step."""
+def outcome_batch(
+    drawing: Drawing, losses: Sequence[float], vocabulary: Sequence[str], config: JudgeConfig, index: int
+) -> OutcomeBatch:
+    """Augmented videos of one step, evenly over outcomes: a pure function of the seed, the step and the losses.
+
+    Tasks that are still judged wrongly are drawn more often, in proportion to their loss: most are learned within a tenth of the steps that
+    the hardest takes.
+    """
     random = np.random.default_rng([config.seed, index])
+    weights = np.array(losses) + _LEAST_LOSS
+    tasks = random.choice(len(drawing), config.batch_size, p=weights / weights.sum()).tolist()
     chosen: list[JudgedVideo] = []
-    for _ in range(config.batch_size):
-        ends = [end for end in drawing[int(random.integers(len(drawing)))] if end]
-        end = ends[int(random.integers(len(ends)))]
+    for task in tasks:
+        end = drawing[task][int(random.integers(len(drawing[task])))]
         chosen.append(end[int(random.integers(len(end)))])
     looks = [video.looks[int(random.integers(len(video.looks)))] for video in chosen]
     batch = _batch(chosen, looks, vocabulary)
     pictures, shown = augment(batch.pictures, batch.shown, step_generator(config.seed, index, "cpu"))
-    return OutcomeBatch(batch.names, pictures, shown, batch.words, batch.success)
+    return replace(batch, pictures=pictures, shown=shown, tasks=tuple(tasks))
 
 
 def _batch(videos: Sequence[JudgedVideo], looks: Sequence[Look], vocabulary: Sequence[str]) -> OutcomeBatch:
@@ -482,6 +507,7 @@ def fit_judge(
     torch.manual_seed(config.seed)
     network = OutcomeNetwork(config.widths, len(vocabulary))
     drawing = by_task(training)
+    objective = OutcomeObjective(network, len(drawing))
 
     def validate() -> dict[str, float]:
         logits, success = logits_of(network, validation, vocabulary)
@@ -491,8 +517,8 @@ def fit_judge(
     result = train(
         config.trainer,
         groups=[ParameterGroup("judge", dict(network.named_parameters()))],
-        objective=OutcomeObjective(network),
-        load=lambda index: outcome_batch(drawing, vocabulary, config, index),
+        objective=objective,
+        load=lambda index: outcome_batch(drawing, objective.losses, vocabulary, config, index),
         validate=validate,
         output=output,
         identity={"config": config.model_dump(mode="json"), "episodes": [video.name for video in training]},
