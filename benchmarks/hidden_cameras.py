@@ -70,7 +70,9 @@ def drawn_jobs(body: str, episodes: int, seed: int) -> Iterator[Job]:
     families = [task for task in TASKS if task != "carry" or len(BODIES[body].arms) == 2]
     for number in range(episodes):
         entropy = (7000 + seed, BODIES[body].stream, SPLIT_STREAM["test"], number)
-        yield Job(f"{body}-{number:02d}", body, "test", families[number % len(families)], entropy)
+        yield Job(
+            f"{body}-{number:02d}", body, "test", families[number % len(families)], entropy, num_frames=NUM_FRAMES
+        )
 
 
 def record(body: str, output: Path, episodes: int, seed: int) -> None:
@@ -79,7 +81,7 @@ def record(body: str, output: Path, episodes: int, seed: int) -> None:
     arrays: dict[str, np.ndarray] = {}
     views: list[str] = []
     for number, job in enumerate(drawn_jobs(body, episodes, seed)):
-        found = recorder.record(job, NUM_FRAMES)
+        found = recorder.record(job)
         views = list(found.frames)
         arrays[f"{number}/state"], arrays[f"{number}/action"] = found.episode.state, found.episode.action
         for view, camera in found.episode.cameras.items():

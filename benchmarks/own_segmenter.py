@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import command_line, print_table
-from benchmarks.hidden_cameras import NUM_FRAMES, HiddenCameras, drawn_jobs
+from benchmarks.hidden_cameras import HiddenCameras, drawn_jobs
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.render_actions import render_actions
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
@@ -31,7 +31,7 @@ HELD_OUT, SIZE = 8, (64, 96)
 def measured(body: str, output: Path, episodes: int, seed: int) -> Iterator[float]:
     """Mean IoU with exact masks of the segmenter that is trained on `episodes` recordings, and of the shipped one."""
     recorder = HiddenCameras(body, seed)
-    recordings = [recorder.record(job, NUM_FRAMES) for job in drawn_jobs(body, episodes + HELD_OUT, seed)]
+    recordings = [recorder.record(job) for job in drawn_jobs(body, episodes + HELD_OUT, seed)]
     with EpisodeSetWriter(output / "set") as writer:
         for recording in recordings[:episodes]:
             writer.add(replace(recording.episode, split="train"), recording.frames)

@@ -83,6 +83,12 @@ def test_misses_are_drawn_evenly_and_apart_from_everything_else() -> None:
     assert all(job.policy is None for job in plain)
 
 
+def test_groups_have_their_own_length() -> None:
+    group = RecordGroup(embodiment="viperx_pearl", count=2)
+    jobs = plan_jobs(RecordConfig(groups=(group, group.model_copy(update={"num_frames": 65}))))
+    assert sorted(job.num_frames for job in jobs) == [33, 33, 65, 65]
+
+
 @pytest.mark.slow
 def test_shifts_are_named_in_the_index(rendering: None, tmp_path: Path) -> None:
     groups = {

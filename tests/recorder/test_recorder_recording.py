@@ -33,7 +33,7 @@ from worldline_core.recorder.record import (
 from worldline_core.recorder.scene import sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, Job, Recording
 
-JOB = Job("one", "viperx_graphite", "train", "place", (1, 2, 3))
+JOB = Job("one", "viperx_graphite", "train", "place", (1, 2, 3), num_frames=17)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def recorder(rendering: None) -> Iterator[EpisodeRecorder]:
 
 @pytest.fixture(scope="module")
 def recording(recorder: EpisodeRecorder) -> Recording:
-    return recorder.record(JOB, 17)
+    return recorder.record(JOB)
 
 
 def digests(root: Path) -> dict[str, str]:
@@ -54,9 +54,9 @@ def digests(root: Path) -> dict[str, str]:
 
 
 def test_an_episode_is_a_function_of_its_entropy(recorder: EpisodeRecorder, recording: Recording) -> None:
-    recorder.record(replace(JOB, split="test", family="press", entropy=(9,)), 17)
-    again = recorder.record(JOB, 17)
-    other = recorder.record(replace(JOB, entropy=(1, 2, 4)), 17)
+    recorder.record(replace(JOB, split="test", family="press", entropy=(9,)))
+    again = recorder.record(JOB)
+    other = recorder.record(replace(JOB, entropy=(1, 2, 4)))
     np.testing.assert_array_equal(again.episode.state, recording.episode.state)
     for view, images in recording.frames.items():
         np.testing.assert_array_equal(again.frames[view], images)

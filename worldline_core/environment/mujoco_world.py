@@ -260,7 +260,7 @@ def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
         def of_episodes(recorder: EpisodeRecorder, row: EpisodeRow) -> Drawn:
             job = jobs[row.episode_id]
             recorder.held_out_camera = job.held_out_camera
-            layout, motion, scene, random = recorder.draw(job, config.num_frames)
+            layout, motion, scene, random = recorder.draw(job)
             return layout, scene, random, motion.action[0]
 
         return of_episodes

@@ -147,7 +147,7 @@ class RecordGroup(StrictModel):
 
     With ``held_out_camera`` the head camera stands where it never stands otherwise. ``look``: the fixed scenes, or scenes drawn from a wide
     range, or from one outside of it (``looks.py``). What was held out is noted in the conventions of drawn looks, ``shift``: look, body,
-    camera, or several with a plus.
+    camera, or several with a plus. ``num_frames``: as of the whole recording, if not given.
     """
 
     embodiment: Embodiment
@@ -156,6 +156,7 @@ class RecordGroup(StrictModel):
     families: tuple[Family, ...] = TASKS
     held_out_camera: bool = False
     look: LookName = "plain"
+    num_frames: int | None = Field(default=None, ge=17, le=2000)
 
     @model_validator(mode="after")
     def _enough_arms(self) -> RecordGroup:
@@ -270,6 +271,7 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
                 held_out_camera=group.held_out_camera,
                 look=group.look,
                 policy=config.policy(family, entropy),
+                num_frames=group.num_frames or config.num_frames,
             )
             jobs.append((round(10 * position / group.count), job))
     # A tenth of every group in turn, so that a worker keeps its compiled model for a while.
@@ -298,7 +300,7 @@ def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
     if key not in _RECORDERS:
         _close_recorders()
         _RECORDERS[key] = EpisodeRecorder(*key)
-    recording = _RECORDERS[key].record(job, config.num_frames)
+    recording = _RECORDERS[key].record(job)
     if recording.failure:
         write_json_atomic(output / "run" / "failures" / f"{job.episode_id}.json", recording.failure)
     if job.defect is not None:

@@ -73,6 +73,7 @@ class Job:
     held_out_camera: bool = False
     look: LookName = "plain"
     policy: ScriptedPolicy | None = None
+    num_frames: int = 33
 
 
 @dataclass(frozen=True)
@@ -325,7 +326,7 @@ class EpisodeRecorder:
         )
         return Recording(episode, frames, masks, motion.failure, things)
 
-    def draw(self, job: Job, num_frames: int) -> tuple[Layout, ExecutedMotion, str, np.random.Generator]:
+    def draw(self, job: Job) -> tuple[Layout, ExecutedMotion, str, np.random.Generator]:
         """Layout, executed motion and scene id of one episode, and the generator to continue with for its cameras.
 
         Raises: DataError when no reachable plan is found in 50 draws.
@@ -334,16 +335,16 @@ class EpisodeRecorder:
         scene_id = str(random.choice(scenes(job.look, job.split in ("train", "validation"))))
         for _ in range(50):
             layout = draw_layout(self.scene.robot, job.family, random, look_of(scene_id))
-            motion = self.move(layout, random, num_frames, job.policy)
+            motion = self.move(layout, random, job.num_frames, job.policy)
             if motion is not None:
                 return layout, motion, scene_id, random
         raise DataError(
             "No reachable plan found", where=f"episode {job.episode_id}", next_step="check the robot's reach"
         )
 
-    def record(self, job: Job, num_frames: int) -> Recording:
+    def record(self, job: Job) -> Recording:
         """Draw, execute and film one episode, a function of the job's ``entropy``; raises as :meth:`draw`."""
-        layout, motion, scene_id, random = self.draw(job, num_frames)
+        layout, motion, scene_id, random = self.draw(job)
         return self.film(layout, motion, episode_id=job.episode_id, scene_id=scene_id, split=job.split, jitter=random)
 
     def tool_positions(self, arm: int, qpos: np.ndarray) -> np.ndarray:
