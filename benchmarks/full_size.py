@@ -1,8 +1,9 @@
-"""Rollouts of a preset's distilled model on one card, with random weights, beside what is planned and the floor.
+"""Training and rollouts of a preset on one card, with random weights, beside what is planned and the floor.
 
-    python -m benchmarks.full_size --preset edge-24gb [--device cuda] [--blocks 8] [--compile]
+    python -m benchmarks.full_size --preset edge-24gb [--device cuda] [--blocks 8] [--steps 3] [--compile]
 
-Blocks in bfloat16 after the window is full, one sampled while the one before is decoded (on a GPU), in one view and in all: with the shape
+Stage II and teacher forcing: one micro-batch of the longest clips and an update, with the preset's precision, moments and recomputation.
+Rollouts: blocks in bfloat16 after the window is full, one sampled while the one before is decoded (on a GPU), in one view and in all: with the shape
 of the published autoencoder, or a small decoder. Peak memory is that of the rollout. The floor is the operations at the card's whole
 dense speed; the plan counts on a share of it. Without `--device cuda` the same runs on the processor, for presets that are small enough.
 """
@@ -11,26 +12,93 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 
 from benchmarks.harness import command_line, print_table, timed
+from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig
 from worldline_core.model.tokenizers import VideoTokenizer, require_device, tokenizer_outline
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline.cards import CARDS, UTILISATION, find_card
-from worldline_core.pipeline.memory_estimate import Sources
+from worldline_core.pipeline.memory_estimate import Estimate, Sources, trainings
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.rollout_speed import block_costs
 from worldline_core.pipeline.size_sheet import SizeSheet
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
 from worldline_core.rollout.simulation import Session
-from worldline_core.training.processes import hold_weights
-from worldline_core.training.stage2 import stage2_model_config
+from worldline_core.training.adapters import add_adapters
+from worldline_core.training.clip_loader import Batch
+from worldline_core.training.flow_matching import FlowMatchingObjective
+from worldline_core.training.processes import hold_weights, place_model
+from worldline_core.training.stage2 import stage2_groups, stage2_model_config
+from worldline_core.training.trainer import Objective, TrainingRun
+from worldline_core.training.training_config import Stage2Config, TrainerConfig
+
+TRAININGS = ("stage II", "distill: teacher forcing")
+
+
+def one_micro_batch[T: Stage2Config | DistillConfig](config: T, device: str) -> T:
+    """The stage with steps of one micro-batch on a device."""
+
+    def short(trainer: TrainerConfig) -> TrainerConfig:
+        return trainer.model_copy(update={"accumulation": 1, "global_batch": None, "device": device})
+
+    if isinstance(config, DistillConfig):
+        first = config.teacher_forcing
+        first = first.model_copy(update={"trainer": short(first.trainer)})
+        return config.model_copy(update={"teacher_forcing": first})
+    return config.model_copy(update={"trainer": short(config.trainer)})
+
+
+def planned(config: Stage2Config | DistillConfig, model: WorldModelConfig, source: Sources) -> Estimate:
+    """The first training of a stage."""
+    return trainings(config, model, source)[0].estimate(1)
+
+
+def trained(
+    config: Stage2Config | DistillConfig, model_config: WorldModelConfig, source: Sources, *, steps: int, compiled: bool
+) -> tuple[float, float]:
+    """Seconds a step, and peak memory [GB]; 0 on a processor, where it is not known."""
+    distilled = isinstance(config, DistillConfig)
+    trainer = config.teacher_forcing.trainer if distilled else config.trainer
+    sharding, device = trainer.sharding.model_copy(update={"compile": compiled}), trainer.device
+    model = build_world_model(model_config)
+    if config.lora is not None:
+        add_adapters(model, config.lora, 0)
+    place_model(model, sharding, precision=trainer.precision, device=device, weights=trainer.weights).train()
+    batch = source.largest(
+        model_config, trainer, config.first_clips if distilled else config.clips,
+        config.views if distilled else model_config.views,
+    )  # fmt: skip
+    batch = replace(
+        batch,
+        latents=torch.randn(batch.latents.shape, device=device),
+        action_maps=None if batch.action_maps is None else torch.rand(batch.action_maps.shape, device=device),
+    )
+    objective: Objective[Batch] = (
+        TeacherForcingObjective(model, config)
+        if distilled
+        else FlowMatchingObjective(model, sigma=config.sigma, weighting=config.weighting)
+    )
+    with TemporaryDirectory() as output:
+        groups = stage2_groups(model, 1.0)
+        run = TrainingRun(trainer, groups, objective, lambda _: batch, (model,), Path(output), "benchmark")
+        run.step(0)
+        on_gpu = torch.device(device).type == "cuda"
+        if on_gpu:
+            torch.cuda.reset_peak_memory_stats()
+        _, seconds, _ = timed(
+            lambda: [run.step(step) for step in range(1, steps + 1)]
+        )  # a step reads its loss: it waits
+    return seconds / steps, torch.cuda.max_memory_allocated() / 1e9 if on_gpu else 0.0
 
 
 def measured(
@@ -67,6 +135,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--card", help="whose speed is the floor (default: the preset's)")
     parser.add_argument("--blocks", type=int, default=8)
+    parser.add_argument("--steps", type=int, default=3)
     parser.add_argument("--compile", action="store_true", help="torch.compile of each layer but its attention")
     arguments = parser.parse_args()
     config = PipelineConfig.load(arguments.preset)
@@ -78,10 +147,29 @@ def main() -> None:
     model, source = stage2_model_config(config.train_stage2, sheet.model), sheet.source(distilled)
     views = tuple(distilled.views)
     view_sets = list(dict.fromkeys((views[:1], views)))
-    with ProcessPoolExecutor(2, get_context("fork")) as pool:  # before CUDA begins
-        costs = dict(zip(view_sets, block_costs(distilled, model, source, view_sets, pool)(), strict=True))
+    stages = [one_micro_batch(stage, arguments.device) for stage in (config.train_stage2, distilled)]
+    with ProcessPoolExecutor(4, get_context("fork")) as pool:  # before CUDA begins
+        counted = block_costs(distilled, model, source, view_sets, pool)
+        plans = list(pool.map(partial(planned, model=model, source=source), stages))
+        costs = dict(zip(view_sets, counted(), strict=True))
 
     require_device(arguments.device)
+    operations = CARDS[card].operations
+
+    def steps() -> Iterator[Sequence[object]]:
+        for title, stage, plan in zip(TRAININGS, stages, plans, strict=True):
+            seconds, peak = trained(stage, model, source, steps=arguments.steps, compiled=arguments.compile)
+            floor = (plan.operations or 0.0) / operations
+            yield (
+                title,
+                plan.parameters / 1e6,
+                seconds,
+                floor / UTILISATION,
+                floor,
+                floor / seconds,
+                peak,
+                plan.total / 1e9,
+            )
 
     def rows() -> Iterator[Sequence[object]]:
         for shown, cost in costs.items():
@@ -90,7 +178,7 @@ def main() -> None:
                     distilled, model, source, shown, small=small, device=arguments.device, blocks=arguments.blocks,
                     compiled=arguments.compile,
                 )  # fmt: skip
-                floor = cost.frames_per_second(CARDS[card].operations, small=small)
+                floor = cost.frames_per_second(operations, small=small)
                 yield (
                     len(shown), "small" if small else "autoencoder", cost.frames / seconds, UTILISATION * floor, floor,
                     cost.frames / seconds / floor, peak,
@@ -98,6 +186,19 @@ def main() -> None:
 
     name = torch.cuda.get_device_name() if arguments.device.startswith("cuda") else "a processor"
     print(f"{arguments.preset} on {name}, floor of {card}")
+    print_table(
+        (
+            "training",
+            "M parameters",
+            "s a micro-step",
+            "planned",
+            "floor",
+            "share of the floor",
+            "peak GB",
+            "planned GB",
+        ),
+        steps(),
+    )
     print_table(("views", "decoder", "frames a second", "planned", "floor", "share of the floor", "peak GB"), rows())
 
 
