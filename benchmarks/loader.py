@@ -5,6 +5,8 @@
 It makes its own recordings (three views, encoded as curation does) in a temporary folder, then times, in turns so that a busy
 machine disturbs both alike: decoding the clips and dropping the frames (*raw*), and a training process that takes every batch
 from loader processes (*loader*). Processor time is that of all processes together; medians of the rounds.
+
+Then a batch of 256 clips of cached latents: read from the store, and resident.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +25,18 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.harness import RECORDINGS, command_line, print_table
+from benchmarks.harness import RECORDINGS, best_seconds, command_line, print_table
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.training.clip_config import ClipSampling, FrameInput
-from worldline_core.training.clip_loader import ClipDataset, read_ahead
+from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput, LatentInput
+from worldline_core.training.clip_loader import ClipDataset, ClipLoader, read_ahead
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
-from worldline_core.training.clip_source import FrameSource
+from worldline_core.training.clip_source import FrameSource, LatentStore, ResidentLatents
+from worldline_core.training.encode_latents import encode_latents
 
 TICK = os.sysconf("SC_CLK_TCK")
 ROUNDS = 3
+TOKENIZER = RECORDINGS.with_name("models") / "tokenizer"
 CASES: dict[str, dict[str, Any]] = {
     "480x640": {"size": (480, 640), "fps": 30.0, "episodes": 4, "frames": 160, "lengths": (33, 65, 97), "batch": 1, "steps": 10},
     "64x96": {"size": (64, 96), "fps": 8.0, "episodes": 12, "frames": 80, "lengths": (33,), "batch": 8, "steps": 12},
@@ -96,7 +101,7 @@ class RepeatedClips:
 def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple[str, float, float, float]:
     """Decoder, frames per second of processor time by raw decoding and by the loader, and their ratio."""
     config = FrameInput.model_validate({"image_size": case["size"]})
-    source = FrameSource(episodes, RECORDINGS.with_name("models") / "tokenizer", config)
+    source = FrameSource(episodes, TOKENIZER, config)
     sampling = ClipSampling.model_validate({"lengths": case["lengths"]})
     sampler = ClipSampler(
         source.rows, sampling, views=VIEWS, splits=["train"], start_step=1, batch_size=case["batch"], seed=0
@@ -130,10 +135,25 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple
     return source.decoder.name, raw, loaded, loaded / raw
 
 
+def latent_batches(root: Path) -> Iterator[tuple[str, float]]:
+    """Milliseconds that a batch of 256 clips of three views takes from a store, and resident."""
+    case = CASES["64x96"]
+    write_recordings(root / "set", case)
+    encode_latents(EncodeLatentsConfig(), {"episodes": root / "set", "tokenizer": TOKENIZER}, root / "latents")
+    store = LatentStore.open(root / "latents")
+    sampling = ClipSampling.model_validate({"lengths": case["lengths"]})
+    sampler = ClipSampler(
+        store.rows, sampling, views=VIEWS, splits=["train"], start_step=store.start_step, batch_size=256, seed=0
+    )
+    for name, source in (("read", store), ("resident", ResidentLatents(store, "cpu"))):
+        load, steps = ClipLoader(source, views=VIEWS).batches(sampler, LatentInput()), count()
+        yield name, 1000 * best_seconds(lambda load=load, steps=steps: load(next(steps)))
+
+
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--only", choices=sorted(CASES))
+    parser.add_argument("--only", choices=sorted([*CASES, "latents"]))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -144,8 +164,12 @@ def main() -> None:
                 with tempfile.TemporaryDirectory() as folder:
                     yield name, *measure(case, write_recordings(Path(folder) / "set", case), arguments.processes)
 
-    print(f"{arguments.processes} loader processes; frames per second of processor time")
-    print_table(("", "decoder", "raw", "loader", "loader over raw"), rows())
+    if arguments.only != "latents":
+        print(f"{arguments.processes} loader processes; frames per second of processor time")
+        print_table(("", "decoder", "raw", "loader", "loader over raw"), rows())
+    if arguments.only in (None, "latents"):
+        with tempfile.TemporaryDirectory() as folder:
+            print_table(("256 clips of latents", "ms of processor time"), latent_batches(Path(folder)))
 
 
 if __name__ == "__main__":

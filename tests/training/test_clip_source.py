@@ -20,7 +20,7 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput, LatentInput
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipRow, ClipSampler, longest_clip
-from worldline_core.training.clip_source import FrameSource, LatentStore, training_rows
+from worldline_core.training.clip_source import FrameSource, LatentStore, ResidentLatents, training_rows
 from worldline_core.training.encode_latents import (
     choose_layout,
     encode_clip,
@@ -72,7 +72,7 @@ def test_a_clip_of_the_store_equals_direct_encoding(tmp_path, tokenizer, clip_fr
     description = {"layout": layout, "start_step": start_step, "strides": [stride], "latent_shape": [3, 2, 2]}
     description |= {"image_size": [2, 2], "clip_frames": clip_frames}
     store = LatentStore(tmp_path, description, [row])
-    resident = LatentStore(tmp_path, description, [row]).resident_on("cpu")
+    resident = ResidentLatents(store, "cpu")
     checked = 0
     for start in range(0, 30, start_step):
         longest = longest_clip(row.num_frames, start, stride)
@@ -104,7 +104,7 @@ def test_clips_longer_than_those_encoded_are_refused_before_training(world):
 
 def test_resident_batches_are_those_of_the_store(world):
     store, tracks = LatentStore.open(world.latents), ActionTracks.open(world.tracks)
-    resident = LatentStore.open(world.latents).resident_on("cpu")
+    resident = ResidentLatents(store, "cpu")
     config = ClipSampling(lengths=(5, 9, 17), view_weights={"joint": 1.0, "left_wrist": 1.0})
     sampler = ClipSampler(store.rows, config, views=VIEWS, splits=["train"], start_step=4, batch_size=3, seed=0)
     for action_frames in (1, 4):
@@ -116,10 +116,34 @@ def test_resident_batches_are_those_of_the_store(world):
                 assert torch.equal(kept[name], value) if isinstance(value, torch.Tensor) else kept[name] == value
 
 
+@pytest.mark.parametrize("tokenizer", [Memoryless(), Remembering()])
+def test_a_resident_batch_mixes_episodes_views_starts_and_strides(tmp_path, tokenizer):
+    generator = torch.Generator().manual_seed(0)
+    config = EncodeLatentsConfig(start_step=2, strides=(1, 2))
+    layout = choose_layout(tokenizer, torch.zeros(3, 9, 2, 2, dtype=torch.uint8), config)
+    rows = []
+    for name, count, views in (("a", 30, ("x", "y")), ("b", 17, ("z", "y", "x")), ("c", 22, ("y",))):
+        video = torch.randint(0, 256, (len(views), 3, count, 2, 2), generator=generator, dtype=torch.uint8)
+        save_file(encode_episode(tokenizer, name, list(video), layout, config), tmp_path / name)
+        rows.append(ClipRow(name, count, views, "s", "r", "train", "", views[-1], name))
+    description = {"layout": layout, "start_step": 2, "strides": [1, 2], "latent_shape": [3, 2, 2]}
+    store = LatentStore(tmp_path, description | {"image_size": [2, 2], "clip_frames": None}, rows)
+    resident = ResidentLatents(store, "cpu")
+    for length, strides in ((1, (1, 2)), (5, (2, 1)), (9, (1, 1))):
+        clips = tuple(Clip(name, start, length, strides[start % 4 // 2]) for name in "ab" for start in range(0, 9, 2))
+        for batch in (
+            ClipBatch(clips, ("y", "x")), ClipBatch((*clips, Clip("c", 6, length, 1)), ("head",), primary=True)
+        ):  # fmt: skip
+            assert torch.equal(resident.read_batch(batch), store.read_batch(batch))
+    resident._first["b/single" if layout == "groups" else "b/clips/1/0"] = (0, 0)
+    with pytest.raises(ArtifactError, match=r"lack frames[\s\S]*b/(single|clips/1/0)"):
+        read(resident, Clip("b", 0, 5, 1), ("x",))
+
+
 def test_bad_requests_and_bad_values_are_named(world, tmp_path):
     root = shutil.copytree(world.latents, tmp_path / "latents")
     shard, whole = root / "00000.safetensors", Clip("episode-000", 0, 17, 1)
-    for source in (LatentStore.open(root), LatentStore.open(root).resident_on("cpu")):
+    for source in (LatentStore.open(root), ResidentLatents(LatentStore.open(root), "cpu")):
         for clip, views, message in (
             (dataclasses.replace(whole, start=4), VIEWS, r"at most 17 of 17[\s\S]*frames 4\.\.20"),
             (Clip("episode-000", 0, 5, 2), VIEWS, r"strides \(1,\)[\s\S]*frames 0\.\.8 by 2"),

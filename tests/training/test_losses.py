@@ -1,5 +1,6 @@
 """Flow matching, its weights and preconditioning, and the relational terms beside it."""
 
+import dataclasses
 from collections import OrderedDict
 
 import numpy as np
@@ -11,7 +12,7 @@ from worldline_core.model.layers import preconditioned_velocity
 from worldline_core.model.world_model_config import VIEWS
 from worldline_core.training import relational
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.clip_sampler import Clip, ClipRow
 from worldline_core.training.flow_matching import (
     FlowMatchingObjective,
     add_noise,
@@ -127,9 +128,16 @@ def test_cells_of_things_count_more_where_they_are_or_were():
     raw[:, 1, 2] = 1 + 0.5 * (127 / 255) ** 0.5
     assert torch.allclose(weights[0, 0, 0], raw / raw[1:].mean(), atol=2e-3)
     assert weights[:, :, :, 1:].mean() == pytest.approx(1, abs=1e-6)
+    rows = [ClipRow("a", 9, ("head", "top"), "s", "r", "train", "", "head")]
+    clips = (Clip("a", 0, 5, 1), Clip("a", 0, 5, 2), Clip("a", 4, 5, 1)), [("top", "head")] * 3
+    found = [ObjectWeights(masks, (2, 3), 3.0, 0.5, resident=kept)(*clips) for kept in (rows, None)]
+    assert torch.equal(*found) and found[0].shape == (3, 2, 1, 2, 2, 3)
+    with pytest.raises(DataError, match=r"(?s)not of every frame.*a, view head"):
+        ObjectWeights(masks, (2, 3), 3.0, 0.5, resident=[dataclasses.replace(rows[0], num_frames=10)])
     masks.labels = None
-    with pytest.raises(DataError, match=r"(?s)a, view head.*weighting.things"):
-        ObjectWeights(masks, (2, 3), 1.0, 0.0)(*clips)
+    for kept in (rows, None):
+        with pytest.raises(DataError, match=r"(?s)a, view (head|top).*weighting.things"):
+            ObjectWeights(masks, (2, 3), 1.0, 0.0, resident=kept)(*clips)
     # What was there at the start counts later.
     shares = torch.zeros(1, 1, 2, 3, 1, 2)
     shares[0, 0, 0, 0, 0, 0] = 1.0

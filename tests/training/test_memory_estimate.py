@@ -11,6 +11,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from flows.command_line import main
 from tasks.train_stage1 import train_stage1
 from tests.model.test_checkpoint import most_bytes
+from tests.training.conftest import TINY_MODEL, VIEWS, stage2
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError
 from worldline_core.model.networks import build_world_model
@@ -28,8 +30,11 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import SizeSheet
 from worldline_core.store.store import ArtifactStore
 from worldline_core.training.adapters import add_adapters
+from worldline_core.training.clip_config import LatentInput
+from worldline_core.training.clip_source import LatentStore, ResidentLatents
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import hold_weights
+from worldline_core.training.resident import ResidentTracks
 from worldline_core.training.trainer import ParameterGroup, train, trained_groups
 from worldline_core.training.training_config import (
     LoRAConfig,
@@ -179,15 +184,36 @@ def test_distillation_from_frames_holds_what_encodes_them():
         assert more.total >= less.total + more.parts["encoder"] > less.total
 
 
-def test_a_training_that_cannot_fit_its_card_is_refused_before_it_begins(world, tmp_path, monkeypatch):
+@pytest.mark.parametrize("native_size", [None, 5])
+def test_resident_bytes_are_those_on_the_device(world, native_size):
+    config = stage2(2, input=LatentInput(resident=True), weighting={"things": [1, 0]})
+    taken = {} if native_size is None else {"action_conditioning": "vectors", "native_size": native_size}
+    model = MixtureConfig.model_validate(TINY_MODEL | taken)
+    source = ResidentLatents(LatentStore.open(world.latents), "cpu")
+    tracks = ResidentTracks(ActionTracks.open(world.tracks), source.rows, VIEWS, "cpu", native_size)
+    held = [source._frames.nbytes, *(values.nbytes for values in tracks._samples.values())]
+    held.append(sum(2 * 4 * 4 * row.num_frames * len(row.views) for row in source.rows))
+    counted = memory_estimate.resident_bytes(config, world.inputs, model)
+    assert 0 <= counted - sum(held) < 3000  # the head of the file
+    assert memory_estimate.resident_bytes(stage2(2), world.inputs, model) == 0
+
+
+@pytest.mark.parametrize("resident", [False, True])
+def test_a_training_that_cannot_fit_its_card_is_refused_before_it_begins(world, tmp_path, monkeypatch, resident):
     values = {"model": {"num_layers": 1}, "trainer": {"steps": 1, "batch_size": 1}, "clips": {"lengths": [9]}}
     config, inputs = Stage1Config.model_validate(values), {"episodes": world.episodes, "latents": world.latents}
+    if resident:
+        config = config.model_copy(update={"input": LatentInput(resident=True)})
     (training,) = trainings(config, config.model, memory_estimate._sources(config, inputs))
-    need = training.estimate(1).total / memory_estimate.USABLE
+    kept = memory_estimate.resident_bytes(config, inputs, config.model)
+    need = (training.estimate(1).total + kept) / memory_estimate.USABLE
     monkeypatch.setattr(memory_estimate, "device_memory", lambda _device: 1.001 * need)
     memory_estimate.require_memory(config, inputs)
     monkeypatch.setattr(memory_estimate, "device_memory", lambda _device: 0.999 * need)
-    with pytest.raises(ConfigError, match=r"stage I on cpu[\s\S]*weights[\s\S]*worldline plan"):
+    with pytest.raises(
+        ConfigError,
+        match=rf"stage I on cpu[\s\S]*weights[\s\S]*{'resident input[^;]*false' if resident else ''}[\s\S]*worldline plan",
+    ):
         train_stage1.run(ArtifactStore(tmp_path), config, inputs)
 
 

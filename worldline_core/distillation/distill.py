@@ -180,7 +180,7 @@ class DistillationRun:
         teacher = self._frozen(settings.trainer) if settings.teacher_share else None
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
         loader = copy(self.loader)
-        loader.object_weights = weights_of(settings.weighting, self.episodes, self.source)
+        loader.object_weights = weights_of(settings.weighting, self.episodes, self.source, self.rows, loader.device)
         load = loader.batches(sampler, self.config.input)
         return self._train(STEPS[0], settings.trainer, objective, load, info, self.start)
 

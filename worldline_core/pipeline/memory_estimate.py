@@ -5,9 +5,10 @@ Activations are counted by running a stage's own objective on tensors that have 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode, unset_fake_temporarily
 
 from worldline_core.actions.action_maps import latent_frame_indices
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import StrictModel
 from worldline_core.distillation.auxiliary_losses import PerceptualLoss
 from worldline_core.distillation.causal_objective import maps_of
@@ -43,6 +45,7 @@ from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.optimizers import BLOCK, in_eight_bits
 from worldline_core.training.processes import hold_weights
 from worldline_core.training.relational import ClipSimilarities, RelationalTerm, SimilarityMatrices, common_shape
+from worldline_core.training.resident import track_bytes
 from worldline_core.training.stage1 import is_trained
 from worldline_core.training.stage2 import stage2_model_config
 from worldline_core.training.trainer import autocast
@@ -458,16 +461,33 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
         model = read_checkpoint_info(Path(start)).config
     if isinstance(config, Stage2Config):
         model = stage2_model_config(config, model)
+    resident = resident_bytes(config, inputs, model)
+    instead = "set input.resident to false, " if resident else ""
     for training in trainings(config, model, source):
         need = training.estimate(int(os.environ.get("WORLD_SIZE", "1")))
+        need = replace(need, parts={**need.parts, **({"resident input": resident} if resident else {})})
         if not need.fits(memory):
             raise ConfigError(
                 "This training does not fit the device's memory.",
                 where=f"{need.title} on {device}",
                 expected=f"at most {gigabytes(USABLE * memory)} GB",
                 got=f"{gigabytes(need.total)} GB ({need.describe_parts()})",
-                next_step="take more devices or what `worldline plan --fit` proposes, first trainer.sharding.checkpointing: block",
+                next_step=f"{instead}take more devices or what `worldline plan --fit` proposes, first "
+                "trainer.sharding.checkpointing: block",
             )
+
+
+def resident_bytes(config: AnyStage, inputs: Mapping[str, Path], model: WorldModelConfig) -> int:
+    """Bytes of what every device keeps of all episodes: latents, samples of tracks, shares of things."""
+    if isinstance(config.input, FrameInput) or not config.input.resident:
+        return 0
+    distilled = isinstance(config, DistillConfig)
+    weighting = (config.teacher_forcing if distilled else config).weighting
+    latents, views = LatentStore.open(Path(inputs["latents"])), config.views if distilled else model.views
+    tracks = ActionTracks.open(Path(inputs["tracks"])).rows if "tracks" in inputs else []
+    samples = track_bytes(len(views), max((len(row["arms"] or ()) for row in tracks), default=0), model.native_size)
+    shares = 2 * math.prod(latents.latent_shape[1:]) if any(weighting.things) else 0
+    return latents.stored_bytes + sum(row.num_frames * (samples + len(row.views) * shares) for row in latents.rows)
 
 
 def device_memory(device: str) -> float | None:

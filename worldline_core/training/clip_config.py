@@ -83,8 +83,8 @@ class ReadingConfig(StrictModel):
 class LatentInput(ReadingConfig):
     """Latents cached by encode_latents.
 
-    ``resident``: keep the latents and action tracks of all episodes on the training device, for sets that fit there:
-    a small model then never waits for reading.
+    ``resident``: keep latents, action tracks and shares of things of all episodes on the training device, for sets that fit
+    there: a small model then never waits for reading.
     """
 
     kind: Literal["latents"] = "latents"

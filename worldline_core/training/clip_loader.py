@@ -11,6 +11,7 @@ from dataclasses import KW_ONLY, dataclass, field
 from itertools import count
 
 import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
@@ -23,7 +24,7 @@ from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.training.clip_config import ReadingConfig
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
 from worldline_core.training.clip_source import ClipSource
-from worldline_core.training.resident_tracks import ResidentTracks
+from worldline_core.training.resident import ResidentTracks, on_device
 
 START_METHOD = "spawn"
 """Start method of loader processes: forked ones would share the threads and CUDA state of this one."""
@@ -129,8 +130,8 @@ class ClipLoader:
         self._tracks: dict[str, EpisodeTracks] = {}
         self._resident: ResidentTracks | None = None
         if self.source.resident and self.tracks:
-            names = [row.episode_id for row in self.source.rows if row.episode_id in self.tracks]
-            self._resident = ResidentTracks(self.tracks, names, self.views, self.device, self.native_size)
+            rows = [row for row in self.source.rows if row.episode_id in self.tracks]
+            self._resident = ResidentTracks(self.tracks, rows, self.views, self.device, self.native_size)
 
     def batches(self, sampler: ClipSampler, reading: ReadingConfig) -> Callable[[int], Batch]:
         """A function that gives the batch of a micro-step, read ahead by the configured workers.
@@ -142,8 +143,10 @@ class ClipLoader:
             ConfigError: the source has no clips of this length.
         """
         self.source.require_length(sampler.longest, "clips.lengths")
+        if self.source.resident:
+            return lambda index: self.load(sampler.clips(index))
         dataset = ClipDataset(self.source, sampler)
-        pinned = torch.device(self.device).type == "cuda" and not self.source.resident
+        pinned = torch.device(self.device).type == "cuda"
         ahead: tuple[int, Iterator[Tensor | WorldLineError]] | None = None
 
         def load(index: int) -> Batch:
@@ -191,13 +194,13 @@ class ClipLoader:
         if self.text is not None:
             facts = [self.clip_facts(clip) for clip in clips]
             ids, mask = self.text([self.source.row(clip.episode_id).instruction for clip in clips], facts)
-            ids, mask = ids.to(self.device), mask.to(self.device)
+            ids, mask = (on_device(values, self.device) for values in (ids, mask))
         rates = [self._rate(clip) for clip in clips] if self.frame_rates else None
-        fps = None if rates is None else torch.tensor(rates, device=self.device)
+        fps = None if rates is None else on_device(np.array(rates, np.float32), self.device)
         weights = None
         if self.object_weights is not None:
             recorded = [self.source.recorded_views(batch, clip) for clip in clips]
-            weights = self.object_weights(clips, recorded).to(self.device)
+            weights = self.object_weights(clips, recorded)
         return Batch(clips, views, latents, maps, ids, mask, frames, fps, weights)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
@@ -217,7 +220,9 @@ class ClipLoader:
             samples, size = self._collated(self.tracks, clips, views)
         sigma = self.tracks.sigma_px_ref if self.maps else None
         drawing = ControlDrawing(self.source.latent_shape[1:], sigma, self.native_size, self.action_frames)
-        by_vector = torch.tensor([[view in clip.vectors for view in views] for clip in clips], device=self.device)
+        by_vector = None
+        if self.native_size is not None:
+            by_vector = on_device(np.array([[view in clip.vectors for view in views] for clip in clips]), self.device)
         return drawing.draw(samples, size, by_vector)
 
     def _collated(

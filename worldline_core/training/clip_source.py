@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -41,6 +41,7 @@ from worldline_core.progress import with_progress
 from worldline_core.store.artifact_files import read_json, read_rows
 from worldline_core.training.clip_config import ClipInput, FrameInput
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipRow, longest_clip
+from worldline_core.training.resident import on_device
 
 logger = logging.getLogger(__name__)
 
@@ -151,7 +152,6 @@ class LatentStore(ClipSource):
         self.clip_frames = description["clip_frames"]
         self._shard_of = {row.episode_id: row.shard for row in rows}
         self._shards: dict[str, Any] = {}
-        self._resident: dict[str, Tensor] = {}
 
     @classmethod
     def open(cls, root: Path) -> LatentStore:
@@ -176,15 +176,10 @@ class LatentStore(ClipSource):
         # Open shards stay in the process that opened them.
         return {**self.__dict__, "_shards": {}}
 
-    def resident_on(self, device: str) -> Self:
-        """This store, with all latents kept on one device in half precision."""
-        for row in with_progress(self.rows, "reading latents", "episode"):
-            with self._shard(row.episode_id) as shard:
-                for name in (name for name in shard.keys() if name.startswith(f"{row.episode_id}/")):  # noqa: SIM118
-                    self._resident[name] = shard.get_tensor(name).to(device, torch.float16)
-        self._shards.clear()
-        self.resident = True
-        return self
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes of all latents."""
+        return sum(path.stat().st_size for path in self.root.glob("*.safetensors"))
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
         """Latents of one clip (float32), views in the given order.
@@ -192,12 +187,9 @@ class LatentStore(ClipSource):
         Raises:
             ArtifactError: the clip does not fit the store, or its shard is damaged.
         """
-        selected, parts = self._stored_views(clip, views), self._parts(clip)
-        if self.resident:
-            frames = [self._resident[name][:, :, first:stop] for name, first, stop in parts]
-        else:
-            with self._shard(clip.episode_id) as shard:
-                frames = [shard.get_slice(name)[:, :, first:stop] for name, first, stop in parts]
+        selected = self._stored_views(clip, views)
+        with self._shard(self._shard_of[clip.episode_id]) as shard:
+            frames = [shard.get_slice(name)[:, :, first:stop] for name, first, stop in self._parts(clip)]
         return torch.cat(frames, dim=2)[selected].float()
 
     def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
@@ -231,9 +223,9 @@ class LatentStore(ClipSource):
         return [row.views.index(view) for view in views]
 
     @contextmanager
-    def _shard(self, episode_id: str) -> Iterator[Any]:
-        """The open safetensors file that holds an episode; it stays open."""
-        path = self.root / self._shard_of[episode_id]
+    def _shard(self, name: str) -> Iterator[Any]:
+        """An open safetensors file; it stays open."""
+        path = self.root / name
         try:
             if path.name not in self._shards:
                 self._shards[path.name] = safe_open(path, framework="pt")
@@ -245,6 +237,63 @@ class LatentStore(ClipSource):
                 got=error,
                 next_step="encode the latents again",
             ) from error
+
+
+class ResidentLatents(LatentStore):
+    """All latents of a store on one device in half precision, frame by frame and view by view: a batch is one gather there."""
+
+    resident = True
+
+    def __init__(self, store: LatentStore, device: str) -> None:
+        super().__init__(store.root, store.description, store.rows)
+        self._first: dict[str, tuple[int, int]] = {}
+        """Of each tensor the place of its first frame, and how many it has."""
+        shards, places = sorted({*self._shard_of.values()}), 0
+        for file in shards:
+            with self._shard(file) as shard:
+                for name in shard.keys():  # noqa: SIM118
+                    views, _, frames, *_ = shard.get_slice(name).get_shape()
+                    self._first[name] = places, frames
+                    places += views * frames
+        self._frames = torch.empty(places, *self.latent_shape, dtype=torch.float16, device=device)
+        for file in with_progress(shards, "reading latents", "shard"):
+            with self._shard(file) as shard:
+                for name in shard.keys():  # noqa: SIM118
+                    frames = rearrange(shard.get_tensor(name).to(device), "v c t h w -> (t v) c h w")
+                    first, _ = self._first[name]
+                    self._frames[first : first + len(frames)] = frames
+        self._shards.clear()
+
+    def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
+        return self._gathered([clip], [views])[0]
+
+    def read_batch(self, batch: ClipBatch) -> Float[Tensor, "b v c t h w"]:
+        return self._gathered(batch.clips, [self.recorded_views(batch, clip) for clip in batch.clips])
+
+    def _gathered(self, clips: Sequence[Clip], views: Sequence[tuple[str, ...]]) -> Float[Tensor, "b v c t h w"]:
+        """Some views of clips of one length; raises as `read`."""
+        selected = np.array([self._stored_views(clip, shown) for clip, shown in zip(clips, views, strict=True)])
+        parts = [self._parts(clip) for clip in clips]
+        lengths = [stop - first for _, first, stop in parts[0]]
+        within = np.concatenate([np.arange(length) for length in lengths])
+        count = np.array([len(self._by_id[clip.episode_id].views) for clip in clips])[:, None]
+        begin = np.array([[self._place(*part) for part in own] for own in parts])
+        first, skipped = (np.repeat(values, lengths, axis=1) for values in (begin[..., 0], begin[..., 1]))
+        places = (first + (skipped + within) * count)[:, None] + selected[..., None]
+        channels, *grid = self.latent_shape
+        images = rearrange(on_device(places, self._frames.device) * channels, "b v t -> b v 1 t")
+        images = images + rearrange(torch.arange(channels, device=images.device), "c -> c 1")
+        return self._frames.flatten(0, 1).index_select(0, images.flatten()).float().view(*images.shape, *grid)
+
+    def _place(self, name: str, first: int, stop: int) -> tuple[int, int]:
+        """Place of a tensor's first frame, and the number of the wanted one."""
+        place, frames = self._first.get(name, (0, 0))
+        if stop > frames:
+            raise ArtifactError(
+                "The latents lack frames of this clip.", where=self.root, expected=f"{name}, {stop} latent frames", got=frames,
+                next_step="encode the latents again",
+            )  # fmt: skip
+        return place, first
 
 
 class FrameSource(ClipSource):
@@ -434,5 +483,5 @@ def open_source(reading: ClipInput, inputs: Mapping[str, Path], episodes: Episod
         )
     if not isinstance(reading, FrameInput):
         store = LatentStore.open(Path(inputs["latents"]))
-        return store.resident_on(device) if reading.resident else store
+        return ResidentLatents(store, device) if reading.resident else store
     return FrameSource(episodes, Path(inputs["tokenizer"]), reading, device=device)

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import accumulate
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from einops import rearrange
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import DataError
-from worldline_core.training.clip_sampler import Clip
+from worldline_core.progress import with_progress
+from worldline_core.training.clip_sampler import Clip, ClipRow
+from worldline_core.training.resident import frame_numbers, on_device
+
+_FULL = np.zeros((256, 2), np.uint8)
+"""Of each label what a pixel shows: what the task moves (1), another thing (2..)."""
+_FULL[1, 0] = _FULL[2:, 1] = 255
 
 
 class ObjectWeights:
@@ -23,48 +33,93 @@ class ObjectWeights:
         episodes: with exact masks of things.
         grid_size: (h, w) of the latents.
         moved, others: extra weight of a cell that is full of what the task moves, or of other things.
+        resident: episodes whose shares of things are all read now and stay on the device; None: each is read when it is needed.
+
+    Raises:
+        DataError: a resident recording has no masks of things.
     """
 
-    def __init__(self, episodes: EpisodeSet, grid_size: tuple[int, int], moved: float, others: float) -> None:
+    def __init__(
+        self,
+        episodes: EpisodeSet,
+        grid_size: tuple[int, int],
+        moved: float,
+        others: float,
+        *,
+        device: str = "cpu",
+        resident: Sequence[ClipRow] | None = None,
+    ) -> None:
         self._episodes = episodes
         self._grid_size = grid_size
         self._moved, self._others = moved, others
+        self._device = device
         self._shares: dict[tuple[str, str], np.ndarray] = {}
+        self._kept: Tensor | None = None
+        self._first: dict[tuple[str, str], int] = {}
+        if resident is not None:
+            self._keep(resident)
 
     def __call__(self, clips: Sequence[Clip], views: Sequence[Sequence[str]]) -> Float[Tensor, "b v 1 t h w"]:
         """Weights whose mean over the noisy frames of a clip is 1.
 
         Args:
+            clips: of one length.
             views: of each clip, as they were recorded.
 
         Raises:
             DataError: a recording has no masks of things.
         """
-        stacked = [
-            np.stack([self._latent_shares(clip, view) for view in names])
-            for clip, names in zip(clips, views, strict=True)
+        shown = [[(clip.episode_id, view) for view in names] for clip, names in zip(clips, views, strict=True)]
+        frames = frame_numbers(clips, range(clips[0].num_frames))
+        if self._kept is None:
+            read = [[self._read(name)[own] for name in names] for names, own in zip(shown, frames, strict=True)]
+            shares = on_device(np.array(read), self._device)
+        else:
+            first = np.array([[self._first[name] for name in names] for names in shown])
+            shares = self._kept[on_device(first[..., None] + frames[:, None], self._device)]
+        return object_weights(latent_shares(shares), self._moved, self._others)
+
+    def _keep(self, rows: Sequence[ClipRow]) -> None:
+        """Read the shares of all views of some episodes onto the device."""
+        counts = {(row.episode_id, view): row.num_frames for row in rows for view in row.views}
+        self._first = dict(zip(counts, accumulate(counts.values(), initial=0), strict=False))
+        self._kept = torch.empty(sum(counts.values()), 2, *self._grid_size, dtype=torch.uint8, device=self._device)
+        with ThreadPoolExecutor() as pool:  # zlib and cv2 work beside each other
+            read = pool.map(self._resized, map(self._labels, counts))
+            for (name, count), shares in zip(with_progress(counts.items(), "reading masks", "view"), read, strict=True):
+                if len(shares) != count:
+                    raise DataError(
+                        "Masks of things are not of every frame", where=", view ".join(name), expected=count, got=len(shares)
+                    )  # fmt: skip
+                self._kept[self._first[name] : self._first[name] + count] = torch.from_numpy(shares)
+
+    def _read(self, name: tuple[str, str]) -> UInt8[np.ndarray, "n 2 h w"]:
+        if name not in self._shares:
+            self._shares[name] = self._resized(self._labels(name))
+        return self._shares[name]
+
+    def _labels(self, name: tuple[str, str]) -> MadeFrames:
+        labels = self._episodes.thing_labels(self._episodes.position(name[0]), name[1])
+        if labels is None:
+            raise DataError(
+                "A recording has no exact masks of things", where=", view ".join(name),
+                expected="recordings of `worldline record`", next_step="set weighting.things to [0, 0]",
+            )  # fmt: skip
+        return labels
+
+    def _resized(self, labels: MadeFrames) -> UInt8[np.ndarray, "n 2 h w"]:
+        """Share of each cell that shows what the task moves, and other things; 255 is all of it."""
+        resized = [
+            cv2.resize(_FULL.take(frame, axis=0), self._grid_size[::-1], interpolation=cv2.INTER_AREA)
+            for frame in labels
         ]
-        return object_weights(torch.from_numpy(np.stack(stacked)).float() / 255, self._moved, self._others)
+        return np.moveaxis(np.stack(resized), -1, 1)
 
-    def _latent_shares(self, clip: Clip, view: str) -> np.ndarray:
-        """uint8 (2, t, h, w): a latent frame covers four frames, and takes the largest share of them."""
-        shown = self._frame_shares(clip.episode_id, view)[:, list(clip.frames)]
-        groups = shown[:, 1:].reshape(2, -1, TEMPORAL_FACTOR, *self._grid_size).max(axis=2)
-        return np.concatenate((shown[:, :1], groups), axis=1)
 
-    def _frame_shares(self, episode_id: str, view: str) -> np.ndarray:
-        """uint8 (2, n, h, w): share of each cell that shows what the task moves, and other things; 255 is all of it."""
-        if (episode_id, view) not in self._shares:
-            labels = self._episodes.thing_labels(self._episodes.position(episode_id), view)
-            if labels is None:
-                raise DataError(
-                    "A recording has no exact masks of things", where=f"{episode_id}, view {view}",
-                    expected="recordings of `worldline record`", next_step="set weighting.things to [0, 0]",
-                )  # fmt: skip
-            masks = (255 * np.stack((frame == 1, frame > 1), axis=-1).astype(np.uint8) for frame in labels)
-            resized = [cv2.resize(mask, self._grid_size[::-1], interpolation=cv2.INTER_AREA) for mask in masks]
-            self._shares[episode_id, view] = np.moveaxis(np.stack(resized), -1, 0)
-        return self._shares[episode_id, view]
+def latent_shares(frames: UInt8[Tensor, "b v n 2 h w"]) -> Float[Tensor, "b v 2 t h w"]:
+    """Shares 0..1 of latent frames: the first covers one frame, each other four, of which it takes the largest share."""
+    first, others = frames[:, :, :1], rearrange(frames[:, :, 1:], "b v (t k) s h w -> b v t k s h w", k=TEMPORAL_FACTOR)
+    return rearrange(torch.cat((first, others.amax(3)), 2), "b v t s h w -> b v s t h w").float() / 255
 
 
 def object_weights(shares: Float[Tensor, "b v 2 t h w"], moved: float, others: float) -> Float[Tensor, "b v 1 t h w"]:

@@ -146,7 +146,9 @@ class Stage:
             frame_rates={row.episode_id: row.fps for row in self.episodes.rows},
             native_size=self.model.config.native_size,
             maps=self.model.config.takes_maps,
-            object_weights=weights_of(self.config.weighting, self.episodes, self.source),
+            object_weights=weights_of(
+                self.config.weighting, self.episodes, self.source, self.rows, self.config.trainer.device
+            ),
             device=self.config.trainer.device,
             **conditions,
         )
@@ -235,12 +237,15 @@ class Stage:
         return {"steps": result.steps, "clips": clips, "found": found, "kept": kept, "left_out": left_out}
 
 
-def weights_of(weighting: LossWeighting, episodes: EpisodeSet, source: ClipSource) -> ObjectWeights | None:
-    """Loss weights of things, where the configuration asks for them."""
+def weights_of(
+    weighting: LossWeighting, episodes: EpisodeSet, source: ClipSource, rows: Sequence[ClipRow], device: str
+) -> ObjectWeights | None:
+    """Loss weights of things, where the configuration asks for them; with resident latents those of all ``rows`` are resident."""
     if not any(weighting.things):
         return None
     _, height, width = source.latent_shape
-    return ObjectWeights(episodes, (height, width), *weighting.things)
+    resident = rows if source.resident else None
+    return ObjectWeights(episodes, (height, width), *weighting.things, device=device, resident=resident)
 
 
 def input_facts(reading: ClipInput, source: ClipSource) -> dict[str, Any]:
