@@ -13,6 +13,7 @@ from torch import Tensor
 from worldline_core.actions.action_maps import control_frames
 from worldline_core.actions.episode_tracks import SAMPLES, ActionTracks, TrackBatch, collate_tracks
 from worldline_core.errors import DataError
+from worldline_core.progress import with_progress
 from worldline_core.training.clip_sampler import Clip, ClipRow
 
 
@@ -47,7 +48,7 @@ class ResidentTracks:
         device: str,
         native_size: int | None,
     ) -> None:
-        episodes = [tracks.tracks(row.episode_id) for row in rows]
+        episodes = [tracks.tracks(row.episode_id) for row in with_progress(rows, "reading tracks", "episode")]
         for episode, row in zip(episodes, rows, strict=True):
             episode.index((0, row.num_frames - 1))
         sizes = {episode.image_size for episode in episodes if episode.calibrated_views}
