@@ -70,7 +70,8 @@ def trained(
     distilled = isinstance(config, DistillConfig)
     trainer = config.teacher_forcing.trainer if distilled else config.trainer
     sharding, device = trainer.sharding.model_copy(update={"compile": compiled}), trainer.device
-    model = build_world_model(model_config)
+    with torch.device(device):
+        model = build_world_model(model_config)
     if config.lora is not None:
         add_adapters(model, config.lora, 0)
     place_model(model, sharding, precision=trainer.precision, device=device, weights=trainer.weights).train()
