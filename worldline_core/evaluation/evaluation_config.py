@@ -97,7 +97,7 @@ class JudgeConfig(_NetworkTraining):
         default=(32, 64, 96, 128), min_length=1, description="channels, from half resolution on; multiples of 8"
     )
     steps: int = Field(default=3000, ge=1)
-    learning_rate: float = Field(default=2e-3, gt=0)
+    learning_rate: float = Field(default=1e-3, gt=0)
     disturbance: float = Field(
         default=0.3,
         ge=0,

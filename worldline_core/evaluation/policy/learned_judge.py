@@ -65,6 +65,8 @@ _CHANNELS = 3 + _THINGS
 _GROUPS = 8
 _WORDS = 64
 """Length of the vector that an instruction and a view become."""
+_CONTRAST = 4.0
+"""Factor on differences of colours: most are small."""
 _MIRRORED = [VIEWS.index(view) for view in ("head", "right_wrist", "left_wrist")]
 _OUTCOMES = ("success", "failure")
 _FORGET = 0.03
@@ -100,14 +102,13 @@ def look_at(instruction: str, frames: Mapping[str, np.ndarray]) -> Look:
     """Frames at `POSITIONS` by view, uint8 (frames, h, w, 3), and in them the things that the instruction names by colour."""
     height, width = next(iter(frames.values())).shape[1:3]
     pictures = np.zeros((len(VIEWS), len(POSITIONS), _CHANNELS, height, width), np.uint8)
-    colours = named_colours(instruction)
+    first = frames.get(HEAD, next(iter(frames.values())))[:1]
+    things = [(colour, own_colour(first, colour)) for colour in named_colours(instruction)]
     for number, view in enumerate(VIEWS):
-        if view not in frames:
-            continue
-        pictures[number, :, :3] = rearrange(frames[view], "t h w c -> t c h w")
-        for channel, colour in enumerate(colours, start=3):
-            own = own_colour(frames.get(HEAD, frames[view])[:1], colour)
-            pictures[number, :, channel] = np.round(255 * thing_share(frames[view], colour, own))
+        if view in frames:
+            pictures[number, :, :3] = rearrange(frames[view], "t h w c -> t c h w")
+            for channel, (colour, own) in enumerate(things, start=3):
+                pictures[number, :, channel] = np.round(255 * thing_share(frames[view], colour, own))
     return Look(pictures, np.array([view in frames for view in VIEWS]))
 
 
@@ -128,11 +129,11 @@ class OutcomeNetwork(nn.Module):
     def __init__(self, widths: tuple[int, ...], words: int) -> None:
         super().__init__()
         self.condition = nn.Linear(words + len(VIEWS), _WORDS)
-        stacked = len(POSITIONS) * _CHANNELS + 2
+        stacked = len(POSITIONS) * (_CHANNELS + 1) + 3 * (len(POSITIONS) - 1) + 2
         self.blocks = nn.ModuleList(
             _Block(cin, cout) for cin, cout in zip((stacked, *widths[:-1]), widths, strict=True)
         )
-        self.view = nn.Linear(2 * widths[-1], 2 * _WORDS)
+        self.view = nn.Linear(2 * sum(widths), 2 * _WORDS)
         self.head = nn.Sequential(
             nn.Linear(len(VIEWS) * 2 * _WORDS + len(VIEWS) + words, 2 * _WORDS),
             nn.SiLU(),
@@ -147,18 +148,33 @@ class OutcomeNetwork(nn.Module):
     ) -> Float[Tensor, " b"]:
         """Logits of success; pictures in [0, 1]."""
         batch, views, _, _, height, width = pictures.shape
-        stacked = rearrange(2 * pictures - 1, "b views frames c h w -> (b views) (frames c) h w")
+        features = rearrange(self._contrasts(pictures), "b views c h w -> (b views) c h w")
         rows, columns = torch.linspace(-1, 1, height), torch.linspace(-1, 1, width)
         places = torch.stack([repeat(rows, "h -> h w", w=width), repeat(columns, "w -> h w", h=height)])
-        places = repeat(places.to(stacked), "c h w -> n c h w", n=len(stacked))
-        features = torch.cat([stacked, places], dim=1)
+        places = repeat(places.to(features), "c h w -> n c h w", n=len(features))
+        features = torch.cat([features, places], dim=1)
         which = repeat(torch.eye(views).to(words), "v w -> (b v) w", b=batch)
         condition = functional.silu(self.condition(torch.cat([repeat(words, "b w -> (b v) w", v=views), which], dim=1)))
+        pooled: list[Tensor] = []
         for block in self.blocks:
             features = block(features, condition)
-        pooled = torch.cat([features.mean(dim=(2, 3)), features.amax(dim=(2, 3))], dim=1)
-        seen = rearrange(functional.silu(self.view(pooled)), "(b v) c -> b v c", v=views) * shown[..., None]
+            pooled += [features.mean(dim=(2, 3)), features.amax(dim=(2, 3))]
+        seen = (
+            rearrange(functional.silu(self.view(torch.cat(pooled, dim=1))), "(b v) c -> b v c", v=views)
+            * shown[..., None]
+        )
         return self.head(torch.cat([rearrange(seen, "b v c -> b (v c)"), shown, words], dim=1))[:, 0]
+
+    @staticmethod
+    def _contrasts(pictures: Float[Tensor, "b views frames 5 h w"]) -> Float[Tensor, "b views c h w"]:
+        """What stands out from tables of any colour: colours and paleness less their means, shares, and changes since the first frame."""
+        colours, shares = pictures[:, :, :, :3], pictures[:, :, :, 3:]
+        pale = colours.amin(dim=3, keepdim=True)
+        seen = torch.cat([colours, pale], dim=3)
+        seen = _CONTRAST * (seen - seen.mean(dim=(4, 5), keepdim=True))
+        changes = _CONTRAST * (colours[:, :, 1:] - colours[:, :, :1])
+        parts = (seen, 2 * shares - 1, changes)
+        return torch.cat([rearrange(part, "b views frames c h w -> b views (frames c) h w") for part in parts], dim=2)
 
 
 class _Block(nn.Module):
@@ -389,21 +405,24 @@ def _batch(videos: Sequence[JudgedVideo], looks: Sequence[Look], vocabulary: Seq
 def augment(
     pictures: Float[Tensor, "b views frames 5 h w"], shown: Float[Tensor, "b views"], generator: torch.Generator
 ) -> tuple[Float[Tensor, "b views frames 5 h w"], Float[Tensor, "b views"]]:
-    """Half of the videos mirrored, left and right wrist with them; each view moved; a third of them degraded after the first frame, as
-    predictions are; half of them with the colours of another scene; a few wrist views hidden."""
+    """Half of the videos mirrored, left and right wrist with them; half with each view moved; a quarter degraded after the first frame, as
+    predictions are; a third with the colours of another scene; a few wrist views hidden. Many stay sharp: thin things decide."""
     batch, views, frames = pictures.shape[:3]
     mirrored = torch.rand(batch, generator=generator) < 0.5
     pictures, shown = pictures.clone(), shown.clone()
     pictures[mirrored], shown[mirrored] = pictures[mirrored][:, _MIRRORED].flip(-1), shown[mirrored][:, _MIRRORED]
-    stacked = rearrange(pictures, "b v t c h w -> (b v) (t c) h w")
-    pictures = rearrange(move(stacked, generator, mirror=False), "(b v) (t c) h w -> b v t c h w", v=views, t=frames)
-    worse = torch.rand(batch, generator=generator) < 1 / 3
+    elsewhere = torch.rand(batch, generator=generator) < 1 / 2
+    if elsewhere.any():
+        stacked = rearrange(pictures[elsewhere], "b v t c h w -> (b v) (t c) h w")
+        stacked = move(stacked, generator, mirror=False)
+        pictures[elsewhere] = rearrange(stacked, "(b v) (t c) h w -> b v t c h w", v=views, t=frames)
+    worse = torch.rand(batch, generator=generator) < 1 / 4
     if worse.any():
         sharp = pictures[worse, :, 1:]
         late, ghosts = (rearrange(part, "b v t c h w -> (b v t) c h w") for part in (sharp, sharp.roll(1, dims=2)))
         late = degrade(mix_ghosts(late, ghosts, generator), generator).clamp(0, 1)
         pictures[worse, :, 1:] = rearrange(late, "(b v t) c h w -> b v t c h w", v=views, t=frames - 1)
-    other = torch.rand(batch, generator=generator) < 0.5
+    other = torch.rand(batch, generator=generator) < 1 / 3
     if other.any():
         scenes = rearrange(pictures[other, :, :, :3], "b v t c h w -> b c (v t h) w")
         scenes = change_colours(scenes, generator)
