@@ -86,7 +86,7 @@ def named_colours(instruction: str) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewPictures:
     """What is seen of one video.
 
     Attributes:
@@ -98,7 +98,7 @@ class Look:
     shown: np.ndarray
 
 
-def look_at(instruction: str, frames: Mapping[str, np.ndarray]) -> Look:
+def look_at(instruction: str, frames: Mapping[str, np.ndarray]) -> ViewPictures:
     """Frames at `POSITIONS` by view, uint8 (frames, h, w, 3), and in them the things that the instruction names by colour."""
     height, width = next(iter(frames.values())).shape[1:3]
     pictures = np.zeros((len(VIEWS), len(POSITIONS), _CHANNELS, height, width), np.uint8)
@@ -109,7 +109,7 @@ def look_at(instruction: str, frames: Mapping[str, np.ndarray]) -> Look:
             pictures[number, :, :3] = rearrange(frames[view], "t h w c -> t c h w")
             for channel, (colour, own) in enumerate(things, start=3):
                 pictures[number, :, channel] = np.round(255 * thing_share(frames[view], colour, own))
-    return Look(pictures, np.array([view in frames for view in VIEWS]))
+    return ViewPictures(pictures, np.array([view in frames for view in VIEWS]))
 
 
 def frame_numbers(available: Sequence[int], num_frames: int) -> list[int]:
@@ -319,7 +319,7 @@ class JudgedVideo:
     name: str
     instruction: str
     success: bool
-    looks: tuple[Look, ...]
+    looks: tuple[ViewPictures, ...]
 
 
 @dataclass(frozen=True)
@@ -392,7 +392,7 @@ def outcome_batch(
     return replace(batch, pictures=pictures, shown=shown, tasks=tuple(tasks))
 
 
-def _batch(videos: Sequence[JudgedVideo], looks: Sequence[Look], vocabulary: Sequence[str]) -> OutcomeBatch:
+def _batch(videos: Sequence[JudgedVideo], looks: Sequence[ViewPictures], vocabulary: Sequence[str]) -> OutcomeBatch:
     return OutcomeBatch(
         tuple(video.name for video in videos),
         torch.from_numpy(np.stack([look.pictures for look in looks])) / 255.0,
