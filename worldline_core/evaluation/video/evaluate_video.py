@@ -9,6 +9,7 @@ over trajectories of every frame show drift along a rollout. `metric_registry` l
 from __future__ import annotations
 
 import logging
+import os
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -114,10 +115,11 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
 def _workers(*, on_gpu: bool) -> Iterator[ThreadPoolExecutor]:
     """One thread per core, each an episode at a time: decoding, GrabCut and small networks do not fill the cores alone.
 
-    Networks run on one thread then, so that results do not depend on the number of cores.
+    Networks run on one thread then, so that results do not depend on the number of cores. Where steps run side by side it takes all cores,
+    too: it is the last to end.
     """
-    count = 1 if on_gpu else torch.get_num_threads()
-    pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(torch.get_num_threads() // count,))
+    count, threads = (1, torch.get_num_threads()) if on_gpu else (len(os.sched_getaffinity(0)), 1)
+    pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(threads,))
     try:
         yield pool
     finally:
