@@ -39,7 +39,7 @@ SegmenterName = Literal["learned", "colour", "sam3"]
 
 
 class _NetworkTraining(StrictModel):
-    """How a small network of the evaluation is trained."""
+    """Training of a small network of the evaluation."""
 
     WEIGHT_DECAY: ClassVar[float] = 1e-4
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import string
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -108,16 +109,16 @@ def shown_video(video: Trajectory) -> CandidateVideo:
     return CandidateVideo(frames, indices, video.fps, video.num_frames, points)
 
 
-class ScoringSelector:
+class ScoringSelector(ABC):
     """Scores each video by itself; a comparison takes the best scores."""
 
     def __init__(self) -> None:
         # Smaller budgets show the same videos again.
         self._scores: dict[tuple[str, str], CandidateScore] = {}
 
+    @abstractmethod
     def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
         """0..1, how likely this candidate completes the task."""
-        raise NotImplementedError
 
     def compare(self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int) -> Comparison:
         """The highest scores; of equals, those shown first."""
@@ -142,7 +143,7 @@ class MeasuredSelector(ScoringSelector):
         self.segmenter = segmenter
 
     def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
-        """What cannot be measured scores as what cannot be seen."""
+        """`UNSEEN_SCORE` where nothing can be measured."""
         measured = measure(self.segmenter, instruction, route(instruction), candidate.frames, candidate.points)
         return UNSEEN_SCORE if measured is None else measured.score()
 

@@ -235,8 +235,9 @@ def summarise_decisions(
 
     Returns:
         {"trajectories", "methods": {method: {group: {"accuracy": interval, "seeds": {...}, "confusion": {...}, "over_shortcut": {"shortcut",
-        "gain": interval}, "undecided": {"share", "accuracy_of_decided"}}}}, "shortcuts": {shortcut: {group: interval}}, "differences": [...]}; groups are "all", each split, each family,
-        and split/family; an undecided verdict counts as the nearer side; a gain is over the shortcut that is right most often there, recording by recording.
+        "gain": interval}, "undecided": {"share", "accuracy_of_decided"}}}}, "shortcuts": {shortcut: {group: interval}}, "differences": [...]};
+        groups are "all", each split, each family, and split/family; an undecided verdict counts as the nearer side; a gain is over the
+        shortcut that is right most often there, recording by recording.
     """
     outcomes = {row["episode_id"]: row["outcome"] == "success" for row in rows}
     correct = {

@@ -22,7 +22,7 @@ import torch
 from einops import rearrange, repeat
 from jaxtyping import Float
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 from safetensors.torch import save
 from scipy.optimize import minimize
 from torch import Tensor, nn
@@ -40,7 +40,7 @@ from worldline_core.evaluation.policy.evidence import route
 from worldline_core.evaluation.policy.judge import Judgement
 from worldline_core.evaluation.recordings import HEAD, Pictures, Trajectory
 from worldline_core.evaluation.segmenters.coloured_things import HUES_DEG, own_colour, thing_share
-from worldline_core.model.checkpoint import check_fit, fill, read_weights
+from worldline_core.evaluation.small_network import WEIGHTS_FILE, load_network
 from worldline_core.model.tokenizers import (
     VideoTokenizer,
     frames_to_video,
@@ -49,14 +49,12 @@ from worldline_core.model.tokenizers import (
     video_to_frames,
 )
 from worldline_core.progress import with_progress
-from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.train_tokenizer import disturb
 from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
 
 logger = logging.getLogger(__name__)
 
-WEIGHTS_FILE = "model.safetensors"
 DESCRIPTION_FILE = "judge.json"
 POSITIONS = (0.0, 0.75, 0.9, 1.0)
 """Frames that it sees, 0 the first, 1 the last."""
@@ -72,7 +70,7 @@ _OUTCOMES = ("success", "failure")
 _FORGET = 0.03
 """Share of a task's running loss that each of its videos renews."""
 _LEAST_LOSS = 0.1
-"""What a task counts that is always judged rightly."""
+"""Added to the loss of every task: one that is always judged rightly is still drawn."""
 
 
 def instruction_words(instruction: str) -> tuple[str, ...]:
@@ -87,7 +85,7 @@ def named_colours(instruction: str) -> list[str]:
 
 @dataclass(frozen=True)
 class ViewPictures:
-    """What is seen of one video.
+    """Pictures of one video, as the network takes them.
 
     Attributes:
         pictures: uint8 (views, frames, 5, h, w), zeros of views that are not there; channels are RGB and the shares of two things.
@@ -167,7 +165,7 @@ class OutcomeNetwork(nn.Module):
 
     @staticmethod
     def _contrasts(pictures: Float[Tensor, "b views frames 5 h w"]) -> Float[Tensor, "b views c h w"]:
-        """What stands out from tables of any colour: colours and paleness less their means, shares, and changes since the first frame."""
+        """Colours and paleness less their means, shares, and changes since the first frame: they stand out before a table of any colour."""
         colours, shares = pictures[:, :, :, :3], pictures[:, :, :, 3:]
         pale = colours.amin(dim=3, keepdim=True)
         seen = torch.cat([colours, pale], dim=3)
@@ -275,24 +273,10 @@ class LearnedJudge:
 
         Raises: ArtifactError for a missing or damaged folder, or weights of another network.
         """
-        description_path, weights_path = folder / DESCRIPTION_FILE, folder / WEIGHTS_FILE
-        missing = [path.name for path in (description_path, weights_path) if not path.is_file()]
-        if missing:
-            raise ArtifactError(
-                "Not a trained judge", where=folder, expected=f"{DESCRIPTION_FILE} and {WEIGHTS_FILE}",
-                got=f"missing {missing}", next_step="run train_judge",
-            )  # fmt: skip
-        try:
-            described = _Described.model_validate(read_json(description_path))
-            tensors = read_weights(weights_path, None)
-            with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
-                network = OutcomeNetwork(described.widths, len(described.words))
-            check_fit({name: tuple(t.shape) for name, t in network.state_dict().items()}, tensors, weights_path)
-            fill(network.to_empty(device="cpu"), tensors, where=weights_path, dtype=torch.float32)
-        except (ArtifactError, ValidationError) as error:
-            raise ArtifactError(
-                "The judge cannot be read", where=folder, got=str(error), next_step="train it again"
-            ) from error
+        network, described = load_network(
+            folder, DESCRIPTION_FILE, _Described, lambda found: OutcomeNetwork(found.widths, len(found.words)), noun="judge",
+            next_step="run train_judge",
+        )  # fmt: skip
         return cls(network, described)
 
 
@@ -314,7 +298,7 @@ def multi_hot(instruction: str, vocabulary: Sequence[str]) -> Float[Tensor, " wo
 
 @dataclass(frozen=True)
 class JudgedVideo:
-    """A recording: what is seen of it as it is, and as it comes out of a tokenizer where there is one."""
+    """Pictures of a recording as they are and, with a tokenizer, as that gives them back."""
 
     name: str
     instruction: str
@@ -577,7 +561,7 @@ def fit_judge(
 def load_video(
     episodes: EpisodeSet, row: EpisodeRow, config: JudgeConfig, tokenizer: VideoTokenizer | None
 ) -> JudgedVideo:
-    """What is seen of a recording."""
+    """Pictures of a recording."""
     index = episodes.position(row.episode_id)
     videos = {view: VideoFrames(episodes.clip(index, view)) for view in VIEWS if view in row.views}
     count = min(len(video) for video in videos.values())

@@ -17,7 +17,7 @@ from typing import Annotated, Any, cast
 import numpy as np
 import torch
 from jaxtyping import Float
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
@@ -25,19 +25,18 @@ from torch.nn import functional
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames
-from worldline_core.errors import ArtifactError, DataError
+from worldline_core.errors import DataError
 from worldline_core.evaluation.augmentation import change_colours, degrade, mix_ghosts, move, uniform
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frames_to_unit
 from worldline_core.evaluation.recordings import HEAD
 from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
+from worldline_core.evaluation.small_network import WEIGHTS_FILE, load_network
 from worldline_core.geometry.cameras import ImageTransform
-from worldline_core.model.checkpoint import check_fit, fill, read_weights
-from worldline_core.store.artifact_files import read_json, read_json_lines
+from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
 
-WEIGHTS_FILE = "model.safetensors"
 DESCRIPTION_FILE = "segmenter.json"
 _BATCH = 64
 _GROUPS = 8
@@ -139,27 +138,10 @@ class LearnedSegmenter:
 
         Raises: ArtifactError for a missing or damaged folder, or weights of another network.
         """
-        description_path, weights_path = folder / DESCRIPTION_FILE, folder / WEIGHTS_FILE
-        missing = [path.name for path in (description_path, weights_path) if not path.is_file()]
-        if missing:
-            raise ArtifactError(
-                "Not a trained segmenter",
-                where=folder,
-                expected=f"{DESCRIPTION_FILE} and {WEIGHTS_FILE}",
-                got=f"missing {missing}",
-                next_step="run train_segmenter, or use artifacts/shipped/models/segmenter",
-            )
-        try:
-            described = _Described.model_validate(read_json(description_path))
-            tensors = read_weights(weights_path, None)
-            with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
-                network = UNet(described.widths)
-            check_fit({name: tuple(t.shape) for name, t in network.state_dict().items()}, tensors, weights_path)
-            fill(network.to_empty(device="cpu"), tensors, where=weights_path, dtype=torch.float32)
-        except (ArtifactError, ValidationError) as error:
-            raise ArtifactError(
-                "The segmenter cannot be read", where=folder, got=str(error), next_step="train it again"
-            ) from error
+        network, described = load_network(
+            folder, DESCRIPTION_FILE, _Described, lambda found: UNet(found.widths), noun="segmenter",
+            next_step="run train_segmenter, or use artifacts/shipped/models/segmenter",
+        )  # fmt: skip
         return cls(network, described.threshold)
 
 
