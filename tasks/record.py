@@ -5,7 +5,7 @@ from tasks.execution.artifact_task import ArtifactTask
 record = ArtifactTask(
     name="record",
     summary="simulated robots, scenes and scripted controllers into an EpisodeSet",
-    version=1,
+    version=2,
     function="worldline_core.recorder.attempts:record_artifact",
     config="worldline_core.recorder.attempts:RecordingConfig",
 )

@@ -33,6 +33,7 @@ from worldline_core.recorder.record import (
     RecordConfig,
     check_recorded,
     record,
+    recording_writer,
     run_in_processes,
 )
 from worldline_core.recorder.rendering import prepare_rendering
@@ -197,7 +198,8 @@ def _record_start(
     recorder = EpisodeRecorder(start.embodiment, contact=start.family in CONTACT)
     layout, motions = config.draw(recorder, start)
     finished = EpisodeSetWriter.finished(output)
-    writer = None if finished else EpisodeSetWriter(output, video_crf=config.video_crf)
+    writer = None if finished else recording_writer(output, config.video_crf)
+    masked = not sealed or config.masks
     for number, (name, motion) in enumerate(motions.items()):
         episode_id = f"{start.name}-{name}"
         if writer is None or writer.has(episode_id):
@@ -205,13 +207,13 @@ def _record_start(
         recording = recorder.film(
             layout, replace(motion, outcome="unknown") if sealed else motion, episode_id=episode_id, scene_id=start.scene,
             split="bank" if sealed else "test", jitter=config.camera_draws(start), bank=start.name, candidate=number,
+            masked=masked,
         )  # fmt: skip
-        masked = not sealed or config.masks
         writer.add(
             recording.episode if sealed else replace(recording.episode, source=name),
             recording.frames,
-            recording.robot_masks if masked else None,
-            thing_labels=recording.thing_labels if masked else None,
+            recording.robot_masks,
+            thing_labels=recording.thing_labels,
         )
     recorder.close()
     return {name: (motion.outcome, motion.facts) for name, motion in motions.items()}

@@ -130,23 +130,24 @@ class SceneRenderer:
         self.scene.model.cam_quat[number] = quat
 
     def render(
-        self, qpos: np.ndarray, paint: Callable[[np.ndarray], None], labels: np.ndarray
+        self, qpos: np.ndarray, paint: Callable[[np.ndarray], None], labels: np.ndarray | None
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], dict[str, CameraTrack]]:
         """Render positions (N, nq) from every camera.
 
         Args:
             paint: changes the model's colours before each frame, by its positions (nq,).
-            labels: uint8 (number of geoms,), what thing each geom belongs to, 0 for none.
+            labels: uint8 (number of geoms,), what thing each geom belongs to, 0 for none; None: pictures alone, without masks.
 
-        Returns: frames uint8 (N, 128, 192, 3); robot masks bool (N, 128, 192); labels uint8 (N, 128, 192);
-            camera tracks.
+        Returns: by view, frames uint8 (N, 128, 192, 3), robot masks bool (N, 128, 192), labels uint8 (N, 128, 192) and camera
+            tracks; no masks and labels where none are wanted.
         """
         import mujoco
 
         model, data = self.scene.model, self._data
         frames: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras}
-        masks: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras}
-        things: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras}
+        masked = self.cameras if labels is not None else {}
+        masks: dict[str, list[np.ndarray]] = {view: [] for view in masked}
+        things: dict[str, list[np.ndarray]] = {view: [] for view in masked}
         poses: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras}
         height, width = FRAME_SIZE
         for positions in qpos:
@@ -158,12 +159,13 @@ class SceneRenderer:
             for view, camera in self.cameras.items():
                 self._colour.update_scene(data, camera, self._option)
                 frames[view].append(cv2.resize(self._colour.render(), (width, height), interpolation=cv2.INTER_AREA))
-                self._masks.update_scene(data, camera, self._option)
-                drawn = self._masks.render()
-                is_geom = (drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)) & (drawn[..., 0] >= 0)
-                geoms = np.maximum(drawn[..., 0], 0)
-                masks[view].append(is_geom & self.scene.robot_geoms[geoms])
-                things[view].append(np.where(is_geom, labels[geoms], 0))
+                if labels is not None:
+                    self._masks.update_scene(data, camera, self._option)
+                    drawn = self._masks.render()
+                    is_geom = (drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)) & (drawn[..., 0] >= 0)
+                    geoms = np.maximum(drawn[..., 0], 0)
+                    masks[view].append(is_geom & self.scene.robot_geoms[geoms])
+                    things[view].append(np.where(is_geom, labels[geoms], 0))
                 pose = np.eye(4)
                 pose[:3, :3] = data.camera(camera).xmat.reshape(3, 3) @ OPENCV_AXES
                 pose[:3, 3] = data.camera(camera).xpos

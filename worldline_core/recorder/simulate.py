@@ -286,8 +286,9 @@ class EpisodeRecorder:
         jitter: np.random.Generator,
         bank: str | None = None,
         candidate: int | None = None,
+        masked: bool = True,
     ) -> Recording:
-        """Render a motion in a scene and describe it as an episode."""
+        """Render a motion in a scene and describe it as an episode; with masks of the robot and of things unless told otherwise."""
         if self._renderer is None:
             self._renderer = SceneRenderer(self.scene)
         # Another layout may have been executed since: this one decides where objects stand and what they look like.
@@ -295,7 +296,7 @@ class EpisodeRecorder:
         self._set_scene(self._renderer, scene_id, jitter)
         labels = (solid_labels if self.contact else thing_labels)(self.scene, layout)
         frames, masks, things, cameras = self._renderer.render(
-            motion.qpos, lambda qpos: light_buttons(self.scene, layout, qpos), labels
+            motion.qpos, lambda qpos: light_buttons(self.scene, layout, qpos), labels if masked else None
         )
         drawn = scene_id not in SCENES
         held_out = {
