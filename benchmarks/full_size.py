@@ -1,6 +1,6 @@
 """Training and rollouts of a preset on one card, with random weights, beside what is planned and the floor.
 
-    python -m benchmarks.full_size --preset edge-24gb [--device cuda] [--blocks 8] [--steps 3] [--compile]
+    python -m benchmarks.full_size --preset edge-24gb [--preset edge-80gb] [--device cuda] [--blocks 8] [--steps 3] [--compile]
 
 Stage II and teacher forcing: one micro-batch of the longest clips and an update, with the preset's precision, moments and recomputation.
 Rollouts: blocks in bfloat16 after the window is full, one sampled while the one before is decoded (on a GPU), in one view and in all: with the shape
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -30,7 +30,7 @@ from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline.cards import CARDS, UTILISATION, find_card
 from worldline_core.pipeline.memory_estimate import Estimate, Sources, trainings
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.rollout_speed import block_costs
+from worldline_core.pipeline.rollout_speed import BlockCost, block_costs
 from worldline_core.pipeline.size_sheet import SizeSheet
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
 from worldline_core.rollout.simulation import Session
@@ -130,77 +130,93 @@ def measured(
     return seconds / blocks, torch.cuda.max_memory_allocated() / 1e9 if on_gpu else 0.0
 
 
+@dataclass(frozen=True)
+class Outline:
+    """A preset's stages with steps of one micro-batch, and what they cost by the plan.
+
+    Attributes:
+        costs: of a block in each set of views.
+    """
+
+    preset: str
+    card: str
+    model: WorldModelConfig
+    source: Sources
+    distilled: DistillConfig
+    stages: tuple[Stage2Config | DistillConfig, ...]
+    plans: tuple[Estimate, ...]
+    costs: dict[tuple[str, ...], BlockCost]
+
+
+def outline(preset: str, device: str, card: str | None) -> Outline:
+    """Count memory and operations of a preset."""
+    config = PipelineConfig.load(preset)
+    if config.distill is None or config.train_stage2 is None:
+        raise SystemExit(f"{preset} distils nothing")
+    chosen = find_card(card or config.card or "H100")
+    sheet = SizeSheet.model_validate({"config": config, "project": Path.cwd(), "card": chosen})
+    model, source = stage2_model_config(config.train_stage2, sheet.model), sheet.source(config.distill)
+    views = tuple(config.distill.views)
+    view_sets = list(dict.fromkeys((views[:1], views)))
+    stages = (one_micro_batch(config.train_stage2, device), one_micro_batch(config.distill, device))
+    with ProcessPoolExecutor(4, get_context("fork")) as pool:
+        counted = block_costs(config.distill, model, source, view_sets, pool)
+        plans = tuple(pool.map(partial(planned, model=model, source=source), stages))
+        costs = dict(zip(view_sets, counted(), strict=True))
+    return Outline(preset, chosen, model, source, config.distill, stages, plans, costs)
+
+
+def training_rows(known: Outline, steps: int, *, compiled: bool) -> Iterator[Sequence[object]]:
+    """Steps of both trainings beside their plan."""
+    operations = CARDS[known.card].operations
+    for title, stage, plan in zip(TRAININGS, known.stages, known.plans, strict=True):
+        seconds, peak = trained(stage, known.model, known.source, steps=steps, compiled=compiled)
+        floor = (plan.operations or 0.0) / operations
+        planned_seconds = floor / UTILISATION
+        yield (
+            title, plan.parameters / 1e6, seconds, planned_seconds, floor, floor / seconds, peak, plan.total / 1e9,
+        )  # fmt: skip
+
+
+def rollout_rows(known: Outline, blocks: int, device: str, *, compiled: bool) -> Iterator[Sequence[object]]:
+    """Blocks in one view and in all, with either decoder, beside their plan."""
+    for shown, cost in known.costs.items():
+        for small in (False, True):
+            seconds, peak = measured(
+                known.distilled, known.model, known.source, shown, small=small, device=device, blocks=blocks,
+                compiled=compiled,
+            )  # fmt: skip
+            floor = cost.frames_per_second(CARDS[known.card].operations, small=small)
+            yield (
+                len(shown), "small" if small else "autoencoder", cost.frames / seconds, UTILISATION * floor, floor,
+                cost.frames / seconds / floor, peak,
+            )  # fmt: skip
+
+
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("--preset", default="edge-24gb")
+    parser.add_argument("--preset", action="append", dest="presets", help="again for several (default: edge-24gb)")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--card", help="whose speed is the floor (default: the preset's)")
     parser.add_argument("--blocks", type=int, default=8)
     parser.add_argument("--steps", type=int, default=3)
     parser.add_argument("--compile", action="store_true", help="torch.compile of each layer but its attention")
     arguments = parser.parse_args()
-    config = PipelineConfig.load(arguments.preset)
-    if config.distill is None or config.train_stage2 is None:
-        raise SystemExit(f"{arguments.preset} distils nothing")
-    distilled = config.distill
-    card = find_card(arguments.card or config.card or "H100")
-    sheet = SizeSheet.model_validate({"config": config, "project": Path.cwd(), "card": card})
-    model, source = stage2_model_config(config.train_stage2, sheet.model), sheet.source(distilled)
-    views = tuple(distilled.views)
-    view_sets = list(dict.fromkeys((views[:1], views)))
-    stages = [one_micro_batch(stage, arguments.device) for stage in (config.train_stage2, distilled)]
-    with ProcessPoolExecutor(4, get_context("fork")) as pool:  # before CUDA begins
-        counted = block_costs(distilled, model, source, view_sets, pool)
-        plans = list(pool.map(partial(planned, model=model, source=source), stages))
-        costs = dict(zip(view_sets, counted(), strict=True))
-
-    require_device(arguments.device)
-    operations = CARDS[card].operations
-
-    def steps() -> Iterator[Sequence[object]]:
-        for title, stage, plan in zip(TRAININGS, stages, plans, strict=True):
-            seconds, peak = trained(stage, model, source, steps=arguments.steps, compiled=arguments.compile)
-            floor = (plan.operations or 0.0) / operations
-            yield (
-                title,
-                plan.parameters / 1e6,
-                seconds,
-                floor / UTILISATION,
-                floor,
-                floor / seconds,
-                peak,
-                plan.total / 1e9,
-            )
-
-    def rows() -> Iterator[Sequence[object]]:
-        for shown, cost in costs.items():
-            for small in (False, True):
-                seconds, peak = measured(
-                    distilled, model, source, shown, small=small, device=arguments.device, blocks=arguments.blocks,
-                    compiled=arguments.compile,
-                )  # fmt: skip
-                floor = cost.frames_per_second(operations, small=small)
-                yield (
-                    len(shown), "small" if small else "autoencoder", cost.frames / seconds, UTILISATION * floor, floor,
-                    cost.frames / seconds / floor, peak,
-                )  # fmt: skip
-
-    name = torch.cuda.get_device_name() if arguments.device.startswith("cuda") else "a processor"
-    print(f"{arguments.preset} on {name}, floor of {card}")
-    print_table(
-        (
-            "training",
-            "M parameters",
-            "s a micro-step",
-            "planned",
-            "floor",
-            "share of the floor",
-            "peak GB",
-            "planned GB",
-        ),
-        steps(),
-    )
-    print_table(("views", "decoder", "frames a second", "planned", "floor", "share of the floor", "peak GB"), rows())
+    presets, device, compiled = arguments.presets or ["edge-24gb"], arguments.device, arguments.compile
+    with ProcessPoolExecutor(len(presets), get_context("fork")) as pool:  # before CUDA begins
+        outlines = list(pool.map(partial(outline, device=device, card=arguments.card), presets))
+    require_device(device)
+    name = torch.cuda.get_device_name() if device.startswith("cuda") else "a processor"
+    for known in outlines:
+        print(f"{known.preset} on {name}, floor of {known.card}")
+        print_table(
+            ("training", "M parameters", "s a micro-step", "planned", "floor", "share of the floor", "peak GB", "planned GB"),
+            training_rows(known, arguments.steps, compiled=compiled),
+        )  # fmt: skip
+        print_table(
+            ("views", "decoder", "frames a second", "planned", "floor", "share of the floor", "peak GB"),
+            rollout_rows(known, arguments.blocks, device, compiled=compiled),
+        )  # fmt: skip
 
 
 if __name__ == "__main__":
