@@ -264,6 +264,13 @@ def wan():
 
 
 @torch.no_grad()
+def test_compression_of_an_outline_is_known_without_it(wan_folder, fitted, tmp_path):
+    fitted.save(tmp_path)
+    for folder in (None, wan_folder, wan_folder / "vae", tmp_path):
+        outline = tokenizers.tokenizer_outline(folder)
+        assert tokenizers.spatial_compression(folder) == outline.spatial_compression
+
+
 def test_a_small_decoder_decodes_latents_as_they_arrive(patch, wan):
     """In whatever pieces: the same bits, which no later latent frame changes; a copy goes on separately."""
     for tokenizer in (patch, wan):

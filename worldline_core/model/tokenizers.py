@@ -644,11 +644,24 @@ def tokenizer_outline(folder: Path | None) -> WanTokenizer | PatchTokenizer:
         return PatchTokenizer.outline(folder)
     from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 
+    root, shape = _wan_outline(folder)
+    vae: Any = AutoencoderKLWan.from_config(shape)
+    return WanTokenizer(vae.eval().requires_grad_(False), where=root)
+
+
+def spatial_compression(folder: Path | None) -> int:
+    """That of `tokenizer_outline`, without the seconds that diffusers takes to load."""
+    if folder is not None and (folder / DESCRIPTION).is_file():
+        return PatchTokenizer.outline(folder).spatial_compression
+    return int(_wan_outline(folder)[1]["scale_factor_spatial"])
+
+
+def _wan_outline(folder: Path | None) -> tuple[Path | None, dict[str, Any]]:
+    """Folder and configuration of an autoencoder; the published one without a folder."""
     places = [] if folder is None else [folder / "vae", folder]
     root = next((place for place in places if (place / "config.json").is_file()), None)
-    shape = WAN22_SHAPE if root is None else _wan_shape(root)
-    vae: Any = AutoencoderKLWan.from_config({"latents_mean": WAN22_MEAN, "latents_std": WAN22_STD, **shape})
-    return WanTokenizer(vae.eval().requires_grad_(False), where=root)
+    shape = WAN22_SHAPE if root is None else {"scale_factor_spatial": 8, **_wan_shape(root)}
+    return root, {"latents_mean": WAN22_MEAN, "latents_std": WAN22_STD, **shape}
 
 
 def require_device(device: str) -> None:

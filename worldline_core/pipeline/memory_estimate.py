@@ -32,7 +32,7 @@ from worldline_core.model.checkpoint import read_checkpoint_info
 from worldline_core.model.lpips import LPIPS
 from worldline_core.model.mixture import is_text_parameter
 from worldline_core.model.networks import build_world_model
-from worldline_core.model.tokenizers import tokenizer_outline
+from worldline_core.model.tokenizers import spatial_compression, tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import MixtureConfig, WanConfig, WorldModelConfig
 from worldline_core.pipeline.memory_trace import Held, extrapolated, traced
@@ -84,8 +84,7 @@ class Sources:
     @cache
     def of(cls, tokenizer: Path | None, teacher: Path | None, image_size: tuple[int, int]) -> Sources:
         """With the latents that a tokenizer makes of pictures of a size."""
-        with FakeTensorMode():
-            space = tokenizer_outline(tokenizer).spatial_compression
+        space = spatial_compression(tokenizer)
         return cls(tokenizer, teacher, image_size, (image_size[0] // space, image_size[1] // space))
 
     def batch(self, model: WorldModelConfig, clips: int, views: Sequence[str], frames: int, text: int = 0) -> Batch:

@@ -56,11 +56,11 @@ def block_costs(
     config: DistillConfig, model: WorldModelConfig, source: Sources, view_sets: Sequence[Sequence[str]], pool: Executor
 ) -> Callable[[], list[BlockCost]]:
     """Begins to count the operations of a block in each of these sets of views, and returns a function that gives them."""
+    decoded = pool.submit(_decoding, config, source)
     sampled = [pool.submit(_sampling, config, model, source, views) for views in view_sets]
-    decoded = [pool.submit(_decoding, config, source, small=small) for small in (False, True)]
 
     def costs() -> list[BlockCost]:
-        own, small = (each.result() for each in decoded)
+        own, small = decoded.result()
         frames = TEMPORAL_FACTOR * config.block_size
         return [
             BlockCost(len(views), frames, each.result(), len(views) * own, len(views) * small)
@@ -91,13 +91,15 @@ def _sampling(config: DistillConfig, model: WorldModelConfig, source: Sources, v
     return extrapolated(trace, model.num_layers).operations
 
 
-def _decoding(config: DistillConfig, source: Sources, *, small: bool) -> float:
-    """One view of a block."""
+def _decoding(config: DistillConfig, source: Sources) -> tuple[float, float]:
+    """Operations of one view of a block, by the tokenizer's own decoder and by a small one."""
     with FakeTensorMode(), torch.no_grad():
-        tokenizer: VideoTokenizer = tokenizer_outline(source.tokenizer)
-        if small:
-            tokenizer = SmallDecoder(SmallDecoderConfig.of(tokenizer, ""), tokenizer)
-        decode = tokenizer.decoder(torch.empty(1, 3, *source.image_size))
-        latents = torch.empty(1, tokenizer.latent_channels, 1 + config.block_size, *source.grid)
-        decode(latents[:, :, :1])
-        return traced(lambda: decode(latents[:, :, 1:])).operations
+        own = tokenizer_outline(source.tokenizer)
+        latents = torch.empty(1, own.latent_channels, 1 + config.block_size, *source.grid)
+
+        def operations(tokenizer: VideoTokenizer) -> float:
+            decode = tokenizer.decoder(torch.empty(1, 3, *source.image_size))
+            decode(latents[:, :, :1])
+            return traced(lambda: decode(latents[:, :, 1:])).operations
+
+        return operations(own), operations(SmallDecoder(SmallDecoderConfig.of(own, ""), own))

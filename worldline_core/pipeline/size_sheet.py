@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 from collections.abc import Iterable, Iterator
@@ -9,6 +10,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from pydantic import ByteSize, Field
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
@@ -20,6 +22,7 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.rollout_speed import BlockCost, block_costs
 from worldline_core.progress import Progress
 from worldline_core.shipped import project_path
+from worldline_core.training.adapters import load_peft
 from worldline_core.training.clip_config import FrameInput
 from worldline_core.training.stage2 import stage2_model_config
 
@@ -100,7 +103,7 @@ class SizeSheet(StrictModel):
 
     def rows(self) -> list[Estimate]:
         """Memory of every training in the order of a run."""
-        with _processes() as pool:
+        with self._processes() as pool:
             return self._rows(pool)
 
     def _rows(self, pool: Executor) -> list[Estimate]:
@@ -114,7 +117,7 @@ class SizeSheet(StrictModel):
     def rows_and_rollouts(self) -> tuple[list[Estimate], list[BlockCost]]:
         """The same, and blocks of the distilled model in one view and in all; none where nothing is distilled."""
         config, views = self.config, () if self.config.distill is None else tuple(self.config.distill.views)
-        with _processes() as pool:
+        with self._processes() as pool:
             if config.distill is None or config.train_stage2 is None:
                 return self._rows(pool), []
             model = stage2_model_config(config.train_stage2, self.model)
@@ -124,11 +127,19 @@ class SizeSheet(StrictModel):
 
     def fits(self) -> bool:
         """Returns whether every training fits; the first one that does not ends the work."""
-        with _processes() as pool:
+        with self._processes() as pool:
             try:
                 return all(row.fits(self.bytes) for _, row in self._finished(pool))
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
+
+    def _processes(self) -> Executor:
+        """Processes that find imported what all of them need, and never search it for garbage."""
+        FakeTensorMode()  # imports half of torch
+        if any(stage is not None and stage.lora for stage in (self.config.train_stage2, self.config.distill)):
+            load_peft()
+        context = multiprocessing.get_context("fork")
+        return ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=gc.freeze)
 
     def as_text(self, rows: Iterable[Estimate], rollouts: Iterable[BlockCost] = ()) -> str:
         """The sheet as a Markdown table; then the rollouts."""
@@ -172,10 +183,6 @@ class SizeSheet(StrictModel):
         if row.minutes is not None:
             return seconds, row.minutes / 60
         return seconds, None if seconds is None or row.steps is None else seconds * row.steps / 3600
-
-
-def _processes() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(len(os.sched_getaffinity(0)), multiprocessing.get_context("fork"))
 
 
 def _figure(value: float | None) -> str:

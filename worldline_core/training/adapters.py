@@ -10,6 +10,7 @@ import hashlib
 import logging
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 import torch
@@ -68,17 +69,23 @@ def add_adapters(model: WorldModel, config: LoRAConfig, seed: int) -> None:
     Raises:
         UnavailableError: peft is not installed.
     """
+    peft = load_peft()
+    with torch.random.fork_rng([]):
+        torch.manual_seed(seed)
+        peft.inject_adapter_in_model(peft.LoraConfig(**_peft_settings(model, config)), model)
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(_MARK in name or is_action_parameter(name) or name == "view_embedding")
+
+
+def load_peft() -> ModuleType:
+    """The library, which takes seconds the first time. Raises: UnavailableError: it is not installed."""
     try:
-        from peft import LoraConfig, inject_adapter_in_model
+        import peft
     except ImportError as error:
         raise UnavailableError(
             "peft is not installed", where="lora", got=str(error), next_step=installing("one-gpu")
         ) from error
-    with torch.random.fork_rng([]):
-        torch.manual_seed(seed)
-        inject_adapter_in_model(LoraConfig(**_peft_settings(model, config)), model)
-    for name, parameter in model.named_parameters():
-        parameter.requires_grad_(_MARK in name or is_action_parameter(name) or name == "view_embedding")
+    return peft
 
 
 def _peft_settings(model: WorldModel, config: LoRAConfig) -> dict[str, Any]:
