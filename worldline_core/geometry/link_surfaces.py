@@ -30,10 +30,14 @@ RADIUS_SHARE, MIN_RADIUS_M = 0.6, 0.008
 def link_surfaces(embodiment: Embodiment) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """By link: points (p, 3) in the link's frame and their radii (p,) [m]; no entry for a link without shapes."""
     text, path = read_description(embodiment), embodiment.description_path
-    root = parse_xml(text, path)
-    shapes = (
-        _mjcf_shapes(root, path.parent) if embodiment.description.format == "mjcf" else _urdf_shapes(root, path.parent)
-    )
+    found = surfaces_of(parse_xml(text, path), path.parent)
+    mounts = embodiment.description.mounts
+    return {f"{m}/{link}": value for m in mounts for link, value in found.items()} if mounts else found
+
+
+def surfaces_of(root: ET.Element, folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """The same of a description, whose meshes are named from a folder."""
+    shapes = _urdf_shapes(root, folder) if root.tag == "robot" else _mjcf_shapes(root, folder)
     vertices: dict[str, list[np.ndarray]] = {}
     spheres: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for link, points, radius in shapes:
@@ -43,11 +47,7 @@ def link_surfaces(embodiment: Embodiment) -> dict[str, tuple[np.ndarray, np.ndar
             vertices.setdefault(link, []).append(points)
     for link, parts in vertices.items():
         spheres.setdefault(link, []).append(spread(np.concatenate(parts)))
-    found = {
-        link: (np.concatenate([p for p, _ in s]), np.concatenate([r for _, r in s])) for link, s in spheres.items()
-    }
-    mounts = embodiment.description.mounts
-    return {f"{m}/{link}": value for m in mounts for link, value in found.items()} if mounts else found
+    return {link: (np.concatenate([p for p, _ in s]), np.concatenate([r for _, r in s])) for link, s in spheres.items()}
 
 
 def spread(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -226,16 +226,15 @@ def _estimate_wrist(recorded: RecordedView, arm: int, T_tool_mount: np.ndarray |
     common = wrist_evidence(recorded, arm, distinct[0].camera)
     fits = [fit_wrist(common, fit.camera, fit.lag, fit.camera, SEARCHED_PRIOR) for fit in distinct]
     fits.sort(key=lambda fit: -fit.likelihood)
-    found = _made_exact(recorded, arm, fits[0], fits[0].camera, SEARCHED_PRIOR)
-    rival = next((fit for fit in fits[1:] if _apart(fit.camera, found.fitted.camera)), None)
-    if rival is None:
+    rival = next((fit for fit in fits[1:] if _apart(fit.camera, fits[0].camera)), None)
+    followed = fits[:1] if rival is None else [fits[0], rival]
+    exact = [_made_exact(recorded, arm, fit, fit.camera, SEARCHED_PRIOR) for fit in followed]
+    # What one of them hides of the scene decides too much of that likelihood: episodes that are held out have the last word.
+    found, *others = sorted(exact, key=lambda each: -each.agreement)
+    apart = [other for other in others if _apart(other.fitted.camera, found.fitted.camera)]
+    if not apart:
         return replace(found, searched=True)
-    against = wrist_evidence(recorded, arm, rival.camera)
-    rival = fit_wrist(against, rival.camera, rival.lag, rival.camera, SEARCHED_PRIOR)
-    if not _apart(rival.camera, found.fitted.camera):
-        return replace(found, searched=True)
-    agreements = np.array([each.agreement(rival.camera, rival.lag) for each in against])
-    return replace(found, searched=True, rival=rival, rival_agreements=agreements)
+    return replace(found, searched=True, rival=apart[0].fitted, rival_agreements=apart[0].agreements)
 
 
 def _made_exact(
