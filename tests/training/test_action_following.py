@@ -15,9 +15,10 @@ from worldline_core.model.checkpoint import read_checkpoint_info
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.training.action_following import ActionFollowing
+from worldline_core.training.action_following import ActionFollowing, Place, _error, _moving_part
 from worldline_core.training.clip_config import FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
+from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.clip_source import FrameSource
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.stage1 import train_stage1
@@ -89,11 +90,26 @@ def test_a_model_that_follows_is_told_from_one_that_does_not(world, tokenizer, t
     assert following["clips"] == ignoring["clips"] >= 6
     assert following["tool_error_px"] == 0 and following["hand_psnr"] == pytest.approx(10 * np.log10(255**2 * 12))
     assert following["tool_error_px_shuffled"] > 2 and following["shuffled_gap_low_px"] > 1
+    assert following["copy_gap_px"] >= following["copy_gap_low_px"] > 1 and ignoring["copy_gap_px"] == 0
     assert ignoring["tool_error_px"] == ignoring["tool_error_px_copy"] == ignoring["tool_error_px_shuffled"] > 2
     assert ignoring["hand_psnr"] < ignoring["frame_psnr"]
     if tracks:  # one held-out episode is enough
         found = make_probe(world, tokenizer, held_out=1).measure(1)
         assert found["clips"] > 4 and found["tool_error_px"] < found["tool_error_px_copy"]
+
+
+def test_still_edges_around_a_small_robot_do_not_hide_that_it_moved():
+    behind = np.zeros((64, 96, 3), np.float32)
+    behind[32:, 40:56] = 250  # a still thing
+    first, later = behind.astype(np.uint8), behind.astype(np.uint8)
+    for picture, u in ((first, 36), (later, 46)):
+        picture[24:32, u : u + 6] = (110, 90, 0)
+        picture[26:30, u + 2 : u + 4] = 10
+    points = _moving_part(first, later, behind)
+    assert np.abs(points[0] - (48.5, 27.5)).max() <= 3
+    place = Place(Clip("a", 0, 9, 1), points, behind)
+    assert (_error(later, later, place), _error(later, first, place)) == (0.0, 10.0)
+    assert _error(later, first, Place(place.clip, points)) == 0.0, "still things fit best where they are"
 
 
 def test_a_model_that_ignores_its_controls_is_stopped_from_the_given_step_on(world, tokenizer):

@@ -23,7 +23,7 @@ def end_effector_error(true: np.ndarray, predicted: np.ndarray, points: np.ndarr
     """Error of each frame and point (n, p) float64 [px]; NaN where a point is invalid or its patch leaves the frame.
 
     Args:
-        true, predicted: uint8 (n, h, w, 3), same size.
+        true, predicted: uint8 or float32 (n, h, w, 3), same size.
         points: (n, p, 2) projected tool centres u, v [px]; NaN where invalid.
     """
     height, width = true.shape[1:3]

@@ -1,7 +1,8 @@
 """Action following while a model trains: a second of held-out clips is predicted under its own controls, under another clip's, and by
 copying the first picture; then each tool is looked for in the predicted picture (`actions/tool_error.py`).
 
-Where no camera is known, the part of the recorded picture that has changed most stands for the tool.
+Where no camera is known, the part of the recorded picture that has changed most stands for the tool, and pictures are compared by
+what differs from the recording's own background: the still edges around a small robot are found where they always are.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from worldline_core.model.tokenizers import (
     tokenizer_fingerprint,
     video_to_frames,
 )
+from worldline_core.pictures import evenly_spaced
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipRow
 from worldline_core.training.trainer import autocast, step_generator
@@ -41,8 +43,10 @@ logger = logging.getLogger(__name__)
 SEED = 30_000
 LEAST_MOTION = 0.05
 """Way of a tool in that second, of the frame's height, from which a clip can tell predictions apart."""
-LEAST_CHANGE = 12.0
+LEAST_CHANGE = 8.0
 """Blurred change of a picture that is motion [grey levels]."""
+BACKGROUND_FRAMES = 15
+"""Frames of a recording whose median is its background."""
 LEAST_CLIPS = 4
 FIRST_SECONDS = 3.0
 """Assumed cost of the first measurement."""
@@ -60,10 +64,12 @@ class ClipPredictor(Protocol):
 
 @dataclass(frozen=True)
 class Place:
-    """A clip, and where its tools are after a second: (arms, 2) u, v [px of the model's picture], NaN where they do not move."""
+    """A clip, and where its tools are after a second: (arms, 2) u, v [px of the model's picture], NaN where they do not move; without a
+    camera also the recording's background (h, w, 3)."""
 
     clip: Clip
     points: np.ndarray
+    background: np.ndarray | None = None
 
 
 class ActionFollowing:
@@ -97,7 +103,7 @@ class ActionFollowing:
         self.trainer = trainer
         self.tokenizer = _open_tokenizer(tokenizer, loader)
         self.spent, self.longest = 0.0, FIRST_SECONDS
-        self.batches: list[tuple[ClipBatch, list[np.ndarray]]] = []
+        self.batches: list[tuple[ClipBatch, list[Place]]] = []
         self.frame = 0
         kinds = {row.episode_id: (_shared(row, view_sets), loader.frame_rates[row.episode_id]) for row in rows}
         if kinds:
@@ -116,8 +122,8 @@ class ActionFollowing:
                 part = places[first : first + size]
                 if len(part) > 1:  # another clip's controls are needed
                     clips = ClipBatch(tuple(place.clip for place in part), views, primary=False)
-                    self.batches.append((clips, [place.points for place in part]))
-        if sum(len(points) for _, points in self.batches) < LEAST_CLIPS:
+                    self.batches.append((clips, part))
+        if sum(len(places) for _, places in self.batches) < LEAST_CLIPS:
             logger.warning(
                 "Action following is not measured: fewer than %d held-out clips in which a tool moves within %.3g s.",
                 LEAST_CLIPS, config.seconds,
@@ -134,7 +140,7 @@ class ActionFollowing:
             last = (row.num_frames - frames) // step
             starts = sorted({int(share) for share in np.linspace(0, last, turns)}) if last >= 0 else []
             clips = [Clip(row.episode_id, start * step, frames, 1) for start in starts]
-            places = [Place(clip, self._moved(clip, views[0])) for clip in clips]
+            places = self._moved(clips, views[0])
             moved = [place for place in places if np.isfinite(place.points).any()]
             for turn, place in zip(by_turn, moved, strict=False):
                 turn.append(place)
@@ -142,19 +148,39 @@ class ActionFollowing:
                 break
         return [place for turn in by_turn for place in turn][:wanted]
 
-    def _moved(self, clip: Clip, view: str) -> np.ndarray:
-        """Places of the tools that move, else of the part of the picture that does."""
+    def _moved(self, clips: Sequence[Clip], view: str) -> list[Place]:
+        """Clips of one episode with the places of the tools that move, else of the part of the picture that does."""
         height, width = self.loader.source.image_size
-        tracks = None if self.loader.tracks is None else self.loader.tracks.tracks(clip.episode_id)
+        tracks = (
+            None if self.loader.tracks is None else self.loader.tracks.tracks(clips[0].episode_id) if clips else None
+        )
         if tracks is None or not tracks.valid[:, tracks.views.index(view)].any():
-            return _moving_part(*self._recorded(clip, view, (0, self.frame)))
-        cut, column = tracks.clip([clip.start, clip.start + self.frame]), tracks.views.index(view)
-        scale = np.array([width / tracks.image_size[1], height / tracks.image_size[0]])
-        points = (cut.uv[:, column].astype(np.float64) + 0.5) * scale - 0.5
-        points[~cut.valid[:, column].astype(bool)] = np.nan
-        still = ~(np.linalg.norm(points[1] - points[0], axis=-1) >= LEAST_MOTION * height)
-        outside = ~_inside(points[1], height, width)
-        return np.where((still | outside)[:, None], np.nan, points[1])
+            background = self._background(clips[0].episode_id, view) if clips else np.zeros(0)
+            pictures = [self._recorded(clip, view, (0, self.frame)) for clip in clips]
+            return [
+                Place(clip, _moving_part(first, later, background), background)
+                for clip, (first, later) in zip(clips, pictures, strict=True)
+            ]
+        column, scale = (
+            tracks.views.index(view),
+            np.array([width / tracks.image_size[1], height / tracks.image_size[0]]),
+        )
+        found: list[Place] = []
+        for clip in clips:
+            cut = tracks.clip([clip.start, clip.start + self.frame])
+            points = (cut.uv[:, column].astype(np.float64) + 0.5) * scale - 0.5
+            points[~cut.valid[:, column].astype(bool)] = np.nan
+            still = ~(np.linalg.norm(points[1] - points[0], axis=-1) >= LEAST_MOTION * height)
+            outside = ~_inside(points[1], height, width)
+            found.append(Place(clip, np.where((still | outside)[:, None], np.nan, points[1])))
+        return found
+
+    def _background(self, episode_id: str, view: str) -> np.ndarray:
+        """(h, w, 3) float32 median over an episode."""
+        position = self.episodes.position(episode_id)
+        frames = evenly_spaced(self.episodes.rows[position].video_frames, BACKGROUND_FRAMES)
+        pictures = resized_frames(self.episodes.frames(position, view, frames), self.loader.source.image_size)
+        return np.median(pictures, axis=0).astype(np.float32)
 
     def _recorded(self, clip: Clip, view: str, frames: Sequence[int]) -> np.ndarray:
         indices = [clip.start + frame for frame in frames]
@@ -170,7 +196,7 @@ class ActionFollowing:
 
         - ``tool_error_px``, ``_shuffled``, ``_copy``: mean distance of the tools from where the controls put them;
         - ``shuffled_gap_px``, ``shuffled_gap_low_px``: by how much they are farther off under another clip's controls, and the lower
-          bound of its 95 % interval over the clips;
+          bound of its 95 % interval over the clips; ``copy_gap_px``, ``copy_gap_low_px``: the same of copying;
         - ``hand_psnr``, ``frame_psnr``: around the tools, and of the whole picture [dB].
 
         Raises: TrainingError: ``stop_when_ignored`` steps are done and the controls make no difference.
@@ -180,7 +206,7 @@ class ActionFollowing:
         began = time.monotonic()
         errors: dict[str, list[float]] = {"": [], "_shuffled": [], "_copy": []}
         squared: dict[str, list[float]] = {"hand": [], "frame": []}
-        for number, (clips, points) in enumerate(self.batches):
+        for number, (clips, places) in enumerate(self.batches):
             batch = self.loader.load(clips)
             maps = batch.action_maps
             if maps is None:
@@ -188,17 +214,17 @@ class ActionFollowing:
             generator = step_generator(SEED, number, str(batch.latents.device))
             noise = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
             own, shuffled = (self._pictures(batch, controls, noise) for controls in (maps, maps.roll(1, dims=0)))
-            for place, clip in enumerate(clips.clips):
-                first, true = self._recorded(clip, clips.views[0], (0, self.frame))
-                compared = {"": own[place], "_shuffled": shuffled[place], "_copy": first}
-                found = {name: _error(true, picture, points[place]) for name, picture in compared.items()}
+            for place, of_own, of_other in zip(places, own, shuffled, strict=True):
+                first, true = self._recorded(place.clip, clips.views[0], (0, self.frame))
+                compared = {"": of_own, "_shuffled": of_other, "_copy": first}
+                found = {name: _error(true, picture, place) for name, picture in compared.items()}
                 if any(value is None for value in found.values()):
                     continue
                 for name, value in found.items():
                     errors[name].append(value or 0.0)
-                difference = (own[place].astype(np.float64) - true) ** 2
+                difference = (of_own.astype(np.float64) - true) ** 2
                 squared["frame"].append(float(difference.mean()))
-                squared["hand"].append(_around(difference, points[place]))
+                squared["hand"].append(_around(difference, place.points))
         took = time.monotonic() - began
         self.longest = max(self.longest, took) if self.spent else took
         self.spent += took
@@ -256,20 +282,18 @@ def _inside(points: np.ndarray, height: int, width: int) -> np.ndarray:
     return (u >= half) & (u <= width - half - 1) & (v >= half) & (v <= height - half - 1)
 
 
-def _moving_part(first: np.ndarray, later: np.ndarray) -> np.ndarray:
-    """(1, 2) the place u, v of the later picture that has changed most and shows something; NaN where hardly anything has."""
+def _moving_part(first: np.ndarray, later: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """(1, 2) the place u, v of the later picture that has changed most and is no background; NaN where hardly anything has."""
     height, width = later.shape[:2]
     half = max(2, round(PATCH_FRACTION * height))
 
     def blurred(values: np.ndarray) -> np.ndarray:
         return cv2.GaussianBlur(values, (0, 0), half / 2)[half : height - half, half : width - half]
 
-    now = later.astype(np.float32)
-    change = blurred(np.abs(now - first).max(axis=-1))
-    grey = now.mean(axis=-1)
-    contrast = np.sqrt(
-        np.maximum(blurred(grey**2) - blurred(grey) ** 2, 0)
-    )  # bare background appears where the tool was
+    apart = later - background
+    change = blurred(np.minimum(np.abs(later.astype(np.float32) - first), np.abs(apart)).max(axis=-1))
+    grey = apart.mean(axis=-1)
+    contrast = np.sqrt(np.maximum(blurred(grey**2) - blurred(grey) ** 2, 0))
     likely = np.where((change >= LEAST_CHANGE) & (contrast >= MIN_CONTRAST), change * contrast, 0)
     if not likely.any():
         return np.full((1, 2), np.nan)
@@ -277,8 +301,10 @@ def _moving_part(first: np.ndarray, later: np.ndarray) -> np.ndarray:
     return np.array([[column + half, row + half]], dtype=np.float64)
 
 
-def _error(true: np.ndarray, predicted: np.ndarray, points: np.ndarray) -> float | None:
-    errors = end_effector_error(true[None], predicted[None], points[None])
+def _error(true: np.ndarray, predicted: np.ndarray, place: Place) -> float | None:
+    if place.background is not None:
+        true, predicted = true - place.background, predicted - place.background
+    errors = end_effector_error(true[None], predicted[None], place.points[None])
     return float(np.nanmean(errors)) if np.isfinite(errors).any() else None
 
 
@@ -294,10 +320,11 @@ def _summary(errors: Mapping[str, Sequence[float]], squared: Mapping[str, Sequen
     if len(errors[""]) < LEAST_CLIPS:
         return {}
     values = {f"tool_error_px{name}": float(np.mean(found)) for name, found in errors.items()}
-    gap = np.subtract(errors["_shuffled"], errors[""])
-    margin = 1.96 * float(gap.std(ddof=1)) / math.sqrt(len(gap))
-    values |= {"shuffled_gap_px": float(gap.mean()), "shuffled_gap_low_px": float(gap.mean()) - margin}
+    for name in ("shuffled", "copy"):
+        gap = np.subtract(errors[f"_{name}"], errors[""])
+        margin = 1.96 * float(gap.std(ddof=1)) / math.sqrt(len(gap))
+        values |= {f"{name}_gap_px": float(gap.mean()), f"{name}_gap_low_px": float(gap.mean()) - margin}
     psnr = {
         f"{name}_psnr": 10 * math.log10(255**2 / max(float(np.mean(found)), 1 / 12)) for name, found in squared.items()
     }
-    return values | psnr | {"clips": float(len(gap))}
+    return values | psnr | {"clips": float(len(errors[""]))}
