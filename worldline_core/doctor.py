@@ -7,6 +7,7 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+import re
 import shutil
 import urllib.error
 import urllib.request
@@ -35,7 +36,8 @@ PUBLISHED_MODELS = (
     "Qwen/Qwen3-VL-8B-Instruct",
 )
 
-
+_BUNDLED = re.compile(r"^[^/,]+\.libs/(?:[^/,]+/)*([^-./,]+)", re.MULTILINE)
+"""Names of libraries in the RECORD of a wheel."""
 _BUNDLED_GPL = ("libx264", "libx265")
 
 
@@ -77,8 +79,7 @@ def third_party_licences(project: Path) -> list[str]:
         listed = facts.get_all("Classifier") or []
         classifiers = [text.rsplit(" :: ", 1)[-1] for text in listed if text.startswith("License ::")]
         stated = facts.get("License-Expression") or ", ".join(classifiers) or (facts.get("License") or "").strip()
-        files = [path for path in package.files or () if path.parts[0].endswith(".libs")]
-        bundled = sorted({path.name.split("-")[0].split(".")[0] for path in files})
+        bundled = sorted(set(_BUNDLED.findall(package.read_text("RECORD") or "")))
         gpl = [name for name in bundled if name in _BUNDLED_GPL]
         lines.append(
             f"{package.name} {package.version}: {stated.splitlines()[0][:80] if stated else 'not stated'}"

@@ -71,7 +71,8 @@ def modules(package: str) -> set[str]:
     except PackageNotFoundError:
         return set()
     named = (found.read_text("top_level.txt") or "").split()
-    return set(named) or {file.parts[0].removesuffix(".py") for file in found.files or ()}
+    files = (found.read_text("RECORD") or "").splitlines()  # parsed by `found.files`, which takes a second
+    return set(named) or {re.split("[/,]", file)[0].removesuffix(".py") for file in files}
 
 
 def statements(node: ast.AST) -> Iterator[ast.AST]:
