@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from tests.data.conftest import FPS, make_sample  # pyright: ignore[reportMissingImports]
-from worldline_core.actions.overlays import write_overlay_video
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import VIEWS
@@ -97,13 +96,12 @@ def read_mcap(recorded: Recorded, output: Path) -> None:
 WITH_THUMBNAILS = "episode as lerobot"
 """Keeps grey thumbnails of 72 x 96 until the episode is whole, 0.19 of a view's frames each: those of three views, one of them
 twice while it is stacked, and what they are packed into: 0.97 when measured."""
-SLOW = ("episode as mcap", "episode as rrd", "rollout as mcap and rrd", "inspect", "overlay", "curate", "exact masks")
+SLOW = ("episode as mcap", "episode as rrd", "rollout as mcap and rrd", "inspect", "curate", "exact masks")
 
 OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
     "side by side": lambda r, out: write_side_by_side(
         out / "a.mp4", {"true": r.videos["head"], "again": r.videos["head"]}, FPS, tile_height=96
     ),
-    "overlay": lambda r, out: write_overlay_video(out / "a.mp4", r.videos, r.tracks_of_episode, FPS),
     "episode as mcap": read_mcap,
     "episode as rrd": lambda r, out: export(r.set, out, ["rrd"]),
     "episode as lerobot": lambda r, out: export(r.set, out, ["lerobot"]),

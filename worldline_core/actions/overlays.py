@@ -1,4 +1,4 @@
-"""Overlays: action tracks drawn over frames, of one view or of all views together, with a legend.
+"""Overlays: action tracks drawn over frames, of one view or as a sheet of all views, with a legend.
 
 Every picture of the project in which controls are drawn over a frame is drawn here: previews of `render_actions`, the report,
 `worldline inspect`, Rerun layers and the pictures of `worldline calibrate check`.
@@ -15,10 +15,8 @@ numbers (`geometry.cameras`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -30,8 +28,6 @@ from worldline_core.actions.action_maps import grid_sigma
 from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.robot_masks import project_capsules
-from worldline_core.data.video.encoder import encode_video
-from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import Resize
 from worldline_core.geometry.transforms import rotation_from_rot6d
@@ -39,8 +35,6 @@ from worldline_core.pages.page import words
 from worldline_core.pictures import (
     INK,
     PAPER,
-    STRIP_INK,
-    STRIP_PAPER,
     Colour,
     Picture,
     SheetRow,
@@ -48,10 +42,8 @@ from worldline_core.pictures import (
     font,
     scale_frames,
     scaled_size,
-    side_by_side,
     text_width_px,
 )
-from worldline_core.store.atomic import atomic_path
 
 ARM_COLOURS: dict[str, Colour] = {"left": (255, 150, 20), "right": (40, 150, 255)}
 """RGB. Orange and blue differ for every kind of colour vision."""
@@ -252,35 +244,21 @@ def heat_layer(
     return np.clip(shown, 0, 255).astype(np.uint8)
 
 
-def legend_strip(
-    arms: Sequence[str],
-    width: int,
-    *,
-    note: str = "",
-    outline: bool = False,
-    ink: Colour = INK,
-    paper: Colour = PAPER,
-) -> Picture:
-    """A strip that says what is drawn: arms, axes, ring, outline; and a note (a frame number) at its right end.
-
-    What does not fit the width is left out from the end, the note never.
-    """
-    strip = Image.new("RGB", (width, LEGEND_HEIGHT_PX), paper)
+def legend_strip(arms: Sequence[str], width: int, *, outline: bool = False) -> Picture:
+    """A strip that says what is drawn: arms, axes, ring, outline. Entries that do not fit the width are left out from the end."""
+    strip = Image.new("RGB", (width, LEGEND_HEIGHT_PX), PAPER)
     draw = ImageDraw.Draw(strip)
     middle, x = LEGEND_HEIGHT_PX / 2, 8.0
-    end = width - 8 - (text_width_px(note, LEGEND_TEXT_PX) if note else 0)
-    if note:
-        draw.text((end, middle), note, font=font(LEGEND_TEXT_PX), fill=ink, anchor="lm")
     marks: list[tuple[str, int, Colour]] = []
     items = [(f"{arm} tool", arm_colour(arms, index), "dot") for index, arm in enumerate(arms)]
     items += [(name, colour, "line") for name, colour in zip(AXIS_NAMES, AXIS_COLOURS, strict=True)]
-    items += [("wide ring: gripper open", ink, "ring")]
+    items += [("wide ring: gripper open", INK, "ring")]
     items += [("where the arms should be", OUTLINE_COLOUR, "outline")] if outline else []
     for text, colour, mark in items:
         needed = 20 + text_width_px(text, LEGEND_TEXT_PX) + 14
-        if x + needed > end:
+        if x + needed > width - 8:
             break
-        draw.text((x + 20, middle), text, font=font(LEGEND_TEXT_PX), fill=ink, anchor="lm")
+        draw.text((x + 20, middle), text, font=font(LEGEND_TEXT_PX), fill=INK, anchor="lm")
         marks.append((mark, round(x), colour))
         x += needed
     picture = np.array(strip, dtype=np.uint8)
@@ -293,71 +271,6 @@ def legend_strip(
         else:
             cv2.circle(picture, (left + 7, centre), 6, colour, -1 if mark == "dot" else 2, cv2.LINE_AA)
     return picture
-
-
-def overlay_clip(
-    frames: Mapping[str, Frames],
-    tracks: EpisodeTracks,
-    fps: float,
-    *,
-    style: OverlayStyle = DEFAULT_STYLE,
-    title: str = "",
-) -> Iterator[Picture]:
-    """All views side by side, from the first frame on, as long as every view and the tracks have frames.
-
-    Args:
-        frames: by view, `n h w 3` RGB; views that are missing are left out.
-        title: shown with the name of the first view.
-
-    Returns: pictures (H, W, 3) one after the other, H and W even.
-
-    Raises:
-        DataError: the tracks have none of these views.
-    """
-    columns: dict[str, Frames] = {}
-    for view in [view for view in tracks.views if view in frames]:
-        images = frames[view]
-        shape = min(len(images), tracks.num_frames), *scaled_size(images.shape[1], images.shape[2], TILE_HEIGHT), 3
-
-        def draw(images: Frames = images, view: str = view, count: int = shape[0]) -> Iterator[Picture]:
-            for n, frame in enumerate(islice(images, count)):
-                yield draw_overlay(frame, tracks, n, view, style=style)
-
-        label = words(view) + (f"  ·  {title}" if title and not columns else "")
-        columns[label] = MadeFrames(draw, shape, np.uint8)
-    if not columns:
-        raise DataError(
-            "No view to draw",
-            where=f"episode {tracks.episode_id}",
-            expected=", ".join(tracks.views),
-            got=", ".join(frames) or "no frames",
-        )
-    return _with_legend(side_by_side(columns), tracks, fps, style)
-
-
-def _with_legend(rows: Iterator[Picture], tracks: EpisodeTracks, fps: float, style: OverlayStyle) -> Iterator[Picture]:
-    for n, row in enumerate(rows):
-        legend = legend_strip(
-            tracks.arms, row.shape[1], note=f"frame {n}  ·  {n / fps:.2f} s", outline=style.outline, ink=STRIP_INK,
-            paper=STRIP_PAPER,
-        )  # fmt: skip
-        whole = np.concatenate([row, legend], axis=0)
-        yield np.ascontiguousarray(whole[: whole.shape[0] // 2 * 2, : whole.shape[1] // 2 * 2])
-
-
-def write_overlay_video(
-    path: Path,
-    frames: Mapping[str, Frames],
-    tracks: EpisodeTracks,
-    fps: float,
-    *,
-    style: OverlayStyle = DEFAULT_STYLE,
-    title: str = "",
-) -> None:
-    """Writes `overlay_clip` as an mp4 that browsers play, atomically; the bytes depend on the arguments alone."""
-    clip = overlay_clip(frames, tracks, fps, style=style, title=title)
-    with atomic_path(path) as temporary:
-        encode_video(temporary, clip, fps, crf=20, preset="veryfast")
 
 
 def overlay_sheet(
