@@ -266,7 +266,7 @@ def write_side_by_side(
             yield frame
 
     with atomic_path(path) as temporary:
-        encode_video(temporary, watched(), fps, crf=20, preset="veryfast")
+        encode_video(temporary, watched(), fps, crf=20)
     poster = path.with_suffix(".jpg")
     write_bytes_atomic(poster, jpeg_bytes(shown[0]))
     return WrittenVideo(path, poster, width=shown[0].shape[1], height=shown[0].shape[0], num_frames=count)

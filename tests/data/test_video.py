@@ -319,7 +319,14 @@ def test_bytes_do_not_depend_on_the_processor(tmp_path: Path, monkeypatch: pytes
     for parameters in (X264_PARAMETERS, X264_PARAMETERS + ":asm=0"):
         monkeypatch.setattr("worldline_core.data.video.encoder.X264_PARAMETERS", parameters)
         for pixel_format in ("yuv420p", "yuv444p"):
-            encode_video(tmp_path / f"{pixel_format}{len(parameters)}.mp4", scene, 8, crf=8, pixel_format=pixel_format)
+            encode_video(
+                tmp_path / f"{pixel_format}{len(parameters)}.mp4",
+                scene,
+                8,
+                crf=8,
+                preset="slow",
+                pixel_format=pixel_format,
+            )
     assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 2
 
 

@@ -70,7 +70,7 @@ def _write(root, cases, *, split, bank, sources=None, training=0, late=()):
     methods = {"good": root / "good", "copy": root / "copy"}
     writers = {name: RolloutSetWriter(path, name, FPS) for name, path in methods.items()}
     index = []
-    with EpisodeSetWriter(episodes, pixel_format="yuv444p") as writer:
+    with EpisodeSetWriter(episodes, video_preset="slow", pixel_format="yuv444p") as writer:
         learned = {f"train-{number:02d}": bool(number % 2) for number in range(training)}
         for number, (episode_id, success) in enumerate({**cases, **learned}.items()):
             frames, masks, points = make_film(success, seed=0 if bank else number)

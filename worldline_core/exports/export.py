@@ -49,7 +49,7 @@ FORMATS = {
     "RolloutSet": ("mp4", "rrd", *MCAP_FORMATS, "worldarena", "worldarena-archive"),
     "Checkpoint": ("model", "diffusers"),
 }
-_CRF, _PRESET = 10, "veryfast"
+_CRF = 10
 """For rows that are encoded again because they do not begin at a key frame; others are copied."""
 
 
@@ -161,7 +161,7 @@ def shown_tracks(episode: Episode) -> EpisodeTracks:
 def _export_lerobot(episodes: EpisodeSet, output: Path, positions: Sequence[int]) -> Path:
     """Write rows of a set as a self-contained set; videos are copied where a row begins at a key frame."""
     pixel_format = _pixel_format(episodes, positions)
-    with EpisodeSetWriter(output, video_crf=_CRF, video_preset=_PRESET, pixel_format=pixel_format) as writer:
+    with EpisodeSetWriter(output, video_crf=_CRF, pixel_format=pixel_format) as writer:
         for position in positions:
             row = episodes.rows[position]
             if writer.has(row.episode_id):
@@ -346,7 +346,7 @@ def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequenc
         frames = VideoFrames(episodes.clip(position, HEAD), stride)
         with atomic_path(true) as temporary:
             shown = islice(frames, clip.num_frames)
-            encode_video(temporary, shown, rollouts.fps, crf=8, preset="veryfast", pixel_format="yuv444p")
+            encode_video(temporary, shown, rollouts.fps, crf=8, pixel_format="yuv444p")
         write_bytes_atomic(first, png_bytes(frames[[0]][0]))
         written += [predicted, true, first]
         summary.append({"gt_path": f"{true.resolve()}", "image": f"{first.resolve()}", "prompt": [row.instruction]})
@@ -403,7 +403,7 @@ def export_worldarena_archive(
         videos[path] = _archived_clip(rollouts, episodes, name, driven_by_policy=bool(task))
     for path, clip in videos.items():
         with atomic_path(path) as temporary:
-            encode_video(temporary, VideoFrames(clip), _ARCHIVE_FPS, crf=8, preset="veryfast", pixel_format="yuv420p")
+            encode_video(temporary, VideoFrames(clip), _ARCHIVE_FPS, crf=8, pixel_format="yuv420p")
     about = root / "model_README.md"
     if not about.exists():
         lines = {

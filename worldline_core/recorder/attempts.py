@@ -33,7 +33,6 @@ from worldline_core.recorder.record import (
     RecordConfig,
     check_recorded,
     record,
-    recording_writer,
     run_in_processes,
 )
 from worldline_core.recorder.rendering import prepare_rendering
@@ -198,7 +197,7 @@ def _record_start(
     recorder = EpisodeRecorder(start.embodiment, contact=start.family in CONTACT)
     layout, motions = config.draw(recorder, start)
     finished = EpisodeSetWriter.finished(output)
-    writer = None if finished else recording_writer(output, config.video_crf)
+    writer = None if finished else EpisodeSetWriter(output, video_crf=config.video_crf)
     masked = not sealed or config.masks
     for number, (name, motion) in enumerate(motions.items()):
         episode_id = f"{start.name}-{name}"
@@ -325,7 +324,7 @@ def record_into(config: RecordingConfig, output: Path) -> dict[str, Any]:
         remove_unfinished(output)
         counts = config.record(output)
         environment = describe_environment()
-        environment["packages"]["mujoco"] = importlib.metadata.version("mujoco")
+        packages = {**environment["packages"], "mujoco": importlib.metadata.version("mujoco")}
         facts = {"step": "record", "version": 1, "config": config.model_dump(mode="json"), "metrics": counts}
-        write_manifest(output, {**facts, "environment": environment})
+        write_manifest(output, {**facts, "environment": {**environment, "packages": packages}})
         return counts

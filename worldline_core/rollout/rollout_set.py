@@ -79,7 +79,7 @@ class RolloutSetWriter:
         """
         # Full chroma and a low factor: metrics should see the prediction, not the codec.
         # Predictions are many and small: a slower search of x264 would cost more than sampling them in one step.
-        encoding = Encoding(self.crf, "veryfast", "yuv444p")
+        encoding = Encoding(self.crf, pixel_format="yuv444p")
         with ExitStack() as stack:
             encoders: dict[str, VideoEncoder] = {}
             for view in views:

@@ -497,7 +497,7 @@ def save_played(
         cameras=cameras, state_names=embodiment.state_names, primary_view=next(iter(frames)),
         conventions={"pictures": "predicted", "started_at": recorded.episode_id, **notes},
     )  # fmt: skip
-    with EpisodeSetWriter(folder / name, pixel_format="yuv444p", video_preset="veryfast") as writer:
+    with EpisodeSetWriter(folder / name, pixel_format="yuv444p") as writer:
         views = {view: ViewImages(pictures.__iter__, len(pictures)) for view, pictures in frames.items()}
         writer.add(episode, views)
     return folder / name

@@ -142,7 +142,7 @@ class EpisodeSetWriter:
         self,
         root: Path,
         video_crf: int = 18,
-        video_preset: str = "slow",
+        video_preset: str = "veryfast",
         pixel_format: PixelFormat = "yuv420p",
         video_mode: VideoMode = "auto",
         key_frame_interval: int = VideoSettings.key_frame_interval,

@@ -160,12 +160,12 @@ class Encoding:
 
     Attributes:
         crf: quality, 0 (exact up to the colour conversion) .. 51; 18 is visually exact, 28 small.
-        preset: of x264.
+        preset: of x264; at 128 x 192, slow saves 3 % of the bytes and takes 2.6 times as long as veryfast.
         key_frame_interval: frames from one key frame to the next at most.
     """
 
     crf: int = 18
-    preset: str = "slow"
+    preset: str = "veryfast"
     pixel_format: PixelFormat = "yuv420p"
     key_frame_interval: int = 250
 
@@ -262,7 +262,7 @@ def encode_video(
     fps: float,
     *,
     crf: int = 18,
-    preset: str = "slow",
+    preset: str = "veryfast",
     pixel_format: PixelFormat = "yuv420p",
 ) -> None:
     """Write frames as an mp4 whose bytes depend on the arguments and the codec alone.
