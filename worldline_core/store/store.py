@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import functools
 import importlib.metadata
 import logging
 import os
@@ -430,8 +431,11 @@ def _weights_digests(places: Mapping[str, Path | None], cache: Path) -> dict[str
     return digests
 
 
+@functools.cache
 def describe_environment() -> dict[str, Any]:
-    """Versions, device and commit: what a result depends on besides its config and inputs."""
+    """Versions, device and commit: what a result depends on besides its config and inputs. Looked up once: a process goes on
+    with the code that it began with.
+    """
     versions = {}
     for package in _VERSIONED_PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):
