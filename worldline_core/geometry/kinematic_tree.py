@@ -114,9 +114,13 @@ def _check_size[T](root: T, children: Callable[[T], Iterable[T]], where: object)
     level, bodies, depth = [root], 1, 1
     while level := [child for element in level for child in children(element)]:
         bodies, depth = bodies + len(level), depth + 1
-        if bodies > MAX_BODIES or depth > MAX_DEPTH:
-            limit = f"at most {MAX_BODIES:,} bodies, {MAX_DEPTH} below each other"
-            raise DataError("Kinematic description is too large", where=where, expected=limit, got=(bodies, depth))
+        _require_size(bodies, depth, where)
+
+
+def _require_size(bodies: int, depth: int, where: object) -> None:
+    if bodies > MAX_BODIES or depth > MAX_DEPTH:
+        limit = f"at most {MAX_BODIES:,} bodies, {MAX_DEPTH} below each other"
+        raise DataError("Kinematic description is too large", where=where, expected=limit, got=(bodies, depth))
 
 
 def _check_names(tree: TreeBody, where: object) -> None:
@@ -314,7 +318,9 @@ def read_urdf(text: str, where: object) -> TreeBody:
         raise DataError("Not a URDF file", where=where, expected="<robot> with links and joints", got=f"<{robot.tag}>")
     _check_expanded(robot, where)
     bodies: dict[str, TreeBody] = {}
-    for link in robot.findall("link"):
+    links = robot.findall("link")
+    _require_size(len(links), 1, where)
+    for link in links:
         name = link.get("name", "")
         if not name or name in bodies:
             raise DataError("A link without a name, or named twice", where=where, got=name)
