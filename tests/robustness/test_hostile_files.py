@@ -22,7 +22,6 @@ from tests.robustness.conftest import rejected  # pyright: ignore[reportMissingI
 from tools.corrupted.attacks import ATTACKS, Attack, ending, jpeg_of_scans
 from worldline_core.data.episodes.source import GripperRange
 from worldline_core.data.guards.plain_files import (
-    column_names,
     decode_image,
     image_size,
     read_image,
@@ -122,7 +121,7 @@ def test_tables_come_whole_or_by_column(tmp_path: Path) -> None:
     pq.write_table(table, tmp_path / "t.parquet", row_group_size=2)
     assert read_table(tmp_path / "t.parquet").equals(table)
     assert read_table(tmp_path / "t.parquet", ["d", "a"]).select(["d", "a"]).equals(table.select(["d", "a"]))
-    assert column_names(tmp_path / "t.parquet") == ["a", "b", "c", "d"]
+    assert read_table(tmp_path / "t.parquet", lambda names: names[1:3]).column_names == ["b", "c"]
     with rejected("missing_column", r"t\.parquet"):
         read_table(tmp_path / "t.parquet", ["a", "e"])
 

@@ -11,7 +11,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
@@ -82,8 +82,8 @@ def read_json_lines(path: Path) -> list[JsonObject]:
     return rows
 
 
-def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table | None:
-    """A Parquet table, or some of its columns; None for an absent file.
+def read_table(path: Path) -> pa.Table | None:
+    """A Parquet table; None for an absent file.
 
     Raises:
         ArtifactError: the file cannot be read.
@@ -94,7 +94,8 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table | N
     if not path.is_file():
         return None
     try:
-        return pq.read_table(path, columns=None if columns is None else list(columns))
+        with pq.ParquetFile(path) as file:  # a third of what `pq.read_table` takes for a small table
+            return file.read(use_threads=False)
     except (pa.ArrowInvalid, OSError) as error:
         raise ArtifactError(
             "A Parquet file is damaged", where=path, got=str(error), next_step="rebuild the artifact"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -199,8 +199,13 @@ def read_npy(path: AnyPath, shape: Sequence[int | None]) -> np.ndarray:
 _PARQUET_FAULTS = (pa.ArrowException, OSError, ValueError, TypeError, OverflowError)
 
 
-def read_table(path: AnyPath, columns: Sequence[str] | None = None) -> pa.Table:
+def read_table(
+    path: AnyPath, columns: Sequence[str] | Callable[[Sequence[str]], Sequence[str]] | None = None
+) -> pa.Table:
     """Table of a Parquet file.
+
+    Args:
+        columns: their names, or what chooses some of the names of all.
 
     Raises: RejectedInputError: missing_file, special_file, missing_column (the message names it), out_of_memory, unreadable.
     """
@@ -208,7 +213,8 @@ def read_table(path: AnyPath, columns: Sequence[str] | None = None) -> pa.Table:
     # No memory map: if the file is truncated meanwhile, a map ends in a signal instead of an error.
     with unreadable("Parquet file cannot be read", path, _PARQUET_FAULTS), pq.ParquetFile(local) as file:
         names = file.schema_arrow.names
-        missing = [column for column in columns or () if column not in names]
+        wanted = columns(names) if callable(columns) else names if columns is None else columns
+        missing = [column for column in wanted if column not in names]
         if missing:
             raise RejectedInputError(
                 "missing_column",
@@ -217,17 +223,7 @@ def read_table(path: AnyPath, columns: Sequence[str] | None = None) -> pa.Table:
                 expected=", ".join(missing),
                 got="columns " + ", ".join(names),
             )
-        return file.read(columns=None if columns is None else list(columns), use_threads=False)
-
-
-def column_names(path: AnyPath) -> list[str]:
-    """Names of a Parquet file's columns, from its footer.
-
-    Raises: RejectedInputError: missing_file, special_file, unreadable.
-    """
-    local = regular_file(path)
-    with unreadable("Parquet file cannot be read", path, _PARQUET_FAULTS):
-        return list(pq.read_schema(local, memory_map=False).names)
+        return file.read(columns=None if columns is None else list(wanted), use_threads=False)
 
 
 _END_MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}

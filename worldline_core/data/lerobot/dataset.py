@@ -22,7 +22,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from worldline_core.config import FrameRate
 from worldline_core.data.guards.plain_files import (
-    column_names,
     decode_image,
     image_size,
     read_json,
@@ -339,8 +338,7 @@ class LeRobotV3Dataset(LeRobotDataset):
         files = find_files(folder, "*/*.parquet")
         if not files:
             raise DataError("Dataset lists no episodes", where=str(folder), expected="chunk-*/file-*.parquet")
-        wanted = [[name for name in column_names(file) if not name.startswith("stats/")] for file in files]
-        tables = [read_table(file, names) for file, names in zip(files, wanted, strict=True)]
+        tables = [read_table(file, lambda names: [n for n in names if not n.startswith("stats/")]) for file in files]
         try:
             return EpisodeTable(pa.concat_tables(tables, promote_options="default"), folder)
         except pa.ArrowException as error:
@@ -349,10 +347,9 @@ class LeRobotV3Dataset(LeRobotDataset):
     @cached_property
     def tasks(self) -> dict[int, str]:
         path = self.root / "meta" / "tasks.parquet"
-        label = "task" if "task" in column_names(path) else "__index_level_0__"
-        table = read_table(path, ["task_index", label])
+        table = read_table(path, lambda names: ["task_index", "task" if "task" in names else "__index_level_0__"])
         try:
-            texts = ["" if text is None else str(text) for text in table[label].to_pylist()]
+            texts = ["" if text is None else str(text) for text in table.drop_columns("task_index")[0].to_pylist()]
         except UnicodeDecodeError as error:  # Parquet declares UTF-8 and checks nothing
             raise DataError("Task list holds text that is no UTF-8", where=str(path), got=str(error)) from error
         return dict(zip(table["task_index"].to_pylist(), texts, strict=True))
@@ -438,8 +435,8 @@ class LeRobotV3Dataset(LeRobotDataset):
         found: dict[int, AnyPath] = {}
         for listed in find_files(self.root / "data", "*/*.parquet"):
             path = inside(self.root, str(relative_name(listed, self.root)))
-            if INDEX in column_names(path):
-                for number in pc.unique(read_table(path, [INDEX])[INDEX]).to_pylist():  # pyright: ignore[reportAttributeAccessIssue]
+            for column in read_table(path, lambda names: [INDEX] if INDEX in names else []).columns:
+                for number in pc.unique(column).to_pylist():  # pyright: ignore[reportAttributeAccessIssue]
                     found.setdefault(number, path)
         return found
 
@@ -563,10 +560,9 @@ class LeRobotV21Dataset(LeRobotDataset):
         path = self._episode_path(self.info.data_path, episode_index)
         length = self._number(self.row(episode_index), "length")
         if self._checked != episode_index:
-            present = [column for column in (INDEX, "frame_index") if column in column_names(path)]
-            numbering = read_table(path, present)
+            numbering = read_table(path, lambda names: [name for name in (INDEX, "frame_index") if name in names])
             check_length("Data file", path, states=length, unit="rows", found=len(numbering))
-            if INDEX in present and (numbering[INDEX].to_numpy() != episode_index).any():
+            if INDEX in numbering.column_names and (numbering[INDEX].to_numpy() != episode_index).any():
                 others = pc.unique(numbering[INDEX]).to_pylist()  # pyright: ignore[reportAttributeAccessIssue]
                 raise _contradiction(path, f"{INDEX} {episode_index}", f"{INDEX} {', '.join(map(str, others[:5]))}")
             _check_numbering(numbering, path, frame_index=0)
