@@ -112,13 +112,14 @@ def test_video_metrics_prefer_the_right_videos(evaluated):
 
 
 def test_videos_are_compared_with_videos_without_action_tracks(recordings, evaluated, tmp_path):
-    """Plain mp4s beside plain mp4s: full-frame metrics need no states, cameras or segmenter."""
+    """Plain mp4s beside plain mp4s: full frames, and what moves most, need no states, cameras or segmenter."""
     inputs = {name: path for name, path in recordings.inputs.items() if name not in ("tracks", "segmenter")}
     config = VideoEvaluationConfig(resamples=100, metrics=("hsd", "scene_consistency"))
     found, means = measure(inputs, tmp_path, config)
-    assert {name.partition("@")[0] for name in means["good"]} == {"psnr", "ssim", "sharpness"}
+    assert {name.partition("@")[0] for name in means["good"]} == {"psnr", "ssim", "sharpness", "end_effector_error_px"}
+    assert means["good"]["end_effector_error_px"]["mean"] < 1 < means["copy"]["end_effector_error_px"]["mean"]
     assert means["good"]["psnr"] == summary_of(evaluated)["metrics"]["test"]["good"]["psnr"]
-    for name in ("robot_iou", "end_effector_error_px", "hsd", "scene_consistency"):
+    for name in ("robot_iou", "hsd", "scene_consistency"):
         assert "have no action tracks" in found["unavailable"][name]
 
 

@@ -9,13 +9,14 @@ import torch
 from tests.training import conftest
 from tests.training.conftest import FRAME_INPUT, TINY_MODEL, VIEWS
 from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.actions.tool_error import moving_part
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError, TrainingError
 from worldline_core.model.checkpoint import read_checkpoint_info
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.training.action_following import ActionFollowing, Place, _error, _moving_part
+from worldline_core.training.action_following import ActionFollowing, Place, _error
 from worldline_core.training.clip_config import FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import Clip
@@ -105,7 +106,7 @@ def test_still_edges_around_a_small_robot_do_not_hide_that_it_moved():
     for picture, u in ((first, 36), (later, 46)):
         picture[24:32, u : u + 6] = (110, 90, 0)
         picture[26:30, u + 2 : u + 4] = 10
-    points = _moving_part(first, later, behind)
+    points = moving_part(first, later, behind)
     assert np.abs(points[0] - (48.5, 27.5)).max() <= 3
     place = Place(Clip("a", 0, 9, 1), points, behind)
     assert (_error(later, later, place), _error(later, first, place)) == (0.0, 10.0)

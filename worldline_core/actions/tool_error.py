@@ -6,6 +6,9 @@ best (normalised correlation) is searched within a radius. The distance from tha
 error [px of the recording's frame]. A gripper that correlates with nothing within reach counts with the search radius.
 True videos score 0 by construction; a video in which the robot does not move scores about the distance it should have
 moved, at most the radius.
+
+Where no camera is known, the part of the picture that has moved most stands for the tool, and frames are compared by what differs from
+the recording's background: still edges around a small robot would be found where they always are.
 """
 
 from __future__ import annotations
@@ -17,15 +20,21 @@ PATCH_FRACTION = 0.15  # half side of the patch, of the frame height: the grippe
 MIN_CONTRAST = 8.0  # standard deviation of a patch [grey levels]; flatter ones fit everywhere and say nothing
 SEARCH_FRACTION = 0.25  # search radius, of the frame height
 MIN_CORRELATION = 0.4
+LEAST_CHANGE = 8.0  # blurred change that is motion [grey levels]
 
 
-def end_effector_error(true: np.ndarray, predicted: np.ndarray, points: np.ndarray) -> np.ndarray:
+def end_effector_error(
+    true: np.ndarray, predicted: np.ndarray, points: np.ndarray, background: np.ndarray | None = None
+) -> np.ndarray:
     """Error of each frame and point (n, p) float64 [px]; NaN where a point is invalid or its patch leaves the frame.
 
     Args:
-        true, predicted: uint8 or float32 (n, h, w, 3), same size.
+        true, predicted: uint8 (n, h, w, 3), same size.
         points: (n, p, 2) projected tool centres u, v [px]; NaN where invalid.
+        background: float32 (h, w, 3) that is taken from both.
     """
+    if background is not None:
+        true, predicted = true - background, predicted - background
     height, width = true.shape[1:3]
     half = max(2, round(PATCH_FRACTION * height))
     radius = max(2, round(SEARCH_FRACTION * height))
@@ -45,3 +54,22 @@ def end_effector_error(true: np.ndarray, predicted: np.ndarray, points: np.ndarr
         found = correlation[row, column] >= MIN_CORRELATION
         errors[frame, arm] = min(distance, radius) if found else radius
     return errors
+
+
+def moving_part(first: np.ndarray, later: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """(1, 2) the place u, v of the later picture that has changed most and is no background; NaN where hardly anything has."""
+    height, width = later.shape[:2]
+    half = max(2, round(PATCH_FRACTION * height))
+
+    def blurred(values: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(values, (0, 0), half / 2)[half : height - half, half : width - half]
+
+    apart = later - background
+    change = blurred(np.minimum(np.abs(later.astype(np.float32) - first), np.abs(apart)).max(axis=-1))
+    grey = apart.mean(axis=-1)
+    contrast = np.sqrt(np.maximum(blurred(grey**2) - blurred(grey) ** 2, 0))
+    likely = np.where((change >= LEAST_CHANGE) & (contrast >= MIN_CONTRAST), change * contrast, 0)
+    if not likely.any():
+        return np.full((1, 2), np.nan)
+    row, column = np.unravel_index(int(np.argmax(likely)), likely.shape)
+    return np.array([[column + half, row + half]], dtype=np.float64)

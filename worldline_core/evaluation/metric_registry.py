@@ -111,7 +111,7 @@ _METRICS = (
     ),
     Metric(
         "end_effector_error_px", "Tool error",
-        "How far from the true place the picture around a tool is found in the predicted frame.",
+        "How far from the true place the picture around a tool is found in the predicted frame; without a camera, around what has moved most.",
         "this project", perfect=0.0, margin=0.1, digits=2, unit="px", lower_is_better=True,
     ),
     Metric(

@@ -16,13 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.actions.tool_error import MIN_CONTRAST, PATCH_FRACTION, end_effector_error
+from worldline_core.actions.tool_error import PATCH_FRACTION, end_effector_error, moving_part
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError, TrainingError
 from worldline_core.model.tokenizers import (
@@ -43,8 +42,6 @@ logger = logging.getLogger(__name__)
 SEED = 30_000
 LEAST_MOTION = 0.05
 """Way of a tool in that second, of the frame's height, from which a clip can tell predictions apart."""
-LEAST_CHANGE = 8.0
-"""Blurred change of a picture that is motion [grey levels]."""
 BACKGROUND_FRAMES = 15
 """Frames of a recording whose median is its background."""
 LEAST_CLIPS = 4
@@ -158,7 +155,7 @@ class ActionFollowing:
             background = self._background(clips[0].episode_id, view) if clips else np.zeros(0)
             pictures = [self._recorded(clip, view, (0, self.frame)) for clip in clips]
             return [
-                Place(clip, _moving_part(first, later, background), background)
+                Place(clip, moving_part(first, later, background), background)
                 for clip, (first, later) in zip(clips, pictures, strict=True)
             ]
         column, scale = (
@@ -282,29 +279,8 @@ def _inside(points: np.ndarray, height: int, width: int) -> np.ndarray:
     return (u >= half) & (u <= width - half - 1) & (v >= half) & (v <= height - half - 1)
 
 
-def _moving_part(first: np.ndarray, later: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """(1, 2) the place u, v of the later picture that has changed most and is no background; NaN where hardly anything has."""
-    height, width = later.shape[:2]
-    half = max(2, round(PATCH_FRACTION * height))
-
-    def blurred(values: np.ndarray) -> np.ndarray:
-        return cv2.GaussianBlur(values, (0, 0), half / 2)[half : height - half, half : width - half]
-
-    apart = later - background
-    change = blurred(np.minimum(np.abs(later.astype(np.float32) - first), np.abs(apart)).max(axis=-1))
-    grey = apart.mean(axis=-1)
-    contrast = np.sqrt(np.maximum(blurred(grey**2) - blurred(grey) ** 2, 0))
-    likely = np.where((change >= LEAST_CHANGE) & (contrast >= MIN_CONTRAST), change * contrast, 0)
-    if not likely.any():
-        return np.full((1, 2), np.nan)
-    row, column = np.unravel_index(int(np.argmax(likely)), likely.shape)
-    return np.array([[column + half, row + half]], dtype=np.float64)
-
-
 def _error(true: np.ndarray, predicted: np.ndarray, place: Place) -> float | None:
-    if place.background is not None:
-        true, predicted = true - place.background, predicted - place.background
-    errors = end_effector_error(true[None], predicted[None], place.points[None])
+    errors = end_effector_error(true[None], predicted[None], place.points[None], place.background)
     return float(np.nanmean(errors)) if np.isfinite(errors).any() else None
 
 

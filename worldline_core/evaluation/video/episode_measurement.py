@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.actions.tool_error import end_effector_error
+from worldline_core.actions.tool_error import end_effector_error, moving_part
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -36,10 +36,13 @@ from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.evaluation.video.background import Background, invented_motion, sharpness
 from worldline_core.evaluation.video.metrics_on_request import SceneFrames, ToolFinder
 from worldline_core.model.lpips import LPIPS
+from worldline_core.pictures import evenly_spaced
 from worldline_core.rollout.rollout_set import RolloutSet
 
 PIECE_FRAMES = 32
 """Frames of a video in memory at once; no fewer than `own_colour` needs to find the colour of a thing."""
+BACKGROUND_FRAMES = 15
+"""Frames of a recording whose median is its background."""
 MOVED_IOU = 0.5
 """A thing counts as moved where the IoU of its mask with that of the first frame is below this."""
 FrameValues = dict[str, list[float | None]]
@@ -68,6 +71,23 @@ class _Piece:
     labels: tuple[np.ndarray, np.ndarray] | None
     background: Background | None
     begin: int
+
+
+@dataclass(frozen=True)
+class _MovingPart:
+    """A head view without a camera, in which the part that has moved most stands for the tool."""
+
+    first: np.ndarray
+    background: np.ndarray
+
+    @classmethod
+    def of(cls, recording: VideoFrames) -> _MovingPart:
+        frames = recording[evenly_spaced(len(recording), BACKGROUND_FRAMES)]
+        return cls(frames[0], np.median(frames, axis=0).astype(np.float32))
+
+    def errors(self, true: np.ndarray, predicted: np.ndarray) -> list[float | None]:
+        points = np.stack([moving_part(self.first, frame, self.background) for frame in true])
+        return [finite_mean(row) for row in end_effector_error(true, predicted, points, self.background)]
 
 
 class _Video:
@@ -106,7 +126,7 @@ class EpisodeMeasurement:
     """Measures predictions of one episode.
 
     Args:
-        tracks: None measures full frames alone, as of an episode without tracks.
+        tracks: None measures full frames and the part that moves, as of an episode without tracks.
         segmenters: by the suffix of their metrics.
         lpips: None where it is not available.
         metrics: metrics on request, by name.
@@ -197,6 +217,7 @@ class EpisodeMeasurement:
         known = None
         if view == HEAD and videos and self.tracks is not None:
             known = self._recorded_pieces(self.tracks, true, stride, longest)
+        moving = _MovingPart.of(recording) if view == HEAD and videos and self.tracks is None else None
         for begin in range(0, longest, PIECE_FRAMES):
             piece = None if known is None else next(known)
             frames = next(true.pieces)[: longest - begin] if piece is None else piece.frames
@@ -207,6 +228,8 @@ class EpisodeMeasurement:
                     self._add_full_frame(video, predicted, frames[: len(predicted)], where)
                     if piece is not None:
                         self._add_robot(video, predicted, piece)
+                    elif moving is not None:
+                        video.add(end_effector_error_px=moving.errors(frames[: len(predicted)], predicted))
         return videos, dict(true.values)
 
     def _recorded_pieces(self, tracks: ActionTracks, true: _Video, stride: int, count: int) -> Iterator[_Piece]:

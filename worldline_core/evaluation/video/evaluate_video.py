@@ -98,7 +98,7 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
     rows = rows_of(episodes, set().union(*predicted.values()))
     if without := sum(tracks is None or row.episode_id not in tracks for row in rows):
         missing = f"{without} of {len(rows)} recordings have no action tracks"
-        unavailable |= dict.fromkeys(("robot_iou", "end_effector_error_px", *metrics), missing)
+        unavailable |= dict.fromkeys(("robot_iou", *metrics), missing)
     records: list[Measured] = []
     with (
         _workers(on_gpu="sam3" in config.segmenters) as pool,
