@@ -18,7 +18,6 @@ from worldline_core.calibration.camera_errors import PARAMETERS, Equations, move
 from worldline_core.calibration.estimate import base_pose, estimate, wrist_camera
 from worldline_core.calibration.estimate.estimate import camera_file, estimate_views
 from worldline_core.calibration.estimate.estimate_report import estimate_text
-from worldline_core.calibration.estimate.mount_search import mounts_around
 from worldline_core.calibration.estimate.recordings import RecordedView, recorded_views
 from worldline_core.calibration.estimate.refine import FittedCamera, fit_still
 from worldline_core.calibration.estimate.still_camera import agreement, tools_apart
@@ -30,7 +29,7 @@ from worldline_core.calibration.estimate.verdict import (
     clearest_step,
     full_size,
 )
-from worldline_core.calibration.estimate.wrist_camera import WristCamera
+from worldline_core.calibration.estimate.wrist_camera import WristCamera, mounts_around
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras

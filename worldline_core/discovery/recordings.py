@@ -250,9 +250,7 @@ def discover_robomind(root: AnyPath) -> Discovery:
     return found
 
 
-def _ask_gripper(
-    found: Discovery, key: str, arms: Any, files: Sequence[AnyPath], track: str, width: int | None = None
-) -> None:
+def _ask_gripper(found: Discovery, key: str, arms: Any, files: Sequence[AnyPath], track: str) -> None:
     """Gripper readings of one track: known where the readings say so, asked otherwise."""
     values = []
     for i in _spread(files, _FILES):

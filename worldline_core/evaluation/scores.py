@@ -78,10 +78,8 @@ def bootstrap_mean(
     return Interval(float((sample * weight).sum() / weight.sum()), float(low), float(high), int(sample.size))
 
 
-def crossed_bootstrap(
-    by_seed: Sequence[Mapping[str, float]], *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
-) -> Interval:
-    """Mean over trainings of several seeds, each measured on the same trajectories, and its percentile interval.
+def crossed_bootstrap(by_seed: Sequence[Mapping[str, float]], *, resamples: int = 2000, seed: int = 0) -> Interval:
+    """Mean over trainings of several seeds, each measured on the same trajectories, and its percentile interval of 95 %.
 
     Seeds and trajectories (those that all seeds have) are both resampled: an interval over trajectories alone says nothing
     about another training, and the other way round.
@@ -92,8 +90,7 @@ def crossed_bootstrap(
     seeds = generator.integers(0, sample.shape[0], size=(resamples, sample.shape[0]))
     trajectories = generator.integers(0, sample.shape[1], size=(resamples, sample.shape[1]))
     means = [sample[np.ix_(rows, columns)].mean() for rows, columns in zip(seeds, trajectories, strict=True)]
-    tail = (1.0 - confidence) / 2.0
-    low, high = np.quantile(means, [tail, 1.0 - tail])
+    low, high = np.quantile(means, [0.025, 0.975])
     return Interval(float(sample.mean()), float(low), float(high), len(common))
 
 

@@ -31,7 +31,6 @@ class ArmIndices:
     """Indices of one arm's joints, fingers and tool in the compiled model; ``limits`` (J, 2) of the joints [rad]."""
 
     joint_names: tuple[str, ...]
-    finger_names: tuple[str, ...]
     qpos: np.ndarray
     dofs: np.ndarray
     actuators: np.ndarray
@@ -192,7 +191,6 @@ def _arm_indices(model: Any, prefix: str) -> ArmIndices:
     joints = tuple(name for name in names if name not in fingers)
     return ArmIndices(
         joint_names=joints,
-        finger_names=fingers,
         qpos=np.array([model.joint(name).qposadr[0] for name in joints]),
         dofs=np.array([model.joint(name).dofadr[0] for name in joints]),
         actuators=np.array([model.actuator(name).id for name in joints]),

@@ -292,17 +292,18 @@ def timed[T](work: Callable[[], T], device: str) -> tuple[T, Elapsed]:
 
 
 def long_rollout(
-    simulator: Callable[[], BlockCausalSimulator], first: Tensor, maps: Tensor, blocks: int, *, warm_up: int = 2
+    simulator: Callable[[], BlockCausalSimulator], first: Tensor, maps: Tensor, blocks: int
 ) -> dict[str, list[float]]:
     """Seconds of every block of one long rollout under constant controls; its frames are dropped.
 
+    Two blocks of another rollout before it are not counted.
+
     Args:
         first, maps: observed latents ``(b v c h w)`` and the action maps of a clip ``(b v a t h w)``.
-        warm_up: blocks of another rollout before it, which are not counted.
     """
     device = str(maps.device)
     times: list[Elapsed] = []
-    for count in (warm_up, blocks):
+    for count in (2, blocks):
         running = simulator()
         running.start(first, maps[:, :, :, :1])
         controls = maps[:, :, :, -running.spec.block_size :]

@@ -152,7 +152,7 @@ class VJepa2Teacher:
     mean = (0.485, 0.456, 0.406)
     std = (0.229, 0.224, 0.225)
 
-    def __init__(self, folder: Path, device: str = "cpu", dtype: torch.dtype | None = None) -> None:
+    def __init__(self, folder: Path, device: str = "cpu") -> None:
         from transformers import VJEPA2Model
 
         if not any(folder.glob("*.safetensors")):
@@ -162,7 +162,7 @@ class VJepa2Teacher:
                 expected="a transformers folder of facebook/vjepa2-vitg-fpc64-384 with model*.safetensors",
                 next_step="download it, use the small teacher, or set relational to null",
             )
-        self._hold(VJEPA2Model.from_pretrained(folder, local_files_only=True, dtype=dtype or torch.float32))
+        self._hold(VJEPA2Model.from_pretrained(folder, local_files_only=True, dtype=torch.float32))
         self.model.to(torch.device(device))  # pyright: ignore[reportArgumentType]
 
     @classmethod

@@ -147,9 +147,9 @@ def _blur_matrix(size: int, cells: float) -> Tensor:
     return weight / weight.sum(dim=1).max()
 
 
-def search_cameras(motion: MotionOfSteps, seed: int = 0) -> list[FoundCamera]:
+def search_cameras(motion: MotionOfSteps) -> list[FoundCamera]:
     """The best cameras that differ from each other, the best first: from a grid over the sphere, improved by random changes."""
-    chosen, random = motion.chosen(STEPS), np.random.default_rng(seed)
+    chosen, random = motion.chosen(STEPS), np.random.default_rng(0)
     focal, pose = _grid(chosen)
     found = _Scorer(chosen.first(ROUGH_STEPS), BLURS[0]).scores(focal, pose)
     for number, (blur, count, apart) in enumerate(zip(BLURS, KEPT, APART_DEG, strict=True)):

@@ -8,8 +8,9 @@ a still camera (`camera_errors.StillView`): they show where the tool is in the p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -24,7 +25,6 @@ from worldline_core.calibration.camera_errors import (
     WristView,
     covered_cells,
 )
-from worldline_core.calibration.estimate.mount_search import mounts_around
 from worldline_core.calibration.estimate.recordings import RecordedView, ViewOfEpisode, certainty
 from worldline_core.calibration.estimate.refine import LAG_PRIOR, FittedCamera, climb, inflation
 from worldline_core.calibration.estimate.still_camera import lag_by_amounts
@@ -35,6 +35,11 @@ from worldline_core.geometry.cameras import project_points
 from worldline_core.geometry.transforms import pose_from_rotation, rigid_inverse, rotation_angle
 from worldline_core.pictures import evenly_spaced
 
+BEHIND_M, BESIDE_M = (0.06, 0.14), (0.05, 0.1)
+"""Places of the camera: behind the tool along the hand's axis, and beside that axis."""
+TURNS, ROLLS = 8, 4
+LOOKS_AHEAD_M = 0.03
+"""It looks at a point this far ahead of the tool."""
 FRAMES_OF_SIGHT, HIDDEN_BEHIND_M, STILL_M = 6, 0.005, 1e-3
 """Frames in which it is looked at what the hand hides of itself, how far behind another point one is hidden, and the palm's motion."""
 AT_REST_M = 0.012
@@ -330,3 +335,32 @@ def _equations(
     return Equations(
         information + np.diag(weight), gradient + weight * towards, likelihood - float(weight @ towards**2) / 2
     )
+
+
+def mounts_around(hand: np.ndarray) -> Iterator[np.ndarray]:
+    """T_tool_camera (4, 4), axes of OpenCV, of cameras beside a hand of points (p, 3) in the tool's frame, which see the tool: starts
+    of the estimate where no description says where the camera is mounted.
+
+    The hand points from its middle to the tool, or along the tool's z axis where no point of it is known.
+    """
+    ahead = -hand.mean(axis=0) if len(hand) else np.array([0.0, 0.0, 1.0])
+    ahead /= np.linalg.norm(ahead)
+    across = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+    across /= np.linalg.norm(across)
+    plane = np.c_[across, np.cross(ahead, across)]
+    for behind, beside, turn, roll in product(BEHIND_M, BESIDE_M, range(TURNS), range(ROLLS)):
+        outward, down = (
+            plane @ (np.cos(angle), np.sin(angle))
+            for angle in (2 * np.pi * turn / TURNS, 2 * np.pi * (turn / TURNS + roll / ROLLS))
+        )
+        eye = beside * outward - behind * ahead
+        yield _facing(eye, LOOKS_AHEAD_M * ahead, down)
+
+
+def _facing(eye: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndarray:
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(down, z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3] = np.c_[x, np.cross(z, x), z, eye]
+    return pose
