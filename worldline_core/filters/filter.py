@@ -263,7 +263,8 @@ def filter_episodes(
     write_index(output, rows)
     fit = Counter(row.stage2_reason for row in rows)
     reasons = ", ".join(f"{reason} {count}" for reason, count in sorted((r, n) for r, n in fit.items() if r))
-    logger.info("fit for Stage II: %d of %d%s", fit[None], len(rows), reasons and f" ({reasons})")
+    uncalibrated = "; those without a camera take the commands themselves" if fit["missing_calibration"] else ""
+    logger.info("fit for Stage II: %d of %d%s%s", fit[None], len(rows), reasons and f" ({reasons})", uncalibrated)
     return {
         "found": len(episodes),
         "kept": len(kept),

@@ -139,8 +139,17 @@ def estimate_cameras(config: EstimateConfig, inputs: Mapping[str, Path], output:
     del inputs  # they are in the configuration, and in the cache key
     found = _estimate_source(episodes_of_sources([config.source], config.reader), config.description_paths, (), output)
     verdicts = {view.view: view.verdict for view in found.views}
-    for line in filter(None, (base_text(found), mount_line(found), *map(headline, found.views))):
+    said = [
+        line
+        for view in found.views
+        for line in (headline(view), *(f"{view.view}: not sure: {r}" for r in view.reasons))
+    ]
+    for line in filter(None, (base_text(found), mount_line(found), *said)):
         logger.info("%s", line)
+    if not found.sure:
+        logger.info(
+            "Views without a sure camera take the commands themselves; its page (index.html) shows what was found."
+        )
     return {"views": verdicts, "reasons": {view.view: list(view.reasons) for view in found.views if view.reasons}}
 
 
