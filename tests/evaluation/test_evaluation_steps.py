@@ -81,7 +81,7 @@ def test_a_segmenter_without_exact_masks_is_measured_first(recordings, tmp_path,
     monkeypatch.setattr(evaluate_video_module, "MIN_SEGMENTER_IOU", floor)
     tracks = ActionTracks.tracks
     monkeypatch.setattr(ActionTracks, "tracks", lambda self, i: replace(tracks(self, i), camera_motion=(camera,) * 3))
-    summary, means = measure(without_copy(recordings), tmp_path)
+    summary, means = measure(without_copy(recordings), tmp_path, views=("head",))
     frames = set(pq.read_table(tmp_path / "by_frame.parquet")["metric"].to_pylist())
     assert ("robot_iou_kinematic" in frames) == (camera == "static")
     assert ("robot_iou" in frames) == ("robot_iou" in means["good"]) == (reason is None)
@@ -342,7 +342,7 @@ def test_methods_are_compared_over_the_views_that_both_predicted(recordings, tmp
 def test_strided_predictions_are_compared_with_every_second_frame(recordings, tmp_path):
     inputs = {name: path for name, path in recordings.inputs.items() if not name.startswith("rollouts.")}
     inputs |= rewritten(recordings, tmp_path / "strided", lambda frames: frames[::2], fps=4.0)
-    good = measure(inputs, tmp_path / "out")[1]["strided"]
+    good = measure(inputs, tmp_path / "out", views=("head",))[1]["strided"]
     assert good["robot_iou_exact"]["mean"] > 0.8 and good["object_iou_exact"]["mean"] > 0.8
     assert good["end_effector_error_px"]["mean"] < 1
     by_frame = pq.read_table(tmp_path / "out" / "by_frame.parquet").to_pylist()
