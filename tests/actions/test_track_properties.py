@@ -18,7 +18,7 @@ from worldline_core.actions.episode_tracks import TrackBatch
 
 SEEDS = st.integers(0, 2**32 - 1)
 VALUES = ("uv", "depth", "rot6d", "gripper")
-any_scene = settings(max_examples=40, deadline=None, derandomize=True)
+any_scene = settings(max_examples=24, deadline=None, derandomize=True)
 DEVICES = [
     "cpu",
     pytest.param(
