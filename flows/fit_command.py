@@ -108,7 +108,7 @@ def check_card(config: PipelineConfig, file: Path, memory: str) -> None:
     if too_large := [row.title for row in sheet.rows() if not row.fits(sheet.bytes)]:
         raise ConfigError(
             "A training does not fit this card", where="--gpu", expected=memory, got=", ".join(too_large),
-            next_step=f"worldline plan --config {file} --fit --gpus 1 --memory {memory}",
+            next_step=f"worldline plan --config {file} --fit --gpus 1 --memory {sheet.bytes / 1e9:g}GB",
         )  # fmt: skip
 
 

@@ -22,40 +22,59 @@ def add_plan_command(commands: argparse._SubParsersAction[argparse.ArgumentParse
     )
     add_config_arguments(plan)
     plan.add_argument("--gpus", type=int, default=1, help="devices that share the trainings (default: 1)")
-    plan.add_argument("--card", metavar="NAME", help="RTX 4090, H100, ... (default: the preset's own)")
+    plan.add_argument(
+        "--card", metavar="NAME", help="RTX 4090, H100, ... (default: the preset's own, without --memory)"
+    )
     plan.add_argument("--memory", metavar="SIZE", help="memory of each (default: the card's)")
     plan.add_argument(
         "--fit",
         action="store_true",
-        help="propose the largest setting that fits, not larger than the preset's (a minute or more)",
+        help="propose the largest setting that fits, not larger than the preset's; without a preset, of the one made for"
+        " such a card (a minute or more)",
     )
     plan.set_defaults(run=_plan)
 
 
 def _plan(arguments: argparse.Namespace) -> None:
     from worldline_core.config import preset_path, validate
+    from worldline_core.pipeline.cards import card_memory, preset_for
 
-    preset = arguments.preset or (None if arguments.config else "demo")
+    preset, machine = arguments.preset, arguments.memory or arguments.card
+    if preset is None and arguments.config is None:
+        preset = preset_for(card_memory(machine)) if arguments.fit and machine else "demo"
     if preset is not None:
         preset_path(preset)  # answers before torch is imported
+    from worldline_core.pipeline.memory_estimate import Estimate
     from worldline_core.pipeline.pipeline_config import PipelineConfig
     from worldline_core.pipeline.size_sheet import SizeSheet
 
     def load(changes: Sequence[str] = ()) -> PipelineConfig:
         return PipelineConfig.load(preset, arguments.config, [*arguments.overrides, *changes])
 
-    config = load()
-    machine = {"devices": arguments.gpus, "memory": arguments.memory, "card": arguments.card or config.card}
-    sheet = validate(SizeSheet, {"config": config, "project": Path.cwd(), **machine}, where="worldline plan")
+    def sheet(config: PipelineConfig) -> SizeSheet:
+        card = arguments.card or (None if arguments.memory else config.card)
+        values = {"config": config, "project": Path.cwd(), "devices": arguments.gpus}
+        return validate(SizeSheet, {**values, "memory": arguments.memory, "card": card}, where="worldline plan")
+
+    config, rows = load(), None
     if arguments.fit:
         from worldline_core.pipeline.smaller import largest_fitting
 
-        changes = largest_fitting(load, lambda smaller: sheet.model_copy(update={"config": smaller}).fits())
-        print("what changes of the preset:", *([f"--set '{one}'" for one in changes] or ["nothing"]), sep="\n  ")
-        sheet = sheet.model_copy(update={"config": load(changes)})
-    rows, rollouts = sheet.rows_and_rollouts()
-    print(sheet.as_text(rows, rollouts))
-    raise SystemExit(0 if all(row.fits(sheet.bytes) for row in rows) else 1)
+        fitting: list[list[Estimate]] = []
+
+        def fits(smaller: PipelineConfig) -> bool:
+            found = sheet(smaller).fitting_rows()
+            fitting.extend([] if found is None else [found])
+            return found is not None
+
+        changes = largest_fitting(load, fits)
+        shown = [f"--set '{one}'" for one in changes] or ["nothing"]
+        print(f"what changes of {preset or arguments.config}:", *shown, sep="\n  ")
+        config, rows = load(changes), fitting[-1]  # of settings that fit the largest is tried last
+    planned = sheet(config)
+    rows, rollouts = planned.rows_and_rollouts(rows)
+    print(planned.as_text(rows, rollouts))
+    raise SystemExit(0 if all(row.fits(planned.bytes) for row in rows) else 1)
 
 
 def add_rehearse_command(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -219,7 +219,7 @@ def test_a_training_that_cannot_fit_its_card_is_refused_before_it_begins(world, 
 
 def test_what_does_not_fit_ends_with_status_one(capsys, monkeypatch):
     need = Estimate("stage II", 7, {"weights": 3e9, "activations": 1e9})
-    monkeypatch.setattr(SizeSheet, "rows_and_rollouts", lambda _: ([need], []))
+    monkeypatch.setattr(SizeSheet, "rows_and_rollouts", lambda *_: ([need], []))
     for option, named in (
         (["--gpus", "1", "--memory", "4GB"], "| stage II | 0.0 M | 4.0 | weights 3.0, activations 1.0 | no |"),
         (["--memory", "much"], "memory"), (["--gpus", "0"], "devices"),
@@ -227,6 +227,24 @@ def test_what_does_not_fit_ends_with_status_one(capsys, monkeypatch):
         with pytest.raises(SystemExit, match="1"):
             main(["plan", "--preset", "smoke", *option])
         assert named in "".join(capsys.readouterr())
+
+
+def test_memory_alone_names_its_preset_and_no_speed_of_another_card(capsys, monkeypatch):
+    need, tried = Estimate("stage II", 7, {"weights": 3e9}, operations=1e15, steps=1), []
+
+    def rows(sheet):
+        tried.append(sheet.config.train_stage2.clips.lengths)
+        return [need] if tried[-1] == (17,) else None
+
+    monkeypatch.setattr(SizeSheet, "fitting_rows", rows)
+    with pytest.raises(SystemExit, match="0"):
+        main(["plan", "--fit", "--memory", "24GB"])
+    printed = capsys.readouterr().out
+    assert "what changes of edge-24gb:" in printed
+    assert "--set 'train_stage2.clips.lengths=[17]'" in printed
+    assert "| stage II | 0.0 M | 3.0 | weights 3.0 | yes |" in printed
+    assert "hours |" not in printed
+    assert tried[0] == (33,)
 
 
 def test_distillation_from_frames_of_another_size_than_stage2s_is_refused():

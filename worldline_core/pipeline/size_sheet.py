@@ -114,24 +114,32 @@ class SizeSheet(StrictModel):
                 progress.advance()
         return [made[number] for number in sorted(made)]
 
-    def rows_and_rollouts(self) -> tuple[list[Estimate], list[BlockCost]]:
-        """The same, and blocks of the distilled model in one view and in all; none where nothing is distilled."""
+    def rows_and_rollouts(self, rows: list[Estimate] | None = None) -> tuple[list[Estimate], list[BlockCost]]:
+        """The same, and of a card that is known blocks of the distilled model in one view and in all; none where nothing is
+        distilled.
+
+        Args:
+            rows: what `fitting_rows` returned.
+        """
         config, views = self.config, () if self.config.distill is None else tuple(self.config.distill.views)
         with self._processes() as pool:
-            if config.distill is None or config.train_stage2 is None:
-                return self._rows(pool), []
+            if self.card is None or config.distill is None or config.train_stage2 is None:
+                return self._rows(pool) if rows is None else rows, []
             model = stage2_model_config(config.train_stage2, self.model)
             shown = list(dict.fromkeys((views[:1], views)))
             costs = block_costs(config.distill, model, self.source(config.distill), shown, pool)
-            return self._rows(pool), costs()
+            return self._rows(pool) if rows is None else rows, costs()
 
-    def fits(self) -> bool:
-        """Returns whether every training fits; the first one that does not ends the work."""
+    def fitting_rows(self) -> list[Estimate] | None:
+        """The rows where every training fits; the first one that does not ends the work, and None is returned."""
+        made: dict[int, Estimate] = {}
         with self._processes() as pool:
-            try:
-                return all(row.fits(self.bytes) for _, row in self._finished(pool))
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
+            for number, row in self._finished(pool):
+                made[number] = row
+                if not row.fits(self.bytes):
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    return None
+        return [made[number] for number in sorted(made)]
 
     def _processes(self) -> Executor:
         """Processes that find imported what all of them need, and never search it for garbage."""
@@ -148,6 +156,8 @@ class SizeSheet(StrictModel):
         if self.card is not None:
             speed = f"{UTILISATION:.0%} of the {CARDS[self.card].operations / 1e12:.0f} TFLOPS of {self.card} (bf16)"
             lines += ["", f"Seconds and hours are planned, not measured: operations of the longest clips at {speed}."]
+        else:
+            lines += ["", "--card NAME plans seconds, hours and frames a second, too."]
         timed = " s a step | hours |" if self.card is not None else ""
         lines += ["", f"| stage | parameters | GB a device | of that |{timed} fits |"]
         lines.append("|---" * (lines[-1].count("|") - 1) + "|")

@@ -8,6 +8,7 @@ from typing import Any
 
 from worldline_core.errors import ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.progress import Progress
 from worldline_core.training.clip_config import TEMPORAL_FACTOR, FrameInput
 
 LORA_RANK = 64
@@ -61,11 +62,19 @@ def largest_fitting(
         ConfigError: not even the smallest fits.
     """
     settings = smaller_settings(load(()))
-    found = bisect_left(settings, True, key=lambda changes: fits(load(changes)))
+    rest = range(1, len(settings))
+    with Progress("worldline plan --fit", 1 + len(rest).bit_length(), "setting") as progress:
+
+        def known(number: int) -> bool:
+            answer = fits(load(settings[number]))
+            progress.advance()
+            return answer
+
+        found = 0 if known(0) else 1 + bisect_left(rest, True, key=known)
     if found == len(settings):
         raise ConfigError(
             "No setting of this preset fits the card", where="worldline plan --fit",
-            next_step="take a preset of a smaller model, or a card of more memory",
+            next_step="take a preset of a smaller model (edge-24gb; my_robot below 24 GB), or a card of more memory",
         )  # fmt: skip
     last = dict(change.split("=", 1) for change in settings[found])
     before = load(()).model_dump(mode="json")
