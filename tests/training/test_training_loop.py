@@ -176,6 +176,24 @@ def test_a_state_that_another_process_left_unfinished_is_not_blamed_on_the_disk(
     assert "every process to write its part" in message and "space" not in message
 
 
+def test_an_average_on_the_host_is_the_one_on_the_device():
+    half = {
+        "half": nn.Parameter(torch.randn(7, 3).bfloat16()),
+        "full": nn.Parameter(torch.randn(5)),
+        "one": nn.Parameter(torch.ones(())),
+    }
+    averages = [ExponentialAverage(half, 0.5, on_host=on_host) for on_host in (False, True)]
+    for _ in range(3):
+        with torch.no_grad():
+            for parameter in half.values():
+                parameter.mul_(1.5).add_(0.25)
+        for average in averages:
+            average.update()
+    for name, parameter in half.items():
+        device, host = (average.average[name] for average in averages)
+        assert host.dtype == torch.float32 and torch.equal(device, host) and not torch.equal(host, parameter.float())
+
+
 def stop_at(stopped):
     """Loses as always, but SIGTERM comes in one step."""
 

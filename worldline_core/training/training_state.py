@@ -14,7 +14,7 @@ import math
 import shutil
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
@@ -128,6 +128,22 @@ def _damaged(where: Path, got: object) -> ArtifactError:
     )
 
 
+class HostCopies:
+    """Copies tensors to the machine's memory, one at a time, into one pinned buffer: fresh memory for each costs more than the copy.
+
+    Args:
+        tensors: all that will be copied.
+    """
+
+    def __init__(self, tensors: Sequence[Tensor]) -> None:
+        size, pinned = max((t.nbytes for t in tensors), default=0), any(t.is_cuda for t in tensors)
+        self._buffer = torch.empty(size, dtype=torch.uint8, pin_memory=pinned)
+
+    def __call__(self, tensor: Tensor) -> Tensor:
+        """The copy, valid until the next one."""
+        return self._buffer[: tensor.nbytes].view(tensor.dtype).view(tensor.shape).copy_(tensor)
+
+
 class ExponentialAverage:
     """Exponential moving average of named parameters, in float32; shipped checkpoints hold it. Sharded where they are.
 
@@ -146,6 +162,7 @@ class ExponentialAverage:
             name: parameter.detach().to("cpu" if on_host else parameter.device, torch.float32, copy=True)
             for name, parameter in self.parameters.items()
         }
+        self._fetch = HostCopies([*map(own_part, self.parameters.values())]) if on_host else own_part
 
     @torch.no_grad()
     def update(self) -> None:
@@ -154,7 +171,7 @@ class ExponentialAverage:
         self.updates += 1
         for name, parameter in self.parameters.items():
             average = own_part(self.average[name])
-            average.lerp_(own_part(parameter).to(average), 1 - decay)
+            average.lerp_(self._fetch(own_part(parameter)).to(average.dtype), 1 - decay)
 
     @contextmanager
     def swapped(self) -> Iterator[None]:
