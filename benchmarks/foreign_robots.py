@@ -17,6 +17,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -210,15 +211,8 @@ class Drawn:
 
 
 def drawn(
-    name: str,
-    robot: ForeignRobot,
-    site: Path,
-    output: Path,
-    source: int,
-    episodes: int,
-    size: tuple[int, int],
-    views: Sequence[str],
-) -> Iterator[Drawn]:
+    name: str, robot: ForeignRobot, site: Path, output: Path, source: int, episodes: int, size: tuple[int, int], views: Sequence[str]
+) -> Iterator[Drawn]:  # fmt: skip
     """Recordings of one source in pictures of this size; its description and table are written to `output`.
 
     Args:
@@ -250,12 +244,12 @@ def drawn(
                     picture = renderer.render().astype(np.float32) + random.normal(0, noise, (*size, 1))
                     images[view].append(np.clip(picture, 0, 255).astype(np.uint8))
                     T = np.eye(4)
-                    T[:3, :3] = data.cam_xmat[camera].reshape(3, 3) @ OPENCV_AXES
-                    T[:3, 3] = data.cam_xpos[camera]
+                    T[:3, :3], T[:3, 3] = data.cam_xmat[camera].reshape(3, 3) @ OPENCV_AXES, data.cam_xpos[camera]
                     poses[view].append(T)
             focal = {v: size[0] / 2 / np.tan(np.radians(model.cam_fovy[c]) / 2) for v, c in cameras.items()}
-            middle = (size[1] - 1) / 2, (size[0] - 1) / 2
-            K = {v: np.array([[f, 0, middle[0]], [0, f, middle[1]], [0, 0, 1]]) for v, f in focal.items()}
+            K = {
+                v: np.array([[f, 0, (size[1] - 1) / 2], [0, f, (size[0] - 1) / 2], [0, 0, 1]]) for v, f in focal.items()
+            }
             shown, stood = ({view: np.stack(each) for view, each in values.items()} for values in (images, poses))
             yield Drawn(state, shown, stood, K)
 
@@ -285,11 +279,8 @@ def record_lerobot(name: str, site: Path, output: Path, source: int, episodes: i
     size, tick = (480, 640), 360 / 4095
     robot = replace(ROBOTS[name], fps=30.0)
     (arm,) = robot.arms
-    vector = {
-        "dtype": "float32",
-        "shape": (len(arm.joints) + 1,),
-        "names": [f"{joint}.pos" for joint in (*arm.joints, "gripper")],
-    }
+    names = [f"{joint}.pos" for joint in (*arm.joints, "gripper")]
+    vector = {"dtype": "float32", "shape": (len(names),), "names": names}
     keys = {view: f"observation.images.{'front' if view == 'head' else 'wrist'}" for view in views}
     picture = {"dtype": "video", "shape": (*size, 3), "names": ["height", "width", "channels"]}
     features = {**dict.fromkeys(keys.values(), picture), "observation.state": vector, "action": vector}
@@ -339,13 +330,10 @@ def main() -> None:
     parser.add_argument("--lerobot", metavar="VIEWS", help="write these views as a dataset of LeRobot's")
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
+    write = partial(record_lerobot, views=arguments.lerobot.split(",")) if arguments.lerobot else record
     for name in arguments.robots.split(","):
         for source in range(arguments.sources):
-            place = name, arguments.site, arguments.output, source, arguments.episodes
-            if arguments.lerobot is None:
-                record(*place)
-            else:
-                record_lerobot(*place, arguments.lerobot.split(","))
+            write(name, arguments.site, arguments.output, source, arguments.episodes)
             print(name, source, flush=True)
 
 

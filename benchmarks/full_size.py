@@ -96,9 +96,7 @@ def trained(
         on_gpu = torch.device(device).type == "cuda"
         if on_gpu:
             torch.cuda.reset_peak_memory_stats()
-        _, seconds, _ = timed(
-            lambda: [run.step(step) for step in range(1, steps + 1)]
-        )  # a step reads its loss: it waits
+        _, seconds, _ = timed(lambda: [run.step(step) for step in range(1, steps + 1)])  # each waits for its loss
     return seconds / steps, torch.cuda.max_memory_allocated() / 1e9 if on_gpu else 0.0
 
 
@@ -132,11 +130,7 @@ def measured(
 
 @dataclass(frozen=True)
 class Outline:
-    """A preset's stages with steps of one micro-batch, and what they cost by the plan.
-
-    Attributes:
-        costs: of a block in each set of views.
-    """
+    """A preset's stages with steps of one micro-batch, their plan, and the cost of a block in each set of views."""
 
     preset: str
     card: str
@@ -171,11 +165,8 @@ def training_rows(known: Outline, steps: int, *, compiled: bool) -> Iterator[Seq
     operations = CARDS[known.card].operations
     for title, stage, plan in zip(TRAININGS, known.stages, known.plans, strict=True):
         seconds, peak = trained(stage, known.model, known.source, steps=steps, compiled=compiled)
-        floor = (plan.operations or 0.0) / operations
-        planned_seconds = floor / UTILISATION
-        yield (
-            title, plan.parameters / 1e6, seconds, planned_seconds, floor, floor / seconds, peak, plan.total / 1e9,
-        )  # fmt: skip
+        floor, size = (plan.operations or 0.0) / operations, plan.parameters / 1e6
+        yield (title, size, seconds, floor / UTILISATION, floor, floor / seconds, peak, plan.total / 1e9)
 
 
 def rollout_rows(known: Outline, blocks: int, device: str, *, compiled: bool) -> Iterator[Sequence[object]]:
@@ -186,11 +177,9 @@ def rollout_rows(known: Outline, blocks: int, device: str, *, compiled: bool) ->
                 known.distilled, known.model, known.source, shown, small=small, device=device, blocks=blocks,
                 compiled=compiled,
             )  # fmt: skip
-            floor = cost.frames_per_second(CARDS[known.card].operations, small=small)
-            yield (
-                len(shown), "small" if small else "autoencoder", cost.frames / seconds, UTILISATION * floor, floor,
-                cost.frames / seconds / floor, peak,
-            )  # fmt: skip
+            floor, speed = cost.frames_per_second(CARDS[known.card].operations, small=small), cost.frames / seconds
+            decoder = "small" if small else "autoencoder"
+            yield (len(shown), decoder, speed, UTILISATION * floor, floor, speed / floor, peak)
 
 
 def main() -> None:

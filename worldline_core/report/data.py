@@ -199,11 +199,10 @@ class DatasetFacts:
 
 def _origin(folder: Path, rows: Sequence[EpisodeRow]) -> Path | None:
     """The curated set that a filtered one was made from: by its manifest, else by the place of its datasets."""
-    linked = linked_folder(folder, "episodes")
-    if linked is None and rows:
-        holder = (folder / rows[0].dataset).resolve().parents[1]
-        linked = holder if (holder / INDEX_FILE).is_file() else None
-    return linked
+    if (linked := linked_folder(folder, "episodes")) is not None or not rows:
+        return linked
+    holder = (folder / rows[0].dataset).resolve().parents[1]
+    return holder if (holder / INDEX_FILE).is_file() else None
 
 
 def recorded_time(rows: Iterable[EpisodeRow]) -> str:
