@@ -363,6 +363,15 @@ def test_a_video_of_another_length_and_what_cannot_be_encoded_are_refused(tmp_pa
             encode_video(tmp_path / "v.mp4", frames, rate)
 
 
+def test_clips_of_different_settings_are_not_joined(tmp_path: Path) -> None:
+    frames = np.random.default_rng(5).integers(0, 255, (8, 32, 48, 3), dtype=np.uint8)
+    for preset in ("slow", "veryfast"):
+        encode_video(tmp_path / f"{preset}.mp4", frames, 10, preset=preset)
+    parts = [(tmp_path / f"{preset}.mp4", 8) for preset in ("slow", "veryfast")]
+    with pytest.raises(DataError, match=r"veryfast\.mp4"):
+        concatenate_videos(tmp_path / "joined.mp4", parts, 10)
+
+
 def test_joined_videos_hold_lengths_not_start_codes(tmp_path: Path) -> None:
     """As mp4 wants it, and LeRobot's own joining of datasets needs it: FFmpeg's decoder alone would not mind."""
     frames = np.random.default_rng(5).integers(0, 255, (8, 32, 48, 3), dtype=np.uint8)

@@ -298,11 +298,11 @@ def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float
     Args:
         parts: (clip written by `encode_video`, its frame count), in order.
 
-    Raises: DataError when a part holds another number of frames than stated.
+    Raises: DataError when a part holds another number of frames than stated, or was encoded with other settings than the first.
     """
     rate = frame_rate(fps)
     with new_mp4(path) as out:
-        stream = None
+        stream, header = None, None
         first_frame = 0
         for part, expected in parts:
             count = 0
@@ -312,7 +312,13 @@ def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float
                 if stream is None:
                     # Opaque where the decoder (dav1d) has another name than an encoder.
                     stream = out.add_stream_from_template(template, opaque=not is_h264)
-                    stream.time_base = template.time_base
+                    stream.time_base, header = template.time_base, template.codec_context.extradata
+                elif template.codec_context.extradata != header:  # decoders read the header of the first one
+                    raise DataError(
+                        "Video part was encoded with other settings than those before it",
+                        where=part,
+                        next_step="remove it: it is recorded again",
+                    )
                 ticks = 1 / (rate * (template.time_base or 1 / rate))
                 # x264's own message (a kilobyte of settings) would otherwise repeat for each clip.
                 without_message = BitStreamFilterContext("filter_units=remove_types=6" if is_h264 else "null", template)
