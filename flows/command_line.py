@@ -265,9 +265,10 @@ def _init(arguments: argparse.Namespace) -> None:
 
 
 def _record(arguments: argparse.Namespace) -> None:
+    from tasks.record import record
     from worldline_core.recorder.attempts import load_recording, record_into
 
-    print(record_into(load_recording(arguments.config, arguments.overrides), arguments.output))
+    print(record_into(load_recording(arguments.config, arguments.overrides), arguments.output, record.version))
 
 
 def _inspect(arguments: argparse.Namespace) -> None:

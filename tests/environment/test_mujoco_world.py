@@ -52,7 +52,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("policies") / "recordings"
     grid = BankGrid(embodiments=(ROBOT,), families=("press",), scenes=("scene_12", "scene_13"), count=2)
     config = RecordPoliciesConfig(policies=POLICIES, starts=grid, seed=3, num_frames=33, workers=1)
-    record_into(RecordingConfig(policies=config), folder)
+    record_into(RecordingConfig(policies=config), folder, 1)
     return folder
 
 

@@ -74,7 +74,7 @@ LAYOUTS = (
     "robotwin", "robomind", "unitree_h5", "video_folder",
 )  # fmt: skip
 CASES = 60
-"""Of which the first ten are tried after every change, all with the slow tests."""
+"""The fast tests try the first ten of them, the slow tests all."""
 
 
 @pytest.fixture(scope="module")

@@ -13,14 +13,19 @@ the recording's background: still edges around a small robot would be found wher
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
+
+from worldline_core.pictures import evenly_spaced
 
 PATCH_FRACTION = 0.15  # half side of the patch, of the frame height: the gripper and some of what is behind it
 MIN_CONTRAST = 8.0  # standard deviation of a patch [grey levels]; flatter ones fit everywhere and say nothing
 SEARCH_FRACTION = 0.25  # search radius, of the frame height
 MIN_CORRELATION = 0.4
 LEAST_CHANGE = 8.0  # blurred change that is motion [grey levels]
+BACKGROUND_FRAMES = 15
 
 
 def end_effector_error(
@@ -54,6 +59,16 @@ def end_effector_error(
         found = correlation[row, column] >= MIN_CORRELATION
         errors[frame, arm] = min(distance, radius) if found else radius
     return errors
+
+
+def background_of(count: int, pictures: Callable[[list[int]], np.ndarray]) -> np.ndarray:
+    """(h, w, 3) float32 median of frames of a recording, evenly spaced.
+
+    Args:
+        count: frames of the recording.
+        pictures: gives those of these numbers, (n, h, w, 3).
+    """
+    return np.median(pictures(evenly_spaced(count, BACKGROUND_FRAMES)), axis=0).astype(np.float32)
 
 
 def moving_part(first: np.ndarray, later: np.ndarray, background: np.ndarray) -> np.ndarray:

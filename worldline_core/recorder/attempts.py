@@ -311,8 +311,11 @@ def record_artifact(config: RecordingConfig, inputs: Mapping[str, Path], output:
     return config.record(output)
 
 
-def record_into(config: RecordingConfig, output: Path) -> dict[str, Any]:
+def record_into(config: RecordingConfig, output: Path, version: int) -> dict[str, Any]:
     """Record into a folder outside of a store, or continue a killed recording there; the manifest is written last.
+
+    Args:
+        version: of the task `record`, for the manifest.
 
     Raises:
         DataError: the folder holds a finished recording.
@@ -325,6 +328,6 @@ def record_into(config: RecordingConfig, output: Path) -> dict[str, Any]:
         counts = config.record(output)
         environment = describe_environment()
         packages = {**environment["packages"], "mujoco": importlib.metadata.version("mujoco")}
-        facts = {"step": "record", "version": 1, "config": config.model_dump(mode="json"), "metrics": counts}
+        facts = {"step": "record", "version": version, "config": config.model_dump(mode="json"), "metrics": counts}
         write_manifest(output, {**facts, "environment": {**environment, "packages": packages}})
         return counts

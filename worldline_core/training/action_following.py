@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.actions.tool_error import PATCH_FRACTION, end_effector_error, moving_part
+from worldline_core.actions.tool_error import PATCH_FRACTION, background_of, end_effector_error, moving_part
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError, TrainingError
 from worldline_core.model.tokenizers import (
@@ -31,7 +31,6 @@ from worldline_core.model.tokenizers import (
     tokenizer_fingerprint,
     video_to_frames,
 )
-from worldline_core.pictures import evenly_spaced
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipRow
 from worldline_core.training.trainer import autocast, step_generator
@@ -42,8 +41,6 @@ logger = logging.getLogger(__name__)
 SEED = 30_000
 LEAST_MOTION = 0.05
 """Way of a tool in that second, of the frame's height, from which a clip can tell predictions apart."""
-BACKGROUND_FRAMES = 15
-"""Frames of a recording whose median is its background."""
 LEAST_CLIPS = 4
 FIRST_SECONDS = 3.0
 """Assumed cost of the first measurement."""
@@ -173,11 +170,11 @@ class ActionFollowing:
         return found
 
     def _background(self, episode_id: str, view: str) -> np.ndarray:
-        """(h, w, 3) float32 median over an episode."""
-        position = self.episodes.position(episode_id)
-        frames = evenly_spaced(self.episodes.rows[position].video_frames, BACKGROUND_FRAMES)
-        pictures = resized_frames(self.episodes.frames(position, view, frames), self.loader.source.image_size)
-        return np.median(pictures, axis=0).astype(np.float32)
+        position, size = self.episodes.position(episode_id), self.loader.source.image_size
+        return background_of(
+            self.episodes.rows[position].video_frames,
+            lambda frames: resized_frames(self.episodes.frames(position, view, frames), size),
+        )
 
     def _recorded(self, clip: Clip, view: str, frames: Sequence[int]) -> np.ndarray:
         indices = [clip.start + frame for frame in frames]

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.actions.tool_error import end_effector_error, moving_part
+from worldline_core.actions.tool_error import background_of, end_effector_error, moving_part
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -36,13 +36,10 @@ from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.evaluation.video.background import Background, invented_motion, sharpness
 from worldline_core.evaluation.video.metrics_on_request import SceneFrames, ToolFinder
 from worldline_core.model.lpips import LPIPS
-from worldline_core.pictures import evenly_spaced
 from worldline_core.rollout.rollout_set import RolloutSet
 
 PIECE_FRAMES = 32
 """Frames of a video in memory at once; no fewer than `own_colour` needs to find the colour of a thing."""
-BACKGROUND_FRAMES = 15
-"""Frames of a recording whose median is its background."""
 MOVED_IOU = 0.5
 """A thing counts as moved where the IoU of its mask with that of the first frame is below this."""
 FrameValues = dict[str, list[float | None]]
@@ -82,8 +79,7 @@ class _MovingPart:
 
     @classmethod
     def of(cls, recording: VideoFrames) -> _MovingPart:
-        frames = recording[evenly_spaced(len(recording), BACKGROUND_FRAMES)]
-        return cls(frames[0], np.median(frames, axis=0).astype(np.float32))
+        return cls(recording[[0]][0], background_of(len(recording), lambda frames: recording[frames]))
 
     def errors(self, true: np.ndarray, predicted: np.ndarray) -> list[float | None]:
         points = np.stack([moving_part(self.first, frame, self.background) for frame in true])
