@@ -20,6 +20,7 @@ from worldline_core.calibration.observation import (
     Motion,
     Observation,
     ObservedArm,
+    PredictedMotion,
     Reading,
     cell_centres,
     predict_motion,
@@ -276,8 +277,15 @@ def still_view_agreement(observation: Observation, reading: Reading, view: str) 
     Returns: correlations of predicted with measured flow and change; angle [deg] by which the flow is turned as a whole,
         smaller where it hardly follows, and 0 where it does not.
     """
+    camera, motion = reading.cameras[view], observation.motion(view)
     states, images = reading.steps(observation.num_images, view)
-    motion, predicted = observation.motion(view), reading.predicted(view)
+    inputs = (reading.points, reading.radii, camera.T_base_camera[:1], camera.K, states, images)
+    return motion.agreement(inputs, lambda: _still_view_agreement(motion, reading.predicted(view), states, images))
+
+
+def _still_view_agreement(
+    motion: Motion, predicted: PredictedMotion, states: slice, images: slice
+) -> tuple[float, float, float]:
     moving = predicted.length[states] > MIN_STEP_PX
     if moving.sum() < 20:
         return 0.0, 0.0, 0.0
@@ -311,10 +319,8 @@ def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) 
     if not camera.moving:
         return 0.0
     states, images = reading.steps(observation.num_images, view)
-    key = b"".join((camera.T_base_camera.tobytes(), camera.K.tobytes(), repr((states, images)).encode()))
-    if key not in motion.agreements:
-        motion.agreements[key] = _wrist_flow_agreement(camera, motion, states, images)
-    return motion.agreements[key]
+    inputs = (camera.T_base_camera, camera.K, states, images)
+    return motion.agreement(inputs, lambda: _wrist_flow_agreement(camera, motion, states, images))
 
 
 def _wrist_flow_agreement(camera: CameraTrack, motion: Motion, states: slice, images: slice) -> float:
@@ -378,18 +384,33 @@ def finger_agreement(observation: Observation, reading: Reading, arm: int) -> fl
         return None
     if reading.shape == "hands" or not _moves(observation, reading, arm):
         return None
-    camera, tool = reading.cameras[view], reading.tools[:, arm, :3, 3]
-    points, radii = reading.capsules
-    near = np.median(lengths(points - tool[:, None]), axis=0) < FINGER_LENGTH_M
-    T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
-    points = points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
-    fixed = replace(camera, T_base_camera=np.eye(4)[None])
+    camera, motion, tool = reading.cameras[view], observation.motion(view), reading.tools[:, arm, :3, 3]
     states, images = reading.steps(observation.num_images, view)
-    predicted = predict_motion(points, radii[near], fixed)[states]
+    inputs = (*reading.capsules, tool, camera.T_base_camera, camera.K, states, images)
+    return motion.agreement(inputs, lambda: _finger_agreement(motion, reading, arm, camera, states, images))
+
+
+def _finger_agreement(
+    motion: Motion, reading: Reading, arm: int, camera: CameraTrack, states: slice, images: slice
+) -> float:
+    predicted = _predicted_fingers(reading, arm, camera)[states]
     moving = lengths(predicted) > MIN_FINGER_STEP_PX
     if moving.sum() < 10:
         return 0.0  # whether there is a term must not depend on the reading
-    return cosine(observation.motion(view).flow[images][moving], predicted[moving])
+    return cosine(motion.flow[images][moving], predicted[moving])
+
+
+def _predicted_fingers(reading: Reading, arm: int, camera: CameraTrack) -> np.ndarray:
+    """`predict_motion` of the links near a tool as its wrist camera shows them, cached with the reading."""
+    name = f"fingers {arm}"
+    if name not in reading.predictions:
+        tool, (points, radii) = reading.tools[:, arm, :3, 3], reading.capsules
+        near = np.median(lengths(points - tool[:, None]), axis=0) < FINGER_LENGTH_M
+        T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
+        points = points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
+        fixed = replace(camera, T_base_camera=np.eye(4)[None])
+        reading.predictions[name] = PredictedMotion(predict_motion(points, radii[near], fixed))
+    return reading.predictions[name].step
 
 
 def _moves(observation: Observation, reading: Reading, arm: int) -> bool:

@@ -5,11 +5,12 @@ Axis legend: n frames, a arms, p points on the robot, r c rows and columns of im
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import blake2b
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -62,8 +63,15 @@ class Motion:
     flow: np.ndarray
     change: np.ndarray
     texture: np.ndarray
-    agreements: dict[bytes, float] = field(default_factory=dict, repr=False)
-    """Cached agreements with wrist cameras: most readings leave the camera as it is."""
+    _agreements: dict[bytes, Any] = field(default_factory=dict, repr=False)
+
+    def agreement[Agreement](self, inputs: Iterable[np.ndarray | slice], compute: Callable[[], Agreement]) -> Agreement:
+        """An agreement with predicted motion, cached by what it is computed from: most readings change little of it."""
+        parts = (each.tobytes() if isinstance(each, np.ndarray) else repr(each).encode() for each in inputs)
+        key = blake2b(b"|".join(parts)).digest()
+        if key not in self._agreements:
+            self._agreements[key] = compute()
+        return self._agreements[key]
 
     @cached_property
     def largest_change(self) -> np.ndarray:
@@ -286,7 +294,8 @@ class Reading:
     shape: Literal["surfaces", "capsules", "hands"]
     capsules: tuple[np.ndarray, np.ndarray]
     first: int
-    _predicted: dict[str, PredictedMotion] = field(default_factory=dict, repr=False)
+    predictions: dict[str, PredictedMotion] = field(default_factory=dict, repr=False)
+    """Cached motion of the robot's points; readings that differ by a lag of the images share it."""
 
     def with_image_lag(self, frames: int) -> Reading:
         """The same geometry with images that trail the states by so many frames."""
@@ -301,10 +310,10 @@ class Reading:
         return slice(start, stop), slice(start + first, stop + first)
 
     def predicted(self, view: str) -> PredictedMotion:
-        """`predict_motion` in a view, cached: readings that differ by a lag of the images share it."""
-        if view not in self._predicted:
-            self._predicted[view] = PredictedMotion(predict_motion(self.points, self.radii, self.cameras[view]))
-        return self._predicted[view]
+        """`predict_motion` in a view, cached."""
+        if view not in self.predictions:
+            self.predictions[view] = PredictedMotion(predict_motion(self.points, self.radii, self.cameras[view]))
+        return self.predictions[view]
 
 
 def tool_travel(tools: np.ndarray) -> np.ndarray:
