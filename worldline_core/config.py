@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeAliasType, Union, cast, get_args, get_origin
@@ -453,6 +453,11 @@ def _holds_numbers_alone(annotation: Any) -> bool:
     )
 
 
+@cache
+def _number_fields(model: type[BaseModel]) -> frozenset[str]:
+    return frozenset(name for name, field in model.model_fields.items() if _holds_numbers_alone(field.annotation))
+
+
 class StrictModel(BaseModel):
     """Frozen; an unknown key is an error, never ignored."""
 
@@ -466,8 +471,7 @@ class StrictModel(BaseModel):
             for name, value in values.items():
                 if (found := unusable_text((name, value))) is not None:
                     raise ValueError(f"{name!a} has half of a surrogate pair: {found}")
-                field = cls.model_fields.get(name)
-                if field is not None and _holds_boolean(value) and _holds_numbers_alone(field.annotation):
+                if name in _number_fields(cls) and _holds_boolean(value):
                     raise ValueError(f"{name}: true and false are no numbers (got {value!r})")
         return values
 

@@ -26,6 +26,7 @@ _CREDENTIALS = (
     re.compile(r"\b(?:hf_|sk-|gh[oprsu]_|github_pat_|glpat-|xox[abprs]-|AIza|AKIA|ASIA)[\w-]{12,}"),
 )
 _SECRET_VARIABLE = re.compile(r"(?i)(?:token|key|secret|password)$")
+_NUMBER = (int, float, type(None))
 _SHORTEST_SECRET = 8
 HIDDEN = "***"
 LONGEST = 4000
@@ -41,6 +42,8 @@ def unusable_text(value: object) -> str | None:
     """The first text within nested mappings and sequences that no file or table can hold (half of a surrogate pair), as ASCII."""
     if isinstance(value, str):
         return None if value.isascii() or not _HALF_PAIR.search(value) else ascii(cut(value, 200))
+    if isinstance(value, _NUMBER):  # most values; the checks below would tell them slowest
+        return None
     if isinstance(value, Mapping):
         value = (*value, *value.values())
     if not isinstance(value, list | tuple | set | frozenset):

@@ -294,7 +294,8 @@ def embodiment_files() -> dict[str, Path]:
     Raises: ConfigError when a robot has the name of one that ships with the project, and is another.
     """
     shipped = {path.stem: path for path in EMBODIMENT_ROOT.glob("*.yaml")}
-    own = {path.stem: path for path in OWN_ROOT.glob("*.yaml")} | _carried
+    apart = OWN_ROOT.is_dir() and not OWN_ROOT.samefile(EMBODIMENT_ROOT)  # one folder in a checkout
+    own = ({path.stem: path for path in OWN_ROOT.glob("*.yaml")} if apart else {}) | _carried
     for name in shipped.keys() & own.keys():
         _require_same(name, shipped[name], own[name])
     return own | shipped
@@ -364,12 +365,20 @@ def load_embodiment(name_or_path: str | Path, description_path: Path | str | Non
     """
     path = Path(name_or_path)
     if not _is_path(name_or_path):
-        check_embodiment_name(str(name_or_path))
-        path = embodiment_files()[str(name_or_path)]
-    embodiment = validate(Embodiment, {**read_yaml(path), "description_path": path.parent}, where=path)
+        name, files = str(name_or_path), embodiment_files()
+        if name not in files:
+            check_embodiment_name(name)
+        path = files[name]
+    embodiment = _validated(path, path.read_bytes() if path.is_file() else None)
     chosen = description_path or os.environ.get(description_variable(embodiment.name))
     located = Path(chosen) if chosen else path.parent / embodiment.description.file
     return embodiment.model_copy(update={"description_path": located})
+
+
+@lru_cache(maxsize=128)  # more than there are robots: a dataset is compared with all of them
+def _validated(path: Path, content: bytes | None) -> Embodiment:
+    """The embodiment of a file with this content, which takes some milliseconds."""
+    return validate(Embodiment, {**read_yaml(path), "description_path": path.parent}, where=path)
 
 
 def description_variable(name: str) -> str:
