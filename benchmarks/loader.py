@@ -17,7 +17,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from itertools import count
+from itertools import count, cycle
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,9 @@ import torch
 from benchmarks.harness import RECORDINGS, best_seconds, command_line, print_table
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput, LatentInput
-from worldline_core.training.clip_loader import ClipDataset, ClipLoader, read_ahead
-from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
+from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput
+from worldline_core.training.clip_loader import ClipLoader, read_ahead
+from worldline_core.training.clip_sampler import Clip, ClipSampler
 from worldline_core.training.clip_source import FrameSource, LatentStore, ResidentLatents
 from worldline_core.training.encode_latents import encode_latents
 
@@ -88,16 +88,6 @@ def decode_raw(source: FrameSource, clips: Sequence[Clip]) -> None:
                 pass
 
 
-class RepeatedClips:
-    """The clips of the first steps again and again, so that every pass reads what raw decoding reads."""
-
-    def __init__(self, sampler: ClipSampler, steps: int) -> None:
-        self.sampler, self.steps = sampler, steps
-
-    def clips(self, index: int) -> ClipBatch:
-        return self.sampler.clips(index % self.steps)
-
-
 def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple[str, float, float, float]:
     """Decoder, frames per second of processor time by raw decoding and by the loader, and their ratio."""
     config = FrameInput.model_validate({"image_size": case["size"]})
@@ -107,10 +97,10 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple
         source.rows, sampling, views=VIEWS, splits=["train"], start_step=1, batch_size=case["batch"], seed=0
     )
     steps = case["steps"]
-    clips = [clip for index in range(steps) for clip in sampler.clips(index).clips]
+    batches = [sampler.clips(index) for index in range(steps)]
+    clips = [clip for batch in batches for clip in batch.clips]
     frames = len(VIEWS) * sum(clip.num_frames for clip in clips)
-    repeated: Any = RepeatedClips(sampler, steps)
-    loader = read_ahead(ClipDataset(source, repeated), 0, processes)
+    loader = read_ahead(source, cycle(batches), processes)  # every pass reads what raw decoding reads
     everyone = [os.getpid()]
 
     def load() -> None:
@@ -146,7 +136,7 @@ def latent_batches(root: Path) -> Iterator[tuple[str, float]]:
         store.rows, sampling, views=VIEWS, splits=["train"], start_step=store.start_step, batch_size=256, seed=0
     )
     for name, source in (("read", store), ("resident", ResidentLatents(store, "cpu"))):
-        load, steps = ClipLoader(source, views=VIEWS).batches(sampler, LatentInput()), count()
+        load, steps = ClipLoader(source, views=VIEWS).batches(sampler), count()
         yield name, 1000 * best_seconds(lambda load=load, steps=steps: load(next(steps)))
 
 

@@ -15,7 +15,7 @@ import torch
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError, TrainingError
-from worldline_core.training.clip_config import ClipSampling, FrameInput, ReadingConfig
+from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import FrameSource, LatentStore
@@ -77,7 +77,7 @@ def test_batches_do_not_depend_on_who_reads_them_and_when(world):
     slow = ClipLoader(scripted(world, {"episode-003": "slow", "episode-006": "slow"}), views=VIEWS)
     state = torch.get_rng_state()
     for workers in (0, 1, 2):
-        load = slow.batches(sampler, ReadingConfig(workers=workers))
+        load = slow.batches(sampler, workers)
         for index in (*range(20), 5, 6, 7, 20, 21):  # in order, and back as after a kill
             assert same(load(index), expected[index])
     assert torch.equal(torch.get_rng_state(), state)
@@ -93,7 +93,7 @@ def test_errors_name_their_clips_and_leave_no_process(world):
         ("die", TrainingError, r"loader process has ended[\s\S]*episode-004[\s\S]*exited unexpectedly"),
     ):
         loader = ClipLoader(scripted(world, {"episode-004": what}), views=VIEWS)
-        load = loader.batches(sampler, ReadingConfig(workers=1))
+        load = loader.batches(sampler, 1)
         for index in range(first):
             load(index)
         with pytest.raises(kind, match=message):
@@ -108,10 +108,10 @@ def test_errors_name_their_clips_and_leave_no_process(world):
 KILLED = """
 import multiprocessing, pickle, sys, time
 from pathlib import Path
-from test_clip_loader import VIEWS, ClipLoader, ReadingConfig, sampler_of
+from test_clip_loader import VIEWS, ClipLoader, sampler_of
 if __name__ == "__main__":
     source = pickle.loads(Path(sys.argv[1]).read_bytes())
-    load = ClipLoader(source, views=VIEWS).batches(sampler_of(source), ReadingConfig(workers=1))
+    load = ClipLoader(source, views=VIEWS).batches(sampler_of(source), 1)
     load(0)
     print(*[process.pid for process in multiprocessing.active_children()], flush=True)
     time.sleep(60)
@@ -138,7 +138,7 @@ def test_processes_end_with_the_training_process(world, tmp_path):
 @pytest.mark.gpu
 def test_batches_reach_a_gpu(world):
     source = scripted(world)
-    load = ClipLoader(source, views=VIEWS, device="cuda").batches(sampler_of(source), ReadingConfig(workers=1))
+    load = ClipLoader(source, views=VIEWS, device="cuda").batches(sampler_of(source), 1)
     plain = ClipLoader(source, views=VIEWS)
     for index in range(6):
         assert torch.equal(load(index).latents.cpu(), plain.load(sampler_of(source).clips(index)).latents)
@@ -150,7 +150,7 @@ def test_a_damaged_clip_is_named(world, tokenizer, tmp_path):
     half = video.stat().st_size // 2
     video.write_bytes(video.read_bytes()[:half] + bytes(half))
     source = FrameSource(episodes, tokenizer, FrameInput(image_size=(32, 32)))
-    load = ClipLoader(source, views=VIEWS).batches(sampler_of(source, lengths=(17,)), ReadingConfig())
+    load = ClipLoader(source, views=VIEWS).batches(sampler_of(source, lengths=(17,)))
     with pytest.raises(DataError, match=r"cannot be read[\s\S]*episode-\d+, frames 0\.\.16, view left_wrist, in .*mp4"):
         for index in range(10):
             load(index)

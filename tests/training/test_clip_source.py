@@ -17,7 +17,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput, LatentInput
+from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipRow, ClipSampler, longest_clip
 from worldline_core.training.clip_source import FrameSource, LatentStore, ResidentLatents, training_rows
@@ -96,7 +96,7 @@ def test_clips_longer_than_those_encoded_are_refused_before_training(world):
         store.rows, ClipSampling(lengths=(9, 17)), views=VIEWS, splits=["train"], start_step=4, batch_size=1, seed=0
     )
     with pytest.raises(ConfigError, match=r"clips.lengths[\s\S]*encode_latents.clip_frames to 17"):
-        ClipLoader(store, views=VIEWS).batches(sampler, LatentInput())
+        ClipLoader(store, views=VIEWS).batches(sampler)
     section = {"encode_latents": {"clip_frames": 29}}
     with pytest.raises(ValueError, match=r"train_stage1.clips.lengths: 33 frames, encode_latents.clip_frames: 29"):
         PipelineConfig.model_validate(read_config("tiny", None) | section)
@@ -124,8 +124,8 @@ def test_a_resident_batch_mixes_episodes_views_starts_and_strides(tmp_path, toke
     rows = []
     for name, count, views in (("a", 30, ("x", "y")), ("b", 17, ("z", "y", "x")), ("c", 22, ("y",))):
         video = torch.randint(0, 256, (len(views), 3, count, 2, 2), generator=generator, dtype=torch.uint8)
-        save_file(encode_episode(tokenizer, name, list(video), layout, config), tmp_path / name)
-        rows.append(ClipRow(name, count, views, "s", "r", "train", "", views[-1], name))
+        save_file(encode_episode(tokenizer, name, list(video), layout, config), tmp_path / f"{name}.safetensors")
+        rows.append(ClipRow(name, count, views, "s", "r", "train", "", views[-1], f"{name}.safetensors"))
     description = {"layout": layout, "start_step": 2, "strides": [1, 2], "latent_shape": [3, 2, 2]}
     store = LatentStore(tmp_path, description | {"image_size": [2, 2], "clip_frames": None}, rows)
     resident = ResidentLatents(store, "cpu")

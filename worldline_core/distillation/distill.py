@@ -181,7 +181,7 @@ class DistillationRun:
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
         loader = copy(self.loader)
         loader.object_weights = weights_of(settings.weighting, self.episodes, self.source, self.rows, loader.device)
-        load = loader.batches(sampler, self.config.input)
+        load = loader.batches(sampler, self.config.input.workers)
         return self._train(STEPS[0], settings.trainer, objective, load, info, self.start)
 
     def trajectory_regression(self) -> dict[str, float]:
@@ -259,8 +259,6 @@ class DistillationRun:
             hold_weights(teacher.requires_grad_(False), trainer.precision).to(trainer.device).eval()
             per_shard = min(settings.clips, settings.clips_per_shard)
             drawn = trainer.model_copy(update={"batch_size": per_shard, "seed": settings.seed})
-            # Processes take shards in turn, so none is read ahead.
-            reading = config.input.model_copy(update={"workers": 0})
             facts = {
                 "teacher": info.weights_sha256,
                 "causal": config.spec.model_dump(mode="json"),
@@ -268,7 +266,8 @@ class DistillationRun:
                 **settings.model_dump(mode="json"),
                 **config.model_dump(mode="json", include={"input", "clips"}),
             }
-            load = self.loader.batches(self._sampler(drawn, config.clips, ALONE), reading)
+            # Processes take shards in turn, so none is read ahead.
+            load = self.loader.batches(self._sampler(drawn, config.clips, ALONE))
             make = partial(trajectory_shard, config=config, teacher=teacher, loader=self.loader, load=load)
             write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
         if processes()[0] == 0:

@@ -71,16 +71,11 @@ class ClipSampling(StrictModel):
         return tuple(view for view in views if drawn & {JOINT, SUBSET, view})
 
 
-class ReadingConfig(StrictModel):
-    """Reading of clips.
-
-    ``workers``: processes that read two micro-batches ahead each; 0 reads in the training process when a batch is needed.
-    """
-
-    workers: int = Field(default=0, ge=0)
+Workers = Annotated[int, Field(ge=0)]
+"""Processes that read two micro-batches ahead each; 0 reads in the training process when a batch is needed."""
 
 
-class LatentInput(ReadingConfig):
+class LatentInput(StrictModel):
     """Latents cached by encode_latents.
 
     ``resident``: keep latents, action tracks and shares of things of all episodes on the training device, for sets that fit
@@ -88,6 +83,7 @@ class LatentInput(ReadingConfig):
     """
 
     kind: Literal["latents"] = "latents"
+    workers: Workers = 0
     resident: bool = False
 
     @model_validator(mode="after")
@@ -97,13 +93,14 @@ class LatentInput(ReadingConfig):
         return self
 
 
-class FrameInput(ReadingConfig):
+class FrameInput(StrictModel):
     """Frames straight from the EpisodeSet, which the tokenizer encodes during training.
 
     ``image_size``: (H, W) that frames are resized to, as in encode_latents. ``start_step``: clips start at multiples of it.
     """
 
     kind: Literal["frames"] = "frames"
+    workers: Workers = 0
     image_size: ImageSize = (64, 96)
     start_step: int = Field(default=1, ge=1)
 

@@ -6,7 +6,7 @@ latents and adds action maps and text ids.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from itertools import count
 
@@ -18,13 +18,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from worldline_core.actions.action_maps import ControlDrawing, control_frames
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, TrackBatch, collate_tracks, drawn_size
-from worldline_core.errors import ConfigError, TrainingError, WorldLineError
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, drawn_size
+from worldline_core.errors import TrainingError, WorldLineError
 from worldline_core.model.text import ClipFacts, TextEncoder
-from worldline_core.training.clip_config import ReadingConfig
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
 from worldline_core.training.clip_source import ClipSource
-from worldline_core.training.resident import ResidentTracks, on_device
+from worldline_core.training.resident import ResidentTracks, frame_numbers, on_device
 
 START_METHOD = "spawn"
 """Start method of loader processes: forked ones would share the threads and CUDA state of this one."""
@@ -32,34 +31,31 @@ START_METHOD = "spawn"
 
 @dataclass(frozen=True)
 class ClipDataset(Dataset[Tensor | WorldLineError]):
-    """The clips of every micro-step, as the source reads them. An error is an item like any other: it reaches the training
-    process as it is.
-    """
+    """Batches of clips as a source reads them. An error is an item like any other: it reaches the training process as it is."""
 
     source: ClipSource
-    sampler: ClipSampler
 
-    def __getitem__(self, index: int) -> Tensor | WorldLineError:
+    def __getitem__(self, batch: ClipBatch) -> Tensor | WorldLineError:
         try:
-            return self.source.read_batch(self.sampler.clips(index))
+            return self.source.read_batch(batch)
         except WorldLineError as error:
             return error
 
 
 def read_ahead(
-    dataset: ClipDataset, first: int, workers: int, *, pinned: bool = False
+    source: ClipSource, batches: Iterable[ClipBatch], workers: int, *, pinned: bool = False
 ) -> Iterator[Tensor | WorldLineError]:
-    """The items of a dataset from ``first`` on, in order, read ahead by so many processes.
+    """What the source reads of each batch, in order, read ahead by so many processes.
 
     Args:
         pinned: in page-locked memory, which a GPU reads at full speed.
     """
     loader = DataLoader(
-        dataset,
+        ClipDataset(source),
         batch_size=None,
-        sampler=count(first),
+        sampler=batches,
         num_workers=workers,
-        multiprocessing_context=START_METHOD if workers else None,
+        multiprocessing_context=START_METHOD,
         worker_init_fn=_start_worker,
         pin_memory=pinned,
         generator=torch.Generator(),  # its own: training's random state stays as it is
@@ -133,8 +129,8 @@ class ClipLoader:
             rows = [row for row in self.source.rows if row.episode_id in self.tracks]
             self._resident = ResidentTracks(self.tracks, rows, self.views, self.device, self.native_size)
 
-    def batches(self, sampler: ClipSampler, reading: ReadingConfig) -> Callable[[int], Batch]:
-        """A function that gives the batch of a micro-step, read ahead by the configured workers.
+    def batches(self, sampler: ClipSampler, workers: int = 0) -> Callable[[int], Batch]:
+        """A function that gives the batch of a micro-step, read ahead by so many processes.
 
         Asked for in order, batches are there already; any other order starts reading anew. The function raises DataError
         and ArtifactError for clips that cannot be read, and TrainingError where a loader process has ended.
@@ -143,16 +139,15 @@ class ClipLoader:
             ConfigError: the source has no clips of this length.
         """
         self.source.require_length(sampler.longest, "clips.lengths")
-        if self.source.resident:
+        if self.source.resident or not workers:
             return lambda index: self.load(sampler.clips(index))
-        dataset = ClipDataset(self.source, sampler)
         pinned = torch.device(self.device).type == "cuda"
         ahead: tuple[int, Iterator[Tensor | WorldLineError]] | None = None
 
         def load(index: int) -> Batch:
             nonlocal ahead
             if ahead is None or ahead[0] != index:
-                ahead = (index, read_ahead(dataset, index, reading.workers, pinned=pinned))
+                ahead = (index, read_ahead(self.source, map(sampler.clips, count(index)), workers, pinned=pinned))
             items, ahead = ahead[1], None  # after an error nothing holds the loader processes
             batch = sampler.clips(index)
             try:
@@ -189,19 +184,16 @@ class ClipLoader:
     def conditioned(self, batch: ClipBatch, latents: Tensor, frames: Tensor | None = None) -> Batch:
         """Latents of a batch's clips, with the conditions that this loader adds. Raises: ArtifactError: the tracks lack an episode."""
         clips, views = batch.clips, batch.views
-        maps = None if self.tracks is None else self.action_maps(clips, views)
-        ids = mask = None
+        ids = mask = weights = None
         if self.text is not None:
             facts = [self.clip_facts(clip) for clip in clips]
             ids, mask = self.text([self.source.row(clip.episode_id).instruction for clip in clips], facts)
             ids, mask = (on_device(values, self.device) for values in (ids, mask))
         rates = [self._rate(clip) for clip in clips] if self.frame_rates else None
         fps = None if rates is None else on_device(np.array(rates, np.float32), self.device)
-        weights = None
         if self.object_weights is not None:
-            recorded = [self.source.recorded_views(batch, clip) for clip in clips]
-            weights = self.object_weights(clips, recorded)
-        return Batch(clips, views, latents, maps, ids, mask, frames, fps, weights)
+            weights = self.object_weights(clips, self.source.recorded_views(batch))
+        return Batch(clips, views, latents, self.action_maps(clips, views), ids, mask, frames, fps, weights)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
         """Facts that a prompt may state about a clip; a stride lowers its rate."""
@@ -210,28 +202,24 @@ class ClipLoader:
     def _rate(self, clip: Clip) -> float:
         return self.frame_rates[clip.episode_id] / clip.stride
 
-    def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v a t h w"]:
-        """Controls that each latent frame takes (docs/method.md section 2): in each view the map at latent resolution, or the vector."""
+    def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v a t h w"] | None:
+        """Controls that each latent frame takes (docs/method.md section 2): in each view the map at latent resolution, or the
+        vector; None without action tracks."""
         if self.tracks is None:
-            raise ConfigError("Action maps need action tracks", where="ClipLoader")
+            return None
         if self._resident is not None:
             samples, size = self._resident.batch(clips, self.action_frames, views), self._resident.image_size
         else:
-            samples, size = self._collated(self.tracks, clips, views)
+            for clip in clips:
+                if clip.episode_id not in self._tracks:
+                    self._tracks[clip.episode_id] = self.tracks.tracks(clip.episode_id)
+            episodes = [self._tracks[clip.episode_id] for clip in clips]
+            frames = frame_numbers(clips, control_frames(clips[0].num_frames, self.action_frames)).tolist()
+            samples = collate_tracks(episodes, views, self.native_size, frames).to(self.device)
+            size = drawn_size(episodes)
         sigma = self.tracks.sigma_px_ref if self.maps else None
         drawing = ControlDrawing(self.source.latent_shape[1:], sigma, self.native_size, self.action_frames)
         by_vector = None
         if self.native_size is not None:
             by_vector = on_device(np.array([[view in clip.vectors for view in views] for clip in clips]), self.device)
         return drawing.draw(samples, size, by_vector)
-
-    def _collated(
-        self, tracks: ActionTracks, clips: Sequence[Clip], views: tuple[str, ...]
-    ) -> tuple[TrackBatch, tuple[int, int]]:
-        """Track samples of clips, and the size of the frames that they are drawn in."""
-        for clip in clips:
-            if clip.episode_id not in self._tracks:
-                self._tracks[clip.episode_id] = tracks.tracks(clip.episode_id)
-        episodes = [self._tracks[clip.episode_id] for clip in clips]
-        frames = [[c.frames[n] for n in control_frames(c.num_frames, self.action_frames)] for c in clips]
-        return collate_tracks(episodes, views, self.native_size, frames).to(self.device), drawn_size(episodes)

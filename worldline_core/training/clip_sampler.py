@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import compress
 from typing import Any, Self
 
 import numpy as np
@@ -165,34 +166,32 @@ class ClipSampler:
         index, part = self.plan.drawn(index)
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         kind = self._kinds[int(random.choice(len(self._kinds), p=self._kind_weights))]
-        name = JOINT
+        sets, name = self._sets(kind), JOINT
         if set(self._view_weights) != {JOINT}:
-            drawn = self._drawn(kind)
-            name = list(drawn)[int(random.choice(len(drawn), p=_normalised(list(drawn.values()))))]
+            name = list(self._view_weights)[int(random.choice(len(self._view_weights), p=self._shares(sets)))]
         size = self.batch_size * (1 if name in (JOINT, SUBSET) else self.single_view_factor)
-        sets = self._sets(name, kind)
-        views = sets[0] if len(sets) == 1 else sets[int(random.integers(len(sets)))]
+        views = sets[name][0] if len(sets[name]) == 1 else sets[name][int(random.integers(len(sets[name])))]
         return ClipBatch(self._draw(random, kind, size, part), views, primary=name == PRIMARY)
 
-    def _drawn(self, kind: _Kind) -> dict[str, float]:
-        """Choices of views for steps on clips of a kind, with their weights."""
-        here = (PRIMARY, *((JOINT, SUBSET, *kind.views) if kind.views else ()))
-        return {name: weight * (name in here) for name, weight in self._view_weights.items()}
+    def _sets(self, kind: _Kind) -> dict[str, list[tuple[str, ...]]]:
+        """Sets of views, equally likely, that steps on clips of a kind may show, by the name in the view weights."""
+        if not kind.views:
+            return {PRIMARY: [(self.views[0],)]}
+        single = {view: [(view,)] for view in kind.views}
+        return {PRIMARY: [(self.views[0],)], JOINT: [kind.views], SUBSET: view_subsets(kind.views), **single}
 
-    def _sets(self, name: str, kind: _Kind) -> list[tuple[str, ...]]:
-        """Sets of views that a step on ``name`` may show, equally likely."""
-        if name == SUBSET:
-            return view_subsets(kind.views)
-        return [kind.views if name == JOINT else (self.views[0],) if name == PRIMARY else (name,)]
+    def _shares(self, sets: Mapping[str, object]) -> np.ndarray:
+        """Share of the steps by each of the view weights, where ``sets`` of views can be shown."""
+        return _normalised([weight * (name in sets) for name, weight in self._view_weights.items()])
 
     def view_sets(self, slots: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
         """Sets of the model's ``slots`` that `LEAST_SHARE` of the steps or more fill together."""
         shares: Counter[tuple[str, ...]] = Counter()
         for kind, share in zip(self._kinds, self._kind_weights, strict=True):
-            names = self._drawn(kind)
-            for name, weight in zip(names, _normalised(list(names.values())), strict=True):
-                for views in (sets := self._sets(name, kind)):
-                    shares[tuple(view for view in slots if view in views)] += share * weight / len(sets)
+            sets = self._sets(kind)
+            for name, weight in zip(self._view_weights, self._shares(sets), strict=True):
+                for views in sets.get(name, ()):
+                    shares[tuple(view for view in slots if view in views)] += share * weight / len(sets[name])
         return tuple(sorted(views for views, share in shares.items() if share >= LEAST_SHARE))
 
     def trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
@@ -202,18 +201,16 @@ class ClipSampler:
         return None if found == TrainedClips(view_sets=(slots,), strides=(1,)) else found
 
     def _draw(self, random: np.random.Generator, kind: _Kind, size: int, part: int) -> tuple[Clip, ...]:
-        draws = random.random((size * self.plan.together, 2))[part * size : (part + 1) * size]
+        count, own = size * self.plan.together, slice(part * size, (part + 1) * size)
+        draws = random.random((count, 2))[own]
+        vectors = random.random((count, len(self.views)))[own] < self.vector_share
         numbers = np.minimum(np.searchsorted(kind.cumulative, draws[:, 0], side="right"), len(kind.rows) - 1)
         clips: list[Clip] = []
-        for number, where in zip(numbers.tolist(), draws[:, 1].tolist(), strict=True):
+        for number, where, by_vector in zip(numbers.tolist(), draws[:, 1].tolist(), vectors, strict=True):
             row = kind.rows[number]
             starts = (row.num_frames - 1 - (kind.length - 1) * kind.stride) // self.start_step + 1
-            clips.append(Clip(row.episode_id, int(where * starts) * self.start_step, kind.length, kind.stride))
-        if self.vector_share:
-            chosen = random.random((size * self.plan.together, len(self.views)))[part * size : (part + 1) * size]
-            for number, row in enumerate(chosen < self.vector_share):
-                vectors = tuple(view for view, vector in zip(self.views, row, strict=True) if vector)
-                clips[number] = replace(clips[number], vectors=vectors)
+            start, shown = int(where * starts) * self.start_step, tuple(compress(self.views, by_vector))
+            clips.append(Clip(row.episode_id, start, kind.length, kind.stride, shown))
         return tuple(clips)
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -103,17 +104,17 @@ class ClipSource(ABC):
         """Some views of a clip.
 
         Raises:
-            DataError: the clip is damaged; the message names it.
+            DataError: the clip is damaged; the message names it, and where it is of frames the view and the file.
             ArtifactError: the clip does not belong to this source.
         """
 
-    def recorded_views(self, batch: ClipBatch, clip: Clip) -> tuple[str, ...]:
-        """The recorded views that fill a clip's slots: the task-facing one has a name of its own."""
-        return (self.row(clip.episode_id).primary_view,) if batch.primary else batch.views
+    def recorded_views(self, batch: ClipBatch) -> list[tuple[str, ...]]:
+        """The recorded views that fill each clip's slots: the task-facing one has a name of its own."""
+        return [(self.row(clip.episode_id).primary_view,) if batch.primary else batch.views for clip in batch.clips]
 
     def read_batch(self, batch: ClipBatch) -> Shaped[Tensor, "b v ..."]:
         """All clips of a batch; raises as `read`."""
-        return torch.stack([self.read(clip, self.recorded_views(batch, clip)) for clip in batch.clips])
+        return torch.stack(list(map(self.read, batch.clips, self.recorded_views(batch))))
 
     @abstractmethod
     def latents(self, read: Shaped[Tensor, "b v ..."], device: str) -> Float[Tensor, "b v c t h w"]:
@@ -182,11 +183,7 @@ class LatentStore(ClipSource):
         return sum(path.stat().st_size for path in self.root.glob("*.safetensors"))
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
-        """Latents of one clip (float32), views in the given order.
-
-        Raises:
-            ArtifactError: the clip does not fit the store, or its shard is damaged.
-        """
+        """Latents of one clip (float32), views in the given order."""
         selected = self._stored_views(clip, views)
         with self._shard(self._shard_of[clip.episode_id]) as shard:
             frames = [shard.get_slice(name)[:, :, first:stop] for name, first, stop in self._parts(clip)]
@@ -246,37 +243,31 @@ class ResidentLatents(LatentStore):
 
     def __init__(self, store: LatentStore, device: str) -> None:
         super().__init__(store.root, store.description, store.rows)
+        # A shard's header takes a few places, too.
+        places = self.stored_bytes // (2 * math.prod(self.latent_shape))
+        self._frames = torch.empty(places, *self.latent_shape, dtype=torch.float16, device=device)
         self._first: dict[str, tuple[int, int]] = {}
         """Of each tensor the place of its first frame, and how many it has."""
-        shards, places = sorted({*self._shard_of.values()}), 0
-        for file in shards:
+        place = 0
+        for file in with_progress(sorted({*self._shard_of.values()}), "reading latents", "shard"):
             with self._shard(file) as shard:
                 for name in shard.keys():  # noqa: SIM118
-                    views, _, frames, *_ = shard.get_slice(name).get_shape()
-                    self._first[name] = places, frames
-                    places += views * frames
-        self._frames = torch.empty(places, *self.latent_shape, dtype=torch.float16, device=device)
-        for file in with_progress(shards, "reading latents", "shard"):
-            with self._shard(file) as shard:
-                for name in shard.keys():  # noqa: SIM118
-                    frames = rearrange(shard.get_tensor(name).to(device), "v c t h w -> (t v) c h w")
-                    first, _ = self._first[name]
-                    self._frames[first : first + len(frames)] = frames
+                    latents = shard.get_tensor(name).to(device)
+                    frames = rearrange(latents, "v c t h w -> (t v) c h w")
+                    self._first[name] = place, latents.shape[2]
+                    self._frames[place : place + len(frames)] = frames
+                    place += len(frames)
         self._shards.clear()
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
-        return self._gathered([clip], [views])[0]
+        return self.read_batch(ClipBatch((clip,), views))[0]
 
     def read_batch(self, batch: ClipBatch) -> Float[Tensor, "b v c t h w"]:
-        return self._gathered(batch.clips, [self.recorded_views(batch, clip) for clip in batch.clips])
-
-    def _gathered(self, clips: Sequence[Clip], views: Sequence[tuple[str, ...]]) -> Float[Tensor, "b v c t h w"]:
-        """Some views of clips of one length; raises as `read`."""
-        selected = np.array([self._stored_views(clip, shown) for clip, shown in zip(clips, views, strict=True)])
-        parts = [self._parts(clip) for clip in clips]
+        selected = np.array(list(map(self._stored_views, batch.clips, self.recorded_views(batch))))
+        parts = [self._parts(clip) for clip in batch.clips]
         lengths = [stop - first for _, first, stop in parts[0]]
         within = np.concatenate([np.arange(length) for length in lengths])
-        count = np.array([len(self._by_id[clip.episode_id].views) for clip in clips])[:, None]
+        count = np.array([len(self.row(clip.episode_id).views) for clip in batch.clips])[:, None]
         begin = np.array([[self._place(*part) for part in own] for own in parts])
         first, skipped = (np.repeat(values, lengths, axis=1) for values in (begin[..., 0], begin[..., 1]))
         places = (first + (skipped + within) * count)[:, None] + selected[..., None]
@@ -338,25 +329,18 @@ class FrameSource(ClipSource):
         return FrameDecoder()
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> UInt8[Tensor, "v n h w 3"]:
-        """The clip's frames at the training size, RGB.
-
-        Raises:
-            DataError: a frame cannot be read; the message names the clip, the view and the file.
-            ArtifactError: the episode is not in the set.
-        """
+        """The clip's frames at the training size, RGB."""
         position = self.episodes.position(self.row(clip.episode_id).episode_id)
         frames = np.empty((len(views), clip.num_frames, *self.image_size, 3), np.uint8)
         for pictures, view in zip(frames, views, strict=True):
-            where: object = f"{clip}, view {view}"
             try:
                 video = self.episodes.clip(position, view)
-                where = f"{clip}, view {view}, in {video.path}"
                 for target, picture in zip(pictures, self.decoder.frames(video, clip.frames), strict=True):
                     resize_frame(picture, self.image_size, out=target)
             except DataError as error:
                 raise DataError(
                     f"A clip cannot be read: {error.what}",
-                    where=where,
+                    where=f"{clip}, view {view}, in {error.where}",
                     expected=error.expected,
                     got=error.got,
                     next_step="repair or drop the episode",

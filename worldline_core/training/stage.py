@@ -175,7 +175,7 @@ class Stage:
             trainer,
             groups=groups,
             objective=objective,
-            load=loader.batches(self.sampler, config.input),
+            load=loader.batches(self.sampler, config.input.workers),
             validate=self.held_out(loader).validation(trainer, objective),
             probe=probe,
             output=self.output,
@@ -268,8 +268,6 @@ class HeldOutConfig(Protocol):
     def clips(self) -> ClipSampling: ...
     @property
     def validation_splits(self) -> Sequence[str]: ...
-    @property
-    def input(self) -> ClipInput: ...
 
 
 @dataclass(frozen=True)
@@ -313,8 +311,7 @@ class HeldOutClips:
             held_out, clips, views=self.loader.views, splits=splits, start_step=self.loader.source.start_step,
             batch_size=size, seed=VALIDATION_SEED, vector_share=self.vector_share,
         )  # fmt: skip
-        reading = self.config.input.model_copy(update={"workers": 0})
-        load = self.loader.batches(sampler, reading)
+        load = self.loader.batches(sampler)
         return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)
 
     def action_following(
