@@ -251,50 +251,35 @@ class Training:
         operations = sum(share * steps[step].operations for step, share in self.turns.items())
         return Held(most, 0, operations + sum(times * held.operations for times, held in before))
 
-    def _parts(self, shards: int) -> tuple[dict[str, float], int, int]:
-        """Bytes of weights, and what comes with them, at all layers; bytes of gradients when they are whole; trained parameters."""
-        trainer = self.trainer
-
-        def parts(layers: int) -> dict[str, float]:
-            with FakeTensorMode():
-                work = self.outline(layers, trainer.weights if shards == 1 else None)
-            seen: set[int] = set()
-            scores = sum(_new_bytes(score, seen) for score in work.scores)
-            trained = [[value for value in model.parameters() if value.requires_grad] for model in work.models]
-            return {
-                "weights": sum(_new_bytes(model, seen) for model in work.models) / shards,
-                "moments": sum(_moment_bytes(value, trainer) for values in trained for value in values) / shards,
-                "average": (trainer.average == "device") * sum(4 * value.numel() for value in trained[0]) / shards,
-                **{name: sum(value.nbytes for value in one.state_dict().values()) for name, one in work.whole.items()},
-                "frozen scores": scores / shards,
-                "gradients": max(sum(value.nbytes for value in values) for values in trained),
-                "trained": sum(value.numel() for values in trained for value in values)
-                or sum(value.numel() for value in work.models[0].parameters()),
-                "block": sum(value.numel() for value in work.models[0].layers[0].parameters()),
-            }
-
-        one, two = parts(1), parts(2)
-        line = {name: size + (two[name] - size) * (self.model.num_layers - 1) for name, size in one.items()}
-        return line, round(line.pop("trained")), round(line.pop("block"))
-
     def estimate(self, devices: int) -> Estimate:
         """Memory on each of so many devices that share the training."""
         trainer, sharding = self.trainer, self.trainer.sharding
         shards, clips = min(sharding.shards or devices, devices), trainer.batch_size * devices
         micro_steps = trainer.accumulation if trainer.global_batch is None else -(-trainer.global_batch // clips)
         held = self._held(sharded=shards > 1)
-        sizes, trained, block = self._parts(shards)
+        with FakeTensorMode():
+            work = self.outline(self.model.num_layers, trainer.weights if shards == 1 else None)
+        trained = [[value for value in model.parameters() if value.requires_grad] for model in work.models]
+        count = sum(value.numel() for values in trained for value in values)
+        block = sum(value.numel() for value in work.models[0].layers[0].parameters())
         summed = micro_steps == 1 or sharding.reduce_every_micro_step
+        seen: set[int] = set()
+        scores = sum(_new_bytes(score, seen) for score in work.scores)
         parts = {
-            **sizes,
+            "weights": sum(_new_bytes(model, seen) for model in work.models) / shards,
+            "moments": sum(_moment_bytes(value, trainer) for values in trained for value in values) / shards,
+            "average": (trainer.average == "device") * sum(4 * value.numel() for value in trained[0]) / shards,
+            **{name: sum(value.nbytes for value in one.state_dict().values()) for name, one in work.whole.items()},
+            "frozen scores": scores / shards,
             # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
             "gathered": 0 if shards == 1 else block * (2 * 2 + 2 + 4),
-            "gradients": sizes["gradients"] / (shards if summed else 1),
+            "gradients": max(sum(value.nbytes for value in values) for values in trained) / (shards if summed else 1),
             "activations": held.forward,
         }
         operations = micro_steps * held.operations if trainer.precision == "bf16" else None
         parts = {name: size for name, size in parts.items() if size}
-        return Estimate(self.title, trained, parts, operations, trainer.steps, trainer.minutes)
+        parameters = count or sum(value.numel() for value in work.models[0].parameters())
+        return Estimate(self.title, parameters, parts, operations, trainer.steps, trainer.minutes)
 
 
 class _Similarities(ClipSimilarities):
