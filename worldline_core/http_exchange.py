@@ -17,6 +17,9 @@ import httpx
 
 from worldline_core.errors import UnavailableError
 
+_trusted_authorities = functools.cache(ssl.create_default_context)
+"""The system's certificates, which take 30 ms to read: longer than a small answer."""
+
 
 class UnreachableError(Exception):
     """No server listens at the address."""
@@ -60,12 +63,6 @@ def exchange(
         raise UnreachableError(f"{type(error).__name__}: {error}") from error
     except (httpx.HTTPError, OSError) as error:
         raise IncompleteResponseError(f"{type(error).__name__}: {error}") from error
-
-
-@functools.cache
-def _trusted_authorities() -> ssl.SSLContext:
-    """The system's certificates, which take 30 ms to read: longer than a small answer."""
-    return ssl.create_default_context()
 
 
 def within[T](seconds: float, call: Callable[[], T], *, discard: Callable[[T], object] = lambda late: None) -> T:

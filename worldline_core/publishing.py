@@ -22,11 +22,11 @@ from upath import UPath
 
 from worldline_core.config import StrictModel
 from worldline_core.data.curation.source_table import read_source_table
-from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
+from worldline_core.data.episodes.source import for_evaluation_only
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
 from worldline_core.http_exchange import hub_access
+from worldline_core.report.data import write_card
 from worldline_core.store.artifact_files import (
     MANIFEST_NAME,
     VOLATILE_FOLDER,
@@ -50,9 +50,14 @@ class PublishedFile(StrictModel):
     size: int = Field(ge=0)
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
 
-    def fits(self, path: Path) -> bool:
+    @classmethod
+    def of(cls, path: Path) -> PublishedFile:
+        """Size and digest of the file at a path."""
+        return cls(size=path.stat().st_size, sha256=digest_file(path))
+
+    def is_at(self, path: Path) -> bool:
         """Returns whether this is the file at a path."""
-        return path.is_file() and path.stat().st_size == self.size and digest_file(path) == self.sha256
+        return path.is_file() and self.of(path) == self
 
 
 class FileList(StrictModel):
@@ -83,11 +88,10 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
     sources = set_files(folder)
     if not allow_restricted:
         _check_may_publish(folder, public=public)
-    sizes = {name: path.stat().st_size for name, path in sorted(sources.items())}
-    files = {name: PublishedFile(size=size, sha256=digest_file(sources[name])) for name, size in sizes.items()}
-    _check_names(files, folder)
-    contents = FileList(files=files)
-    sending: dict[str, Path] = sources if "README.md" in files else {**sources, **_card_files(folder)}
+    contents = FileList(files={name: PublishedFile.of(path) for name, path in sorted(sources.items())})
+    _check_names(sources, folder)
+    card = {} if "README.md" in sources else {"README.md": write_card(folder, folder / VOLATILE_FOLDER / "card")}
+    sending = sources | card
     with _client_errors(where, "push"):
         hub = _Repository(where) if where.startswith("hf://") else None
         location = hub.prepare(public=public) if hub else _location(where)
@@ -102,7 +106,7 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
                 next_step="push to a location of its own",
             )
         earlier = _read_list(location, present).files if FILE_LIST in present else {}
-        gone = sorted((earlier.keys() - files.keys()) & present.keys())
+        gone = sorted((earlier.keys() - sources.keys()) & present.keys())
         (hub.commit if hub else partial(_send, location))(sending, gone, contents.model_dump_json(indent=1).encode())
     return contents
 
@@ -131,14 +135,10 @@ def pull(where: str, folder: Path) -> FileList:
                 name = path.relative_to(unfinished)
                 if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
                     path.unlink()
-            missing = [name for name, file in contents.files.items() if not file.fits(unfinished / name)]
+            missing = {name: file for name, file in contents.files.items() if not file.is_at(unfinished / name)}
             with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-                list(
-                    pool.map(
-                        lambda name: _fetch(location / name, unfinished / name, contents.files[name].size), missing
-                    )
-                )
-            _raise_mismatch([name for name in missing if not contents.files[name].fits(unfinished / name)], where)
+                list(pool.map(partial(_fetch, location, unfinished), missing, [file.size for file in missing.values()]))
+            _raise_mismatch([name for name, file in missing.items() if not file.is_at(unfinished / name)], where)
         set_files(unfinished)  # a set that refers to folders beside it would read what others put there
         verify_artifact(unfinished)
         unfinished.rename(folder)
@@ -164,28 +164,20 @@ def set_files(folder: Path) -> dict[str, Path]:
     return {path.relative_to(folder).as_posix(): path for path in paths}
 
 
-def _card_files(folder: Path) -> dict[str, Path]:
-    from worldline_core.report.data import write_card
-
-    output = folder / VOLATILE_FOLDER / "card"
-    path = write_card(folder, output)
-    return {path.name: path}
-
-
 def _check_may_publish(folder: Path, *, public: bool) -> None:
     """Raises: DataError for sources whose licence forbids redistribution or, in a public place, does not mention it, and
     for recordings meant for evaluation only.
     """
-    sources = read_source_table(folder)
-    named = {
-        kind: [f"{s.label} ({s.license})" for s in sources if s.redistribution == kind] for kind in ("no", "unknown")
-    }
-    unknown = named["unknown"] if sources else ["all"]
-    evaluation = sorted({row.source for row in EpisodeSet.open(folder).rows if _evaluation_only(row)})
+    sources, rows = read_source_table(folder), EpisodeSet.open(folder).rows
+    forbidden, unknown = (
+        [f"{source.label} ({source.license})" for source in sources if source.redistribution == kind]
+        for kind in ("no", "unknown")
+    )
+    evaluation = {r.source for r in rows if for_evaluation_only(json.loads(r.conventions), r.source, r.embodiment)}
     for what, names in (
-        ("Sources forbid redistribution", named["no"]),
-        ("Sources are for evaluation only", evaluation),
-        ("Sources do not state whether redistribution is allowed", unknown if public else []),
+        ("Sources forbid redistribution", forbidden),
+        ("Sources are for evaluation only", sorted(evaluation)),
+        ("Sources do not state whether redistribution is allowed", (unknown if sources else ["all"]) if public else []),
     ):
         if names:
             raise DataError(
@@ -195,12 +187,6 @@ def _check_may_publish(folder: Path, *, public: bool) -> None:
                 got=", ".join(names),
                 next_step="leave these sources out, or, if you have the right, add --allow-restricted",
             )
-
-
-def _evaluation_only(row: EpisodeRow) -> bool:
-    conventions = json.loads(row.conventions)
-    marked = conventions.get("layout") in EVALUATION_LAYOUTS or EVALUATION_ONLY in conventions
-    return marked or says_droid(row.source, row.embodiment)
 
 
 def _check_names(names: Mapping[str, object], where: object) -> None:
@@ -280,10 +266,10 @@ def _pieces(source: AnyPath, size: int) -> Iterator[bytes]:
             yield piece
 
 
-def _fetch(source: AnyPath, target: Path, size: int) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with target.open("wb") as stream:
-        stream.writelines(_pieces(source, size))
+def _fetch(location: AnyPath, folder: Path, name: str, size: int) -> None:
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    with (folder / name).open("wb") as stream:
+        stream.writelines(_pieces(location / name, size))
 
 
 def _send(location: AnyPath, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:

@@ -137,8 +137,7 @@ def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
     base = fs._strip_protocol(str(root)).rstrip("/")
     with _answering(root):
         found = _find(fs, base)
-    relative = {name.removeprefix(base).lstrip("/"): found[name] for name in sorted(found)}
-    return {name: about for name, about in relative.items() if name}
+    return {name: found[path] for path in sorted(found) if (name := path.removeprefix(base).lstrip("/"))}
 
 
 def _find(fs: Any, base: str) -> dict[str, dict[str, Any]]:

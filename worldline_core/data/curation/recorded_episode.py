@@ -15,7 +15,7 @@ import numpy as np
 from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits
 from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode, Split
 from worldline_core.data.episodes.instructions import with_instruction
-from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, LoadedEpisode, Masks, says_droid
+from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, LoadedEpisode, Masks, for_evaluation_only
 from worldline_core.data.episodes.view_recording import ViewImages
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import frame_times
@@ -212,16 +212,13 @@ def motion(view: ViewThumbnails) -> float:
 def check_split(episode: Episode) -> None:
     """Raises: ConfigError when an episode for evaluation only is given a split that trains or selects a model.
 
-    For evaluation only are episodes of an evaluation-only layout, those declared so, and any whose source or robot is
-    called DROID. The layout is noted in the episode, so a set made of such recordings earlier is refused as well.
+    The layout is noted in the episode, so a set made of such recordings earlier is refused as well.
     """
-    layout = episode.conventions.get("layout")
-    called = says_droid(episode.source, episode.embodiment)
-    kept_out = called or layout in EVALUATION_LAYOUTS or EVALUATION_ONLY in episode.conventions
+    kept_out = for_evaluation_only(episode.conventions, episode.source, episode.embodiment)
     if kept_out and episode.split in TRAINING_SPLITS:
         raise ConfigError(
             "Recordings for evaluation only were assigned to training",
-            where=f"episode {episode.episode_id}, scene {episode.scene} ({layout})",
+            where=f"episode {episode.episode_id}, scene {episode.scene} ({episode.conventions.get('layout')})",
             expected="split test or ood_test",
             got=episode.split,
             next_step="change the source's split or curate.splits; what is not DROID must not be called so",

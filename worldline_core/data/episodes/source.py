@@ -270,6 +270,12 @@ def says_droid(*names: str) -> bool:
     return any(_DROID.search(name) for name in names)
 
 
+def for_evaluation_only(conventions: Mapping[str, object], *names: str) -> bool:
+    """True for recordings of an evaluation-only layout, those declared so, and any whose source or robot is called DROID."""
+    marked = conventions.get("layout") in EVALUATION_LAYOUTS or EVALUATION_ONLY in conventions
+    return marked or says_droid(*names)
+
+
 def joint_names(arms: Mapping[str, int], *, gripper: bool = True) -> tuple[str, ...]:
     """Names of state columns, from arm -> number of its joints: left/joint_1, ..., left/gripper, right/joint_1, ..."""
     last = ["gripper"] if gripper else []
