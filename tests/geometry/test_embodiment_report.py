@@ -53,6 +53,7 @@ def break_the_reader(monkeypatch: pytest.MonkeyPatch, metres: float) -> None:
         return tree
 
     monkeypatch.setattr(kinematic_tree, "read_mjcf", wrong)
+    monkeypatch.setattr(kinematic_tree, "_read", kinematic_tree._read.__wrapped__)  # not cached
 
 
 @pytest.mark.parametrize(("metres", "passed"), [(2e-5, False), (5e-6, True)])

@@ -14,12 +14,14 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.geometry.embodiment import Embodiment, read_description
+from worldline_core.geometry.embodiment import Embodiment, RigidOffset, read_description
 from worldline_core.geometry.transforms import rotation_about_axis, rotation_from_euler_fixed_xyz
 
 _UNDECLARED_PREFIX = re.compile(r"</?([A-Za-z_][\w.-]*):|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=")
@@ -43,7 +45,7 @@ class TreeJoint:
     position: np.ndarray
 
 
-@dataclass
+@dataclass(eq=False)
 class TreeBody:
     """A body, link or site: its pose in its parent at joint positions zero, its joints in order, its children."""
 
@@ -394,7 +396,7 @@ def _urdf_joints(joint: ET.Element, where: object) -> list[TreeJoint]:
 
 
 def read_tree(embodiment: Embodiment) -> TreeBody:
-    """The tree of an embodiment's description, with its mounts.
+    """The tree of an embodiment's description, with its mounts; the same object for the same description.
 
     Raises:
         UnavailableError, DataError: it cannot be read.
@@ -402,8 +404,13 @@ def read_tree(embodiment: Embodiment) -> TreeBody:
     """
     mounts = embodiment.known_mounts()
     text, path = read_description(embodiment), embodiment.description_path
-    tree = read_urdf(text, path) if embodiment.description.format == "urdf" else read_mjcf(text, path)
-    return mounted(tree, {name: offset.matrix() for name, offset in mounts.items()}) if mounts else tree
+    return _read(text, path, embodiment.description.format, tuple(mounts.items()))
+
+
+@lru_cache(maxsize=64)
+def _read(text: str, path: Path, form: str, mounts: tuple[tuple[str, RigidOffset], ...]) -> TreeBody:
+    tree = read_urdf(text, path) if form == "urdf" else read_mjcf(text, path)
+    return mounted(tree, {name: offset.matrix() for name, offset in mounts}) if mounts else tree
 
 
 def tool_poses(

@@ -7,7 +7,7 @@ float64. Axis legend: n frames, a arms, j state columns, l links.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -188,8 +188,9 @@ class KinematicsByName:
         return result
 
 
+@lru_cache(maxsize=64)
 def chain_from_tree(tree: TreeBody) -> Chain:
-    """A `pytorch_kinematics` chain whose frames are the bodies and sites of the tree.
+    """A `pytorch_kinematics` chain whose frames are the bodies and sites of the tree, the same for the same tree.
 
     MuJoCo turns a body about each of its joints in order, at the joint's position: T_body J1 J2 ..., with
     J = Trans(p) R(axis, q) Trans(-p). A chain frame has one joint, so a body gets one frame per joint, and a last
