@@ -31,11 +31,11 @@ check_shapes_of([f"worldline_core.{name}" for name in CHECKED_PACKAGES])
 IDLE_SERVICES = ("SCHEDULER", "LATE_RUNS", "CANCELLATION_CLEANUP", "PAUSE_EXPIRATIONS", "FOREMAN", "TRIGGERS")
 """Of Prefect's server: for schedules, workers and automations."""
 
-WITH_DIFFUSERS = tuple(
+HEAVY_IMPORTS = tuple(
     f"tests/{name}"
     for name in (
-        "distillation/", "evaluation/test_judges", "model/", "robustness/test_hostile_weights", "training/test_adapters",
-        "training/test_memory_estimate", "training/test_text", "training/test_tokenizer_steps",
+        "distillation/", "evaluation/test_judges", "hub/test_own_models", "model/", "pipeline/test_size_sheet",
+        "robustness/test_hostile_weights", "training/",
     )
 )  # fmt: skip
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
@@ -44,9 +44,10 @@ PROJECT_ROOT = Path(__file__).resolve().parents[1]
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The rehearsal takes as long as all other slow tests on one core: begun last, it would keep the second one idle.
 
-    Tests that need diffusers, transformers or peft follow, for the same process: each imports them for some seconds.
+    Tests that need diffusers, transformers, peft or an optimizer (which imports torch._dynamo) follow, for the same process:
+    each imports them for some seconds.
     """
-    items.sort(key=lambda item: ("tests/rehearsal/" not in item.nodeid, not item.nodeid.startswith(WITH_DIFFUSERS)))
+    items.sort(key=lambda item: ("tests/rehearsal/" not in item.nodeid, not item.nodeid.startswith(HEAVY_IMPORTS)))
 
 
 @pytest.fixture

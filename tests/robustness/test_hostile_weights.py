@@ -125,7 +125,7 @@ def segmenter(tmp_path: Path) -> Path:
         {"widths": 8}, {"widths": ["x"]}, {"widths": [8, 16, 24]}, {"threshold": None}, {"threshold": 1e400},
         {"threshold": math.nan}, {"threshold": -1},
     ],
-    ids=str,
+    ids=lambda change: str(change)[:40],
 )  # fmt: skip
 def test_a_segmenters_description_that_fits_no_weights_is_refused(
     change: dict[str, Any], segmenter: Path, little_memory: None
