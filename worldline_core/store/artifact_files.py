@@ -191,15 +191,15 @@ def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
     """
     root, depth = folder.resolve(), len(folder.parts)
     files = []
-    for path in sorted(folder.rglob("*")):
-        relative = path.parts[depth:]
-        ours = relative[0] == VOLATILE_FOLDER or relative == (MANIFEST_NAME,)
-        if (ours and not everything) or path.is_dir():
-            continue
+    for place, folders, names in os.walk(folder):
+        if place == str(folder) and not everything:
+            folders[:] = [name for name in folders if name != VOLATILE_FOLDER]
+            names = [name for name in names if name not in (VOLATILE_FOLDER, MANIFEST_NAME)]
+        files += [Path(place, name) for name in names]
+    for path in files:
         if path.is_symlink() and leads_out(path, root):
             raise ArtifactError("A symbolic link leads out of the folder", where=path, got=path.resolve())
-        files.append(path)
-    return files
+    return sorted(files, key=lambda path: path.parts[depth:])
 
 
 def _files_by_name(folder: Path, *, everything: bool = False) -> dict[str, Path]:
