@@ -107,9 +107,8 @@ def test_images_of_a_wrong_kind_are_refused(healthy: list) -> None:
         diagnose(replace(item.poses, T_base_ee=item.poses.T_base_ee[:, :1]), item.gray, item.kinematics)
 
 
-@pytest.mark.parametrize("mistake", [{"image_lag_frames": 2}, {"gripper": "inverted"}])
-def test_quick_search_finds_the_same(healthy: list, mistake: dict[str, Any]) -> None:
-    conventions = RecordedConventions.model_validate(mistake)
+def test_quick_search_finds_the_same(healthy: list) -> None:
+    conventions = RecordedConventions(gripper="inverted")
     assert benchmark.examine(healthy[0], healthy[0].joints, conventions, quick=True).best.conventions == conventions
 
 
@@ -209,7 +208,7 @@ def with_exchanged_extrinsics(episode: Episode) -> Episode:
     return replace(episode, cameras=dict(episode.cameras) | exchanged)
 
 
-@pytest.mark.parametrize(("truth", "declared"), [("ur5e", "viperx_graphite"), ("panda", "xarm7_white")])
+@pytest.mark.parametrize(("truth", "declared"), [("ur5e", "viperx_graphite"), *slow(("panda", "xarm7_white"))])
 def test_another_robot_than_declared_is_named(healthy: list, truth: str, declared: str) -> None:
     item = of_robot(healthy, truth)
     diagnosis = declared_as(item, declared)
@@ -294,10 +293,16 @@ AXES, UNIT, ANGLES = (
 @pytest.mark.parametrize(
     ("first", "second"),
     [
-        (UNIT, INVERSE),
         (ANGLES, None),
         *slow(
-            (AXES, INVERSE), (ANGLES, INVERSE), (AXES, UNIT), (AXES, ANGLES), (UNIT, ANGLES), (AXES, None), (UNIT, None)
+            (UNIT, INVERSE),
+            (AXES, INVERSE),
+            (ANGLES, INVERSE),
+            (AXES, UNIT),
+            (AXES, ANGLES),
+            (UNIT, ANGLES),
+            (AXES, None),
+            (UNIT, None),
         ),
     ],
 )

@@ -6,7 +6,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -125,7 +124,7 @@ CONFIG = FilterConfig(min_segment_frames=8)
 
 @pytest.fixture(scope="module")
 def filtered(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four episodes of one recording: healthy, dark in the middle, black throughout, and with a camera turned about."""
+    """Three episodes of one recording: healthy, dark in the middle, and black throughout."""
     root = tmp_path_factory.mktemp("artifacts")
     episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
     i = episodes.position("ur5e_silver-test-s1-00002")
@@ -133,13 +132,10 @@ def filtered(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
     dark = frames["head"].copy()
     dark[12:18] = dark[12:18] // 16
-    head = episode.cameras["head"]
-    turned = episode.cameras | {"head": replace(head, T_base_camera=np.linalg.inv(head.T_base_camera))}
     with EpisodeSetWriter(root / "curate" / "key") as writer:
         writer.add(replace(episode, episode_id="healthy"), frames)
         writer.add(replace(episode, episode_id="dark"), {**frames, "head": dark})
         writer.add(replace(episode, episode_id="black"), {**frames, "head": frames["head"] // 16})
-        writer.add(replace(episode, episode_id="turned", cameras=turned), frames)
     folder = root / "filter" / "key"
     filter_episodes(CONFIG, {"episodes": root / "curate" / "key"}, folder)
     inputs = {"episodes": {"path": "curate/key", "digest": "0"}}
