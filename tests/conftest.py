@@ -34,8 +34,9 @@ IDLE_SERVICES = ("SCHEDULER", "LATE_RUNS", "CANCELLATION_CLEANUP", "PAUSE_EXPIRA
 HEAVY_IMPORTS = tuple(
     f"tests/{name}"
     for name in (
-        "distillation/", "evaluation/test_judges", "hub/test_own_models", "model/", "pipeline/test_size_sheet",
-        "robustness/test_hostile_weights", "training/",
+        "distillation/", "evaluation/test_judges", "evaluation/test_learned_judge", "evaluation/test_measurements",
+        "hub/test_own_models", "model/", "pipeline/test_size_sheet",
+        "robustness/test_hostile_weights", "tasks/test_progress", "training/",
     )
 )  # fmt: skip
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
