@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from flows.pipeline import chain
@@ -21,7 +23,7 @@ from worldline_core.store.store import ArtifactStore
 pytestmark = pytest.mark.slow
 
 
-def _run(project_root: Path, name: str, *arguments: str | Path, cwd: Path | None = None) -> str:
+def _run(project_root: Path, name: str, *arguments: object, cwd: Path | None = None) -> str:
     result = subprocess.run(
         [sys.executable, project_root / "examples" / name, *map(str, arguments)],
         cwd=cwd or project_root, capture_output=True, text=True, check=False,
@@ -73,3 +75,30 @@ def test_train_on_a_lerobot_dataset(project_root: Path, tmp_path: Path) -> None:
     assert "angle_unit: " in printed
     (trained,) = (tmp_path / "artifacts/train_stage1").glob("*/manifest.json")
     assert json.loads(trained.read_text())["metrics"]["steps"] == 2
+
+
+def test_practise_a_controller_inside(project_root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    recordings = tmp_path / "biased"
+    record = [
+        sys.executable,
+        "-m",
+        "flows.command_line",
+        "record",
+        "--config",
+        "configs/recording/biased_controllers.yaml",
+    ]
+    changes = ("starts.families=[close]", "starts.count=4", "workers=1")
+    options = [text for change in changes for text in ("--set", change)]
+    subprocess.run([*record, *options, "--output", recordings], cwd=project_root, check=True, capture_output=True)
+    search = ("--task", "close", "--starts", 1, "--rounds", 1, "--population", 4, "--batch", 4)
+    printed = _run(project_root, "practice_inside.py", "--recordings", recordings, *search)
+    found = json.loads(printed.splitlines()[-1])
+    assert found["before"] == 0.0
+    assert [found[world]["episodes"] for world in ("inside", "mujoco")] == [[4], [4]]
+    # The right shift, the opposite of the bias, closes every drawer in MuJoCo: the tools went where they were to go.
+    example = runpy.run_path(str(project_root / "examples" / "practice_inside.py"))
+    controller = example["ShiftedController"](recordings, "biased", "close", "ur5e_silver")
+    successes = example["physics"](recordings, "ur5e_silver")
+    right = np.array([0.05, -0.03, 0.0])
+    assert successes([(start, controller.shifted(start, right)) for start in controller.commands]) == [1.0] * 4
