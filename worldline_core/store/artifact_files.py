@@ -191,7 +191,7 @@ def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
     """
     root, depth = folder.resolve(), len(folder.parts)
     files = []
-    for place, folders, names in os.walk(folder):
+    for place, folders, names in os.walk(folder, onerror=_refuse):
         if place == str(folder) and not everything:
             folders[:] = [name for name in folders if name != VOLATILE_FOLDER]
             names = [name for name in names if name not in (VOLATILE_FOLDER, MANIFEST_NAME)]
@@ -200,6 +200,10 @@ def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
         if path.is_symlink() and leads_out(path, root):
             raise ArtifactError("A symbolic link leads out of the folder", where=path, got=path.resolve())
     return sorted(files, key=lambda path: path.parts[depth:])
+
+
+def _refuse(error: OSError) -> None:
+    raise error  # os.walk would leave out a folder that cannot be listed
 
 
 def _files_by_name(folder: Path, *, everything: bool = False) -> dict[str, Path]:
