@@ -224,6 +224,7 @@ def configured(folder: Path, **source: Any) -> str:
     return str(folder / "mine.yaml")
 
 
+@pytest.mark.slow
 def test_a_mistake_is_found_and_the_printed_line_repairs_it(project_root, tmp_path, capsys):
     source = {"kind": "episode_set", "path": str(project_root / "artifacts/shipped/recordings"), "include": [INVERTED]}
     assert run(configured(tmp_path, **source), "--output", str(tmp_path / "wrong")) == 1

@@ -126,6 +126,7 @@ def training(recordings, monkeypatch):
     return {"episodes": recordings.inputs["episodes"]}
 
 
+@pytest.mark.slow
 def test_killed_training_continues_to_the_same_bytes(recordings, training, tmp_path, monkeypatch, killed_after):
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     result = learned.train_segmenter(CONFIG, training, whole)

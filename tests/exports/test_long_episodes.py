@@ -96,7 +96,15 @@ def read_mcap(recorded: Recorded, output: Path) -> None:
 WITH_THUMBNAILS = "episode as lerobot"
 """Keeps grey thumbnails of 72 x 96 until the episode is whole, 0.19 of a view's frames each: those of three views, one of them
 twice while it is stacked, and what they are packed into: 0.97 when measured."""
-SLOW = ("episode as mcap", "episode as rrd", "rollout as mcap and rrd", "inspect", "curate", "exact masks")
+SLOW = (
+    "side by side",
+    "episode as mcap",
+    "episode as rrd",
+    "rollout as mcap and rrd",
+    "inspect",
+    "curate",
+    "exact masks",
+)
 
 OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
     "side by side": lambda r, out: write_side_by_side(

@@ -40,6 +40,7 @@ def predicted(root: Path, episodes: EpisodeSet, method: str, change: Any = lambd
     return RolloutSet.open(root)
 
 
+@pytest.mark.slow
 def test_an_archive_is_read_back_and_measured(episodes: EpisodeSet, tmp_path: Path) -> None:
     for method in ("ours_v2_test", "ours_v2_test_1", "ours_v2_10data"):
         rollouts = predicted(tmp_path / method, episodes, method)

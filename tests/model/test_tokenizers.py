@@ -299,6 +299,7 @@ def test_a_small_decoder_decodes_latents_as_they_arrive(patch, wan):
             decoder.decode(latents[:, 1:])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_training_lowers_the_error_and_leaves_the_encoder_as_it_is(patch, wan, tmp_path):
     held_out = scenes(seed=11)

@@ -108,6 +108,7 @@ def test_every_stage_of_a_preset_fits_its_card(preset):
     assert sheet.as_text(rows, rollouts).count("blocks of 16 frames") == 2
 
 
+@pytest.mark.slow
 def test_operations_of_a_block_are_those_that_a_rollout_does(make_model):
     config = PipelineConfig.load("smoke").distill
     spec, views = config.spec, config.views

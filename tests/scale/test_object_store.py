@@ -50,6 +50,7 @@ def curated_digest(configured: CurateConfig, output: Path) -> str:
     return digest_folder(output)
 
 
+@pytest.mark.slow
 def test_a_set_in_the_store_gives_the_bytes_of_one_in_a_folder(
     tmp_path: Path, recordings: Path, store: ObjectStore
 ) -> None:

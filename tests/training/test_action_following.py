@@ -137,6 +137,7 @@ def stage2(**changes):
     return conftest.stage2(2, **values | changes)
 
 
+@pytest.mark.slow
 def test_a_run_logs_what_its_averaged_weights_do_and_resumes_with_the_same_bytes(inputs, tmp_path, killed_after):
     train_stage2(stage2(), inputs, tmp_path / "whole")
     with killed_after(1):
