@@ -8,9 +8,9 @@ from pathlib import Path
 
 from prefect import flow
 
-from flows.pipeline import Inputs, evaluate, predict, prepare, prepare_models, train
+from flows.pipeline import evaluate, predict, prepare, prepare_models, train
 from tasks.ablation_table import ablation_table
-from tasks.execution.artifact_task import variant
+from tasks.execution.artifact_task import Inputs, variant
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
 from worldline_core.pipeline.ablations import FULL, METHOD, LoadConfig, choose_variants, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig

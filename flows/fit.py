@@ -7,9 +7,9 @@ from pathlib import Path
 
 from prefect import flow
 
-from flows.pipeline import STORE, chain
+from flows.pipeline import chain
 from tasks.estimate_cameras import estimate_cameras
-from tasks.execution.prefect_artifacts import run_chain
+from tasks.execution.prefect_artifacts import STORE, run_chain
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
 from worldline_core.calibration.estimate.estimate_config import CAMERAS, ESTIMATE, EstimateConfig
 from worldline_core.data.episodes.conventions import with_image_lags

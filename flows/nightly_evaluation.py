@@ -6,7 +6,8 @@ from pathlib import Path
 
 from prefect import flow, task
 
-from flows.pipeline import Inputs, evaluate, predict, prepare
+from flows.pipeline import evaluate, predict, prepare
+from tasks.execution.artifact_task import Inputs
 from tasks.execution.prefect_artifacts import show_in_prefect
 from tasks.execution.prefect_run import PrefectRun
 from tasks.report import report

@@ -1,7 +1,5 @@
 """The pipeline: `chain` is its only description, a call for each step. Nightly evaluation and ablations compose its parts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from prefect import flow
@@ -12,9 +10,8 @@ from tasks.encode_latents import encode_latents
 from tasks.evaluate_planning import evaluate_planning
 from tasks.evaluate_policy import evaluate_policy
 from tasks.evaluate_video import evaluate_video
-from tasks.execution.artifact_task import TaskCall
-from tasks.execution.prefect_artifacts import run_chain
-from tasks.execution.prefect_run import ArtifactReference
+from tasks.execution.artifact_task import Inputs, TaskCall
+from tasks.execution.prefect_artifacts import STORE, ArtifactReference, run_chain
 from tasks.filter import filter_episodes
 from tasks.import_rollouts import import_rollouts
 from tasks.record import record
@@ -27,9 +24,6 @@ from tasks.train_stage1 import train_stage1
 from tasks.train_stage2 import train_stage2
 from tasks.train_tokenizer import train_tokenizer
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-
-type Inputs = dict[str, TaskCall | Path]
-STORE = Path("artifacts")
 
 
 @flow(name="pipeline", flow_run_name="pipeline-{preset}", retries=0)

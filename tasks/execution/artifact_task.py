@@ -152,6 +152,10 @@ class TaskCall:
         return f"worldline task {self.task.name}" + ("" if self.name == self.task.name else f" --name {self.name}")
 
 
+type Inputs = dict[str, TaskCall | Path]
+"""Where the inputs of a call come from, by name."""
+
+
 class Outline:
     """The calls of a chain, by name and in order. Equal calls are one call, so that variants share what they can.
 

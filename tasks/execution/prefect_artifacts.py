@@ -26,6 +26,9 @@ from worldline_core.store.store import clear_full_disk
 
 logger = logging.getLogger(__name__)
 
+STORE = Path("artifacts")
+"""Where artifacts live unless told otherwise."""
+
 
 def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
     """Run a flow; its result counts although Prefect's server ended before it could record it.
