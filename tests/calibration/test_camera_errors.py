@@ -95,6 +95,7 @@ def test_what_was_put_into_a_wrist_view_is_found(kind: str, sizes: tuple[float, 
     assert solved(view)[KINDS[kind][0]] == pytest.approx(sizes, rel=0.1, abs=0.1 * np.abs(sizes).max())
 
 
+@pytest.mark.slow
 def test_five_degrees_are_a_warning_of_the_filter(healthy_episodes: list) -> None:
     item = healthy_episodes[2]
     recorded = spoiled(item.joints, "head", "rotation", 0.0, 5.0, 0.0)

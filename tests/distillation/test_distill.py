@@ -148,6 +148,7 @@ def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_
     assert set(passes) == {(2, 1, 1.0), (2, 1, 0.6)}
 
 
+@pytest.mark.slow
 def test_the_head_alone_is_distilled_and_said(inputs, tmp_path):
     model, info = load_checkpoint(inputs["stage2"])
     head = TrainedClips(view_sets=(("head",),), strides=(1,))
@@ -161,6 +162,7 @@ def test_the_head_alone_is_distilled_and_said(inputs, tmp_path):
     assert (found.trained, found.views) == (head, ("head",))
 
 
+@pytest.mark.slow
 def test_a_causal_model_goes_on_beside_its_teacher(finished, tmp_path, make_model):
     """With other nodes, on blocks of generated history, part of them the teacher's."""
     given = finished.inputs | {"causal": finished.output}
@@ -240,6 +242,7 @@ def test_masks_follow_the_robot_and_skip_views_without_calibration(finished):
     assert end > begin
 
 
+@pytest.mark.slow
 def test_adapters_train_every_step_and_the_scores_share_their_weights(inputs, tmp_path, monkeypatch):
     scores = []
 

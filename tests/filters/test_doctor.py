@@ -34,6 +34,7 @@ def recording(project_root: Path) -> Recording:
     return episodes.episode(i), thumbnails, measure(episodes.episode(i), thumbnails)
 
 
+@pytest.mark.slow
 def test_frames_that_are_dropped_anyway_do_not_count(recording: Recording) -> None:
     episode, _, signals = recording
     head, bad = signals.gray["head"].copy(), np.arange(episode.num_frames) >= 9

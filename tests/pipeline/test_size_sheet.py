@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import pytest
 import torch
@@ -114,7 +115,8 @@ def test_operations_of_a_block_are_those_that_a_rollout_does(make_model):
     spec, views = config.spec, config.views
     model = make_model(num_layers=2)
     source = Sources(None, None, (64, 96), (4, 6))
-    with ThreadPoolExecutor(1) as pool:
+    # Not a thread: torch keeps a guard of the first thread that traces, and the next trace after its end is a segmentation fault.
+    with ProcessPoolExecutor(1, get_context("fork")) as pool:
         planned = block_costs(config, model.config, source, [views], pool)()[0]
     simulator = BlockCausalSimulator(model, spec, noise=Noise([0]), views=views)
 

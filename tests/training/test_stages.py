@@ -130,6 +130,7 @@ def test_native_control_vectors_take_the_place_of_maps(inputs, tmp_path):
             train_stage2(stage2(2, **changes), given, tmp_path / "refused")
 
 
+@pytest.mark.slow
 def test_a_model_of_maps_also_learns_vectors_and_says_whose(inputs, tmp_path, monkeypatch):
     """Views of one batch take one or the other; a view without a camera always the vector, a model of maps alone never shows it."""
     seen, loss = [], FlowMatchingObjective.loss
@@ -199,7 +200,7 @@ def test_stage2_goes_on_with_maps_of_the_same_meaning_only(
     [
         ({}, r"does not say which embodiments it saw; it now learns ['square']"),
         ({"embodiments": {"ur5e": 2}}, "saw ['ur5e']; it now learns ['square']"),
-        ({"embodiments": {"square": 1, "ur5e": 2}}, None),
+        pytest.param({"embodiments": {"square": 1, "ur5e": 2}}, None, marks=pytest.mark.slow),
     ],
 )
 def test_stage2_goes_on_with_another_robot_and_says_so(
