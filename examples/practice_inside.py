@@ -50,28 +50,22 @@ class ShiftedController:
                 got=sorted({f"{row.source} at {row.bank}" for row in episodes.rows})[:3],
                 next_step="choose --task, --policy and --embodiment among those recorded",
             )  # fmt: skip
-        kinematics = ArmKinematics(load_embodiment(embodiment))
-        self._tools = kinematics.tool_poses
-        self._solver = InverseKinematics(kinematics)
+        self._kinematics = ArmKinematics(load_embodiment(embodiment))
+        self._solver = InverseKinematics(self._kinematics)
+        robot = self._kinematics.embodiment
+        self._grippers = [robot.gripper_column(arm) for arm in robot.arms]
 
     def shifted(self, start: str, shift_m: np.ndarray) -> np.ndarray:
         """Commands (frames, j) after the first picture."""
         commands = self.commands[start]
-        tools = self._tools(commands).numpy()
+        tools = self._kinematics.tool_poses(commands).numpy()
         tools[:, :, :3, 3] += np.minimum(np.arange(len(tools)) / REACH_FRAMES, 1.0)[:, None, None] * shift_m
-        state, moved = commands[0], []
-        for command, wanted in zip(commands[1:], tools[1:], strict=True):
-            # From the last solution on, grippers as recorded.
-            state = self._solver.solve(_with_grippers(self._solver, state, command), wanted).state
-            moved.append(state)
-        return np.stack(moved)
-
-
-def _with_grippers(solver: InverseKinematics, joints: np.ndarray, grippers: np.ndarray) -> np.ndarray:
-    embodiment, state = solver.kinematics.embodiment, joints.copy()
-    for arm in embodiment.arms:
-        state[embodiment.gripper_column(arm)] = grippers[embodiment.gripper_column(arm)]
-    return state
+        moved = commands.copy()
+        for number, wanted in enumerate(tools[1:], start=1):
+            start_state = moved[number - 1].copy()
+            start_state[self._grippers] = commands[number, self._grippers]
+            moved[number] = self._solver.solve(start_state, wanted).state
+        return moved[1:]
 
 
 Try = Callable[[Sequence[tuple[str, np.ndarray]]], list[float]]

@@ -153,7 +153,7 @@ class TaskCall:
 
 
 type Inputs = dict[str, TaskCall | Path]
-"""Where the inputs of a call come from, by name."""
+"""Inputs of a call by name: another call, or a folder."""
 
 
 class Outline:

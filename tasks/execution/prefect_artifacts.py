@@ -27,7 +27,7 @@ from worldline_core.store.store import clear_full_disk
 logger = logging.getLogger(__name__)
 
 STORE = Path("artifacts")
-"""Where artifacts live unless told otherwise."""
+"""Default root of the artifact store."""
 
 
 def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:

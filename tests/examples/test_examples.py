@@ -80,14 +80,8 @@ def test_train_on_a_lerobot_dataset(project_root: Path, tmp_path: Path) -> None:
 def test_practise_a_controller_inside(project_root: Path, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     recordings = tmp_path / "biased"
-    record = [
-        sys.executable,
-        "-m",
-        "flows.command_line",
-        "record",
-        "--config",
-        "configs/recording/biased_controllers.yaml",
-    ]
+    config = "configs/recording/biased_controllers.yaml"
+    record = [sys.executable, "-m", "flows.command_line", "record", "--config", config]
     changes = ("starts.families=[close]", "starts.count=4", "workers=1")
     options = [text for change in changes for text in ("--set", change)]
     subprocess.run([*record, *options, "--output", recordings], cwd=project_root, check=True, capture_output=True)

@@ -45,7 +45,7 @@ class ClipDataset(Dataset[Tensor | WorldLineError]):
 def read_ahead(
     source: ClipSource, batches: Iterable[ClipBatch], workers: int, *, pinned: bool = False
 ) -> Iterator[Tensor | WorldLineError]:
-    """What the source reads of each batch, in order, read ahead by so many processes.
+    """Read batches in order, ahead of time, in ``workers`` processes.
 
     Args:
         pinned: in page-locked memory, which a GPU reads at full speed.
@@ -130,7 +130,7 @@ class ClipLoader:
             self._resident = ResidentTracks(self.tracks, rows, self.views, self.device, self.native_size)
 
     def batches(self, sampler: ClipSampler, workers: int = 0) -> Callable[[int], Batch]:
-        """A function that gives the batch of a micro-step, read ahead by so many processes.
+        """Returns a function from the number of a micro-step to its batch, which ``workers`` processes read ahead.
 
         Asked for in order, batches are there already; any other order starts reading anew. The function raises DataError
         and ArtifactError for clips that cannot be read, and TrainingError where a loader process has ended.
