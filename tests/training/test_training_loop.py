@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from worldline_core.errors import ArtifactError, ConfigError, StoppedError, TrainingError
 from worldline_core.store.store import ArtifactStore
-from worldline_core.training import processes
+from worldline_core.training import processes, training_state
 from worldline_core.training.optimizers import make_optimizer
 from worldline_core.training.processes import BatchPlan
 from worldline_core.training.trainer import Objective, ParameterGroup, train
@@ -176,7 +176,7 @@ def test_a_state_that_another_process_left_unfinished_is_not_blamed_on_the_disk(
     assert "every process to write its part" in message and "space" not in message
 
 
-def test_an_average_on_the_host_is_the_one_on_the_device():
+def test_an_average_on_the_host_taken_in_slices_is_the_one_on_the_device(monkeypatch):
     half = {
         "half": nn.Parameter(torch.randn(7, 3).bfloat16()),
         "full": nn.Parameter(torch.randn(5)),
@@ -187,7 +187,8 @@ def test_an_average_on_the_host_is_the_one_on_the_device():
         with torch.no_grad():
             for parameter in half.values():
                 parameter.mul_(1.5).add_(0.25)
-        for average in averages:
+        for average, values in zip(averages, (2**20, 6), strict=True):
+            monkeypatch.setattr(training_state, "SLICE_VALUES", values)
             average.update()
     for name, parameter in half.items():
         device, host = (average.average[name] for average in averages)

@@ -128,6 +128,21 @@ def _damaged(where: Path, got: object) -> ArtifactError:
     )
 
 
+SLICE_VALUES = 2**20
+
+
+def in_slices(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """Tensors of one shape, cut alike along their first axis into parts of about `SLICE_VALUES` values.
+
+    A whole large matrix in another type is fresh memory for each copy, which costs several times the sum.
+    """
+    first = tensors[0]
+    if first.ndim == 0:
+        return iter([tensors])
+    rows = max(1, SLICE_VALUES * len(first) // max(1, first.numel()))
+    return zip(*(tensor.split(rows) for tensor in tensors), strict=True)
+
+
 class HostCopies:
     """Copies tensors to the machine's memory, one at a time, into one pinned buffer: fresh memory for each costs more than the copy.
 
@@ -171,7 +186,8 @@ class ExponentialAverage:
         self.updates += 1
         for name, parameter in self.parameters.items():
             average = own_part(self.average[name])
-            average.lerp_(self._fetch(own_part(parameter)).to(average.dtype), 1 - decay)
+            for part, weights in in_slices(average, self._fetch(own_part(parameter))):
+                part.lerp_(weights.to(average.dtype), 1 - decay)
 
     @contextmanager
     def swapped(self) -> Iterator[None]:
