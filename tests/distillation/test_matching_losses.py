@@ -267,7 +267,7 @@ def test_equal_clips_cost_nothing_and_gradients_reach_the_compared_frames(weight
     assert all(parameter.grad is None for parameter in loss.network.parameters())
 
 
-@pytest.mark.parametrize("kind", ["patch", "wan"])
+@pytest.mark.parametrize("kind", ["patch", pytest.param("wan", marks=pytest.mark.slow)])
 def test_the_end_of_a_clip_is_compared_as_the_whole_decoded_clip_shows_it(weights, kind):
     """Also with an autoencoder whose frames depend on all frames before them."""
     torch.manual_seed(0)

@@ -49,6 +49,7 @@ def test_its_checker_finds_nothing(world: WorldLine, name: str, request: pytest.
     environment.close()
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_own_vector_of_single_environments(world: WorldLine, calls: list[int]) -> None:
     """To the end of two episodes: observations, rewards, terminal observations, time limits; but one call of the model for all."""
     options: dict[str, Any] = {"model": world, "episode_frames": 6, "observe_every": 4, "reward": "soft"}

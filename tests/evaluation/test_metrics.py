@@ -73,6 +73,7 @@ def test_lpips_without_weights_says_so(tmp_path):
         load_lpips(tmp_path)
 
 
+@pytest.mark.slow
 def test_lpips_equals_torchmetrics_on_the_same_weights(tmp_path):
     """Checks the network, not its weights: torchmetrics gets the same random ones."""
     reference_module = pytest.importorskip("torchmetrics.functional.image.lpips")

@@ -263,6 +263,7 @@ def wan():
     return tokenizers.WanTokenizer(small_wan_autoencoder().requires_grad_(False))
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_compression_of_an_outline_is_known_without_it(wan_folder, fitted, tmp_path):
     fitted.save(tmp_path)
