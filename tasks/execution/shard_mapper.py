@@ -11,6 +11,7 @@ import pickle
 import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import copy_context
 from typing import Any, Self
@@ -35,6 +36,7 @@ _DEATHS = frozenset(
     {"BrokenProcessPool", "KilledWorker", "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "OwnerDiedError"}
 )
 """Errors of the runners for a worker that ended without an answer (concurrent.futures, distributed, ray)."""
+_MOST_WAITING = 4096
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -148,11 +150,18 @@ def process_runner(workers: int) -> Any:
     class ProcessRunner(ProcessPoolTaskRunner):
         """Does not wait for its queue of messages: a worker that was killed while it wrote there never releases the lock,
         and this process would then never end. Its thread sends them with the settings of the run: without, it would know
-        neither address nor password of a temporary server."""
+        neither address nor password of a temporary server.
+
+        Each task waits for its inputs in a thread of its own. Prefect has as many threads as workers, where tasks that wait
+        keep back others that could start."""
 
         def __enter__(self) -> Self:
             self._context = copy_context()
-            return super().__enter__()
+            entered = super().__enter__()
+            if self._resolver_executor is not None:
+                self._resolver_executor.shutdown()
+            self._resolver_executor = ThreadPoolExecutor(_MOST_WAITING)
+            return entered
 
         def _forward_subprocess_messages(self) -> None:
             self._context.run(super()._forward_subprocess_messages)

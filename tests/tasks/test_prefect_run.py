@@ -8,6 +8,7 @@ import json
 import pickle
 import re
 import shutil
+import subprocess
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping
@@ -17,7 +18,7 @@ from unittest.mock import Mock
 
 import pytest
 from PIL import Image
-from prefect import flow
+from prefect import Task, flow
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.client.schemas.sorting import ArtifactSort, TaskRunSort
@@ -30,6 +31,7 @@ from tasks.execution.artifact_task import ArtifactTask, task_names, variant
 from tasks.execution.chain import outline
 from tasks.execution.prefect_artifacts import show_in_prefect
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+from tasks.execution.shard_mapper import process_runner, shared_server
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, DataError, WorldLineError
 from worldline_core.pipeline import memory_estimate
@@ -176,6 +178,23 @@ def test_steps_side_by_side_give_the_artifacts_of_one_process(
         sources = {names[source.model_dump()["id"]] for found in run.task_inputs.values() for source in found}
         expected = {"filter": {"curate"}, "render_actions": {"filter"}, "render_actions.banks": {"curate.banks"}}
         assert sources == expected.get(run.name, set()), run.name
+
+
+@pytest.mark.slow
+def test_tasks_that_wait_do_not_keep_back_what_can_start(prefect_server: None, tmp_path: Path) -> None:
+    """Two workers, one of them busy, and more tasks waiting for it than there are workers."""
+    file = tmp_path / "made"
+    until_made = f"for i in $(seq 400); do test -e '{file}' && exit; sleep 0.05; done; exit 1"
+
+    @flow(name=tmp_path.name)
+    def some_tasks() -> None:
+        with shared_server(), process_runner(2) as runner:
+            busy = runner.submit(Task(fn=subprocess.getstatusoutput), {"cmd": until_made})
+            waiting = [runner.submit(Task(fn=Path.exists), {"self": file}, wait_for=[busy]) for _ in range(3)]
+            made = runner.submit(Task(fn=Path.touch), {"self": file})
+            assert [future.result() for future in (busy, made, *waiting)] == [(0, ""), None, True, True, True]
+
+    some_tasks()
 
 
 @pytest.mark.slow
