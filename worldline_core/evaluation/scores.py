@@ -10,6 +10,7 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from jaxtyping import Float
 
 from worldline_core.errors import DataError
 from worldline_core.store.artifact_files import digest_value
@@ -71,11 +73,21 @@ def bootstrap_mean(
             expected="a non-empty, finite vector (and weights of the same length)",
             got=f"shape {sample.shape}, weights {weight.shape}, {int((~np.isfinite(sample)).sum())} not finite",
         )
-    generator = np.random.default_rng(seed)
-    chosen = generator.integers(0, sample.size, size=(resamples, sample.size))
-    means = (sample * weight)[chosen].sum(axis=1) / weight[chosen].sum(axis=1)
+    times = _times_drawn(sample.size, resamples, seed)
+    # Not BLAS, whose last digits depend on the number of threads.
+    means = np.einsum("rc,c->r", times, sample * weight) / np.einsum("rc,c->r", times, weight)
     low, high = np.quantile(means, [0.025, 0.975])
     return Interval(float((sample * weight).sum() / weight.sum()), float(low), float(high), int(sample.size))
+
+
+@lru_cache(maxsize=4)
+def _times_drawn(count: int, resamples: int, seed: int) -> Float[np.ndarray, "resamples count"]:
+    """How often each resample has each value; the same for all metrics of as many trajectories."""
+    chosen = np.random.default_rng(seed).integers(0, count, size=(resamples, count))
+    flat = np.bincount((chosen + count * np.arange(resamples)[:, None]).ravel(), minlength=resamples * count)
+    times = flat.reshape(resamples, count).astype(np.float64)
+    times.flags.writeable = False
+    return times
 
 
 def crossed_bootstrap(by_seed: Sequence[Mapping[str, float]], *, resamples: int = 2000, seed: int = 0) -> Interval:
