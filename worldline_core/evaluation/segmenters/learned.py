@@ -107,6 +107,7 @@ class LearnedSegmenter:
     follows = False
 
     def __init__(self, network: UNet, threshold: float = 0.5) -> None:
+        cast(Any, network).to(memory_format=torch.channels_last)
         self.network = network.eval().requires_grad_(False)
         self.threshold = threshold
 
@@ -122,7 +123,7 @@ class LearnedSegmenter:
         masks = []
         for start in range(0, len(video), _BATCH):
             frames = torch.from_numpy(np.ascontiguousarray(video[start : start + _BATCH])).to(device)
-            frames = frames_to_unit(frames)
+            frames = frames_to_unit(frames).contiguous(memory_format=torch.channels_last)
             with torch.autocast(device.type, dtype=torch.bfloat16):
                 logits = self.network(frames)
             masks.append((torch.sigmoid(logits.float()) > self.threshold).cpu().numpy())
