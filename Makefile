@@ -4,9 +4,8 @@ SHELL := /bin/bash
 # A uv on the path counts only where it runs: version managers leave shims that answer "not found".
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .bootstrap/bin/uv)
 RUN := $(UV) run --frozen
-# Bytecode of packages is written when they are installed: otherwise every process of the first run compiles what it
-# imports, and where PYTHONDONTWRITEBYTECODE is set (many containers) every process of every run does.
-compile_new = $(if $(wildcard .venv/lib/*/site-packages/$(1)),,--compile-bytecode)
+# Where this is set (many containers), every process would compile again what it imports.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo docs wheels test test-slow lint install install-scale record clean
 
@@ -19,12 +18,12 @@ in_memory = $(shell df -kP /dev/shm 2>/dev/null | awk 'NR == 2 && $$4 > 4e6 {pri
 # One process per core, one thread each; neighbours stay together, so that what a file sets up is set up once.
 test: install-scale
 	@export TMPDIR=$$(mktemp -d $(in_memory)); trap 'rm -rf "$$TMPDIR"' EXIT; \
-	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(RUN) pytest -n auto --dist worksteal
+	OMP_NUM_THREADS=1 $(RUN) pytest -n auto --dist worksteal
 
 # What takes long (CONTRIBUTING.md): servers, processes, trainings, the rehearsal of the full size, wheels. Two at a time, a file
 # in one process: several of them start processes of their own, and share what takes a minute to set up.
 test-slow: install-scale
-	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(RUN) pytest -m slow -n 2 --dist loadfile --no-loadscope-reorder --timeout=900
+	OMP_NUM_THREADS=1 $(RUN) pytest -m slow -n 2 --dist loadfile --no-loadscope-reorder --timeout=900
 
 lint: install-scale
 	$(RUN) ruff check .
@@ -33,11 +32,10 @@ lint: install-scale
 	$(RUN) pyright
 
 install: $(filter .bootstrap/bin/uv,$(UV))
-	$(UV) sync --frozen --inexact --extra sim $(call compile_new,prefect)
-	@$(RUN) python -m compileall -q flows tasks worldline worldline_core
+	$(UV) sync --frozen --inexact --extra sim
 
 install-scale: install
-	$(UV) sync --frozen --inexact --extra sim --group scale $(call compile_new,ray)
+	$(UV) sync --frozen --inexact --extra sim --group scale
 
 .bootstrap/bin/uv:
 	python3 -m venv .bootstrap || { echo "Install Python's venv (Debian: apt-get install python3-venv), or uv (https://docs.astral.sh/uv)"; rm -rf .bootstrap; exit 1; }
