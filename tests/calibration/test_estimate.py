@@ -18,7 +18,7 @@ from worldline_core.calibration.camera_errors import PARAMETERS, Equations, move
 from worldline_core.calibration.estimate import base_pose, estimate, wrist_camera
 from worldline_core.calibration.estimate.estimate import camera_file, estimate_views
 from worldline_core.calibration.estimate.estimate_report import estimate_text
-from worldline_core.calibration.estimate.recordings import RecordedView, recorded_views
+from worldline_core.calibration.estimate.recordings import RecordedView, near_changes, recorded_views
 from worldline_core.calibration.estimate.refine import FittedCamera, fit_still
 from worldline_core.calibration.estimate.still_camera import agreement, tools_apart
 from worldline_core.calibration.estimate.verdict import (
@@ -30,6 +30,7 @@ from worldline_core.calibration.estimate.verdict import (
     full_size,
 )
 from worldline_core.calibration.estimate.wrist_camera import WristCamera, mounts_around
+from worldline_core.calibration.observation import CELL_PX, CLEAR_CHANGE
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
@@ -142,6 +143,22 @@ def test_an_episode_whose_video_cannot_be_read_is_left_out(bank: Loaded, kinemat
     assert [episode.episode_id for episode in recorded.episodes] == [bank[0][0].episode_id]
     with pytest.raises(DataError, match="differ in length"):
         recorded_views(iter([(bank[1][0], {"head": cut_off()})]), kinematics, 1)
+
+
+def test_flow_in_flat_parts_where_nothing_changes_does_not_count(bank: Loaded, kinematics: ArmKinematics) -> None:
+    """Before a black wall flow is a guess of any length: the frame's upper part is black, and noise moves nothing there."""
+    random, wall = np.random.default_rng(0), 24
+    pictures = [frames["head"].copy() for _, frames in bank[:2]]
+    for frames in pictures:
+        frames[:, :wall] = random.integers(0, 2, (len(frames), wall, *frames.shape[2:]))
+    loaded = [(episode, {"head": frames}) for (episode, _), frames in zip(bank[:2], pictures, strict=True)]
+    recorded = recorded_views(iter(loaded), kinematics, 2)["head"]
+    for episode in recorded.episodes:
+        above = int(wall * episode.gray.shape[2] / pictures[0].shape[2] / CELL_PX) - 2
+        motion = near_changes(episode.fine)
+        assert np.abs(episode.fine.flow[:, :above]).max() > 1 and not motion.flow[:, :above].any()
+        moving = motion.change > CLEAR_CHANGE
+        assert np.array_equal(motion.flow[moving], episode.fine.flow[moving])
 
 
 def test_what_moves_outside_of_the_robot_s_masks_does_not_count(bank: Loaded, kinematics: ArmKinematics) -> None:

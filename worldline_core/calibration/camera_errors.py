@@ -268,7 +268,8 @@ class StillView:
             self._maps[key] = self._predicted(theta)
         value, shift, growth, cover = self._maps[key]
         measured, value = self._blurred(blur), _blurred(value, blur)
-        active = (cover > 0.1) | (np.abs(measured).max(axis=-1) > 0.3)
+        moving = np.abs(measured).max(axis=-1) > 0.3
+        active = (cover > 0.1) | moving
         down, across = (np.moveaxis(each, -1, 0).copy() for each in np.gradient(value, axis=(1, 2)))
         columns = np.arange(size)
         information, gradient, likelihood = np.zeros((size + 2, size + 2)), np.zeros(size + 2), 0.0
@@ -280,7 +281,8 @@ class StillView:
             squares = float((error**2).sum())
             weight = 1.0 / max(squares / max(cells, 1.0), 1e-9)
             left_open = squares / max(float((seen**2).sum()), 1e-9)
-            likelihood -= len(channels) * cells / 2 * np.log(max(left_open, 1e-9))
+            # As many samples for all cameras: the more a camera covers, the more likely it would seem.
+            likelihood -= len(channels) * float((trust**2 * moving).sum()) / 2 * np.log(max(left_open, 1e-9))
             for c, channel in enumerate(channels):
                 slope = across[channel] * shift[0]
                 slope += down[channel] * shift[1]

@@ -29,6 +29,8 @@ LoadedViews = Iterable[tuple[Episode, Mapping[str, Iterable[np.ndarray]]]]
 FINE_WIDTH, MASKED_WIDTH = 2 * GRAY_WIDTH, 320
 CHANGE_FROM, TEXTURE_FROM, SURE_ABOVE, LEAST_TRUST = 2.0, 2.0, 6.0, 0.15
 """Grey levels; and the trust in flow where nothing is to be seen."""
+REACH_OF_CHANGE = 1
+"""Cells from one that changes within which flow is believed. In flat parts farther away it is a guess, of any length."""
 SHARED_SURFACES, SHARED_CAPSULES = 2.0, 8.0
 """Variance of a still camera that more episodes do not reduce, in variances of one episode; from recordings whose cameras are known."""
 MOST_FRAMES, FEWEST_FRAMES = 800, 9
@@ -108,7 +110,7 @@ class RecordedView:
     def still_views(self, *, fine: bool) -> list[StillView]:
         """The evidence of a still camera, one for each episode."""
         camera = self.unknown_camera(fine=fine)
-        motions = [e.fine if fine else e.rough for e in self.episodes]
+        motions = [near_changes(e.fine if fine else e.rough) for e in self.episodes]
         return [
             StillView(camera, e.points, e.radii, m, certainty(m)) for e, m in zip(self.episodes, motions, strict=True)
         ]
@@ -135,10 +137,18 @@ class RecordedView:
     def motion(self, delay: float) -> MotionOfSteps:
         """All steps of all episodes, with pictures that trail by `delay` frames."""
         points = [delayed(e.points, delay) for e in self.episodes]
-        flow = np.concatenate([e.rough.flow for e in self.episodes])
+        flow = np.concatenate([near_changes(e.rough).flow for e in self.episodes])
         height, width = self.episodes[0].rough_gray.shape[1:]
         before, after = (np.concatenate([p[part] for p in points]) for part in (slice(None, -1), slice(1, None)))
         return MotionOfSteps(before, after, flow, width, height)
+
+
+def near_changes(motion: Motion) -> Motion:
+    """Motion before a camera that stands still: no flow where nothing near changes."""
+    size = 2 * REACH_OF_CHANGE + 1
+    changes = (motion.change > CHANGE_FROM).astype(np.uint8)
+    near = np.stack([cv2.dilate(cells, np.ones((size, size), np.uint8)) for cells in changes])
+    return replace(motion, flow=motion.flow * near[..., None])
 
 
 def certainty(motion: Motion) -> np.ndarray:

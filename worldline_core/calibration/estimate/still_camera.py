@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldline_core.calibration.camera_errors import PARAMETERS, StillView, delayed
+from worldline_core.calibration.camera_errors import LAG, PARAMETERS, StillView, delayed
 from worldline_core.calibration.estimate.camera_search import FoundCamera, MotionOfSteps, search_cameras
-from worldline_core.calibration.estimate.recordings import RecordedView
+from worldline_core.calibration.estimate.recordings import RecordedView, near_changes
 from worldline_core.calibration.estimate.refine import FittedCamera, fit_still
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import inside_image, project_points
@@ -37,7 +37,7 @@ class StillCamera:
         halves: of the even and of the odd episodes.
         agreements: (e,) of each episode with the camera of the half that it does not belong to.
         rival: the best camera elsewhere, and its agreements.
-        mirrored: log-likelihood that mirrored pictures gain, on some episodes at the rough size, and their agreement then.
+        mirrored: (e,) log-likelihood that mirrored pictures gain, at the rough size, and their median agreement then.
     """
 
     fitted: FittedCamera
@@ -46,7 +46,7 @@ class StillCamera:
     score: float
     rival: FittedCamera | None
     rival_agreements: np.ndarray | None
-    mirrored: float
+    mirrored: np.ndarray
     mirrored_agreement: float
 
 
@@ -69,8 +69,11 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
         fit_still(mirrored_views, _at(camera, each), lag, ROUGH_BLURS, 5, recorded.shared)
         for each in search_cameras(_mirrored(motion))[: STARTS_REFINED // 3]
     ]
-    other = max(mirrored, key=lambda fit: fit.likelihood)
-    gain = other.likelihood - distinct[0].likelihood
+    rough_views = recorded.still_views(fine=False)
+    own = _settled(rough_views, distinct[0], recorded.shared)
+    mirrored_views = [view.mirrored() for view in rough_views]
+    other = _settled(mirrored_views, max(mirrored, key=lambda fit: fit.likelihood), recorded.shared)
+    gains = _likelihoods(mirrored_views, other) - _likelihoods(rough_views, own)
     agreed = float(np.median([agreement(view, other) for view in mirrored_views]))
     views = recorded.still_views(fine=True)
     fine = recorded.unknown_camera(fine=True)
@@ -83,7 +86,7 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
     halves, agreements = _by_halves(views, best, recorded.shared)
     rival = next((fit for fit in fits[1:] if tools_apart(best.camera, fit.camera, recorded) > RIVAL_APART), None)
     rivals = None if rival is None else np.array([agreement(view, rival) for view in views])
-    return StillCamera(best, halves, agreements, found[0].score, rival, rivals, gain, agreed)
+    return StillCamera(best, halves, agreements, found[0].score, rival, rivals, gains, agreed)
 
 
 def refine_with_masks(masked: RecordedView, found: StillCamera) -> StillCamera:
@@ -107,6 +110,18 @@ def _by_halves(
     others = halves[::-1] if len(halves) == 2 else (best, best)
     agreements = np.array([agreement(view, others[i % 2]) for i, view in enumerate(views)])
     return halves, agreements
+
+
+def _settled(views: Sequence[StillView], fit: FittedCamera, shared: float) -> FittedCamera:
+    """The fit to some episodes, made that of all at the rough size."""
+    return fit_still(views, fit.camera, fit.lag, ROUGH_BLURS[-1:], 5, shared)
+
+
+def _likelihoods(views: Sequence[StillView], fit: FittedCamera) -> np.ndarray:
+    """(e,) log-likelihood of each episode at the rough size."""
+    theta = np.zeros(PARAMETERS)
+    theta[LAG] = fit.lag
+    return np.array([view.at(fit.camera).equations(theta, ROUGH_BLURS[-1]).likelihood for view in views])
 
 
 def agreement(view: StillView, fitted: FittedCamera) -> float:
@@ -137,7 +152,7 @@ def lag_by_amounts(recorded: RecordedView) -> float:
     lags = np.arange(-np.floor(reach / LAG_STEP), np.floor(reach / LAG_STEP) + 1) * LAG_STEP
     totals = np.zeros(len(lags))
     for episode in recorded.episodes:
-        seen = np.linalg.norm(episode.rough.flow, axis=-1).mean(axis=(1, 2))
+        seen = np.linalg.norm(near_changes(episode.rough).flow, axis=-1).mean(axis=(1, 2))
         travel = np.linalg.norm(np.diff(episode.points, axis=0), axis=-1).mean(axis=1)
         inner = slice(int(reach), len(seen) - int(reach)) if len(seen) > 4 * reach else slice(None)
         for i, lag in enumerate(lags):

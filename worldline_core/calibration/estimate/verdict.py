@@ -45,7 +45,7 @@ RIVAL_DEVIATIONS = 3.0
 LARGEST_HALVES_APART, LARGEST_INTERVAL = 0.035, 6.0
 """Between the tools of the two halves [widths], and of the interval in the picture [% of the width]."""
 MIRRORED_GAIN = -20.0
-"""Log-likelihood above which mirrored pictures cannot be told apart; of usual sets it is -90 to -260."""
+"""Log-likelihood of all episodes above which mirrored pictures cannot be told apart."""
 LEAST_FOLLOWED, FOLLOWED_MORE = 0.3, 0.1
 """Correlation of how much a view changes with an arm's motion, 0.4 to 0.9 of the arm's own episodes and views and up to 0.2 of others;
 and by how much another arm's is larger where wrist views are exchanged."""
@@ -185,14 +185,15 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     places, known = _places(own, [view.at(fitted.camera).shown(np.zeros(PARAMETERS)) for view in views])
     moved, scatter = _moved_at(recorded, found, places, known), scatter_of(places, known)
     contradictory = moved is None and typical < USUAL_AGREEMENT and scatter > LARGEST_SCATTER
-    if found.mirrored > -MIRRORED_GAIN and (not contradictory or found.mirrored_agreement > CLEAR_AGREEMENT):
+    mirrored = float(found.mirrored.sum())
+    if mirrored > -MIRRORED_GAIN and (not contradictory or found.mirrored_agreement > CLEAR_AGREEMENT):
         reasons.append("mirrored pictures fit better: left and right are exchanged")
     elif contradictory:
         reasons.append(
             f"each episode puts the robot elsewhere ({scatter:.1f} times the expected squares, agreement {typical:.2f}): another"
             " robot is declared, its columns or units are others, or other things move"
         )
-    elif found.mirrored > MIRRORED_GAIN:
+    elif mirrored > MIRRORED_GAIN or _deviations(-found.mirrored) < RIVAL_DEVIATIONS:
         reasons.append("mirrored pictures fit as well: the motion shows no difference")
     if found.rival is not None and found.rival_agreements is not None:
         apart = 100 * tools_apart(fitted.camera, found.rival.camera, recorded)
