@@ -56,8 +56,9 @@ LARGEST_WRIST_HALVES_APART, LARGEST_WRIST_INTERVAL = 0.05, 10.0
 FEWEST_EPISODES = 3
 LEAST_TRAVEL_M, LEAST_CHANGE = 1.5, 0.02
 """Travel of the busiest tool over all episodes together; after less, a mirrored camera can look right."""
-MOVED_SHARE, MOVED_DEVIATIONS = 2.5, 5.0
-"""Displacement of the robot in the picture from one episode on: shares of the width, standard deviations."""
+MOVED_SHARE, MOVED_DEVIATIONS, STILL_MOVED_DEVIATIONS = 2.5, 5.0, 4.5
+"""Displacement of the robot in the picture from one episode on: shares of the width, standard deviations, and those of a
+still camera. Where it stands they are up to 2.4, from recordings whose cameras are known."""
 MOVED = "from episode {} on the camera stands elsewhere: give the two parts a source each"
 LEAST_SPREAD = 0.5
 """Standard deviation [% of the width] of an episode's place in the picture, however much it shows."""
@@ -366,7 +367,7 @@ def _places(own: Sequence[Equations], shown: Sequence[np.ndarray]) -> tuple[np.n
 
 def _moved_at(recorded: RecordedView, found: StillCamera, places: np.ndarray, known: np.ndarray) -> str | None:
     """The first episode that the camera of those before it does not fit; None where all have one camera."""
-    split = clearest_step(places, known, MOVED_SHARE)
+    split = clearest_step(places, known, MOVED_SHARE, STILL_MOVED_DEVIATIONS)
     if split is None:
         spread = np.full((len(places), 1, 1), AGREEMENT_SPREAD**2)
         split = clearest_step(found.agreements[:, None], spread, LEAST_EPISODE)
@@ -380,11 +381,13 @@ def scatter_of(values: np.ndarray, covariances: np.ndarray) -> float:
     return float(np.einsum("ni,nij,nj->", left, weights, left)) / (left.size - left.shape[1])
 
 
-def clearest_step(values: np.ndarray, covariances: np.ndarray, least: float) -> int | None:
-    """Index at which a series (n, k) of known covariances (n, k, k) steps by `least` and by many standard deviations; None where
+def clearest_step(
+    values: np.ndarray, covariances: np.ndarray, least: float, deviations: float = MOVED_DEVIATIONS
+) -> int | None:
+    """Index at which a series (n, k) of known covariances (n, k, k) steps by `least` and by many standard `deviations`; None where
     it does not. A value counts as much as it is known, and a series that scatters more than that is known less.
     """
-    best, at = MOVED_DEVIATIONS**2, None
+    best, at = deviations**2, None
     weights = np.linalg.inv(covariances)
     for k in range(2, len(values) - 1):
         parts = slice(None, k), slice(k, None)
