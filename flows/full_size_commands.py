@@ -99,6 +99,7 @@ def add_rehearse_command(commands: argparse._SubParsersAction[argparse.ArgumentP
 
 def rehearse_command(arguments: argparse.Namespace) -> None:
     """Prepare the folder, train in several processes, let the flow do the rest, and report."""
+    prepare_prefect(arguments.output / "artifacts")  # before the imports below, which import Prefect
     from flows.rehearse import train_in_processes
     from worldline_core.rehearsal.rehearsal import prepare, table
 
@@ -111,7 +112,6 @@ def rehearse_command(arguments: argparse.Namespace) -> None:
     os.chdir(arguments.output)
     artifacts = Path("artifacts")
     train_in_processes(preset, path, overrides, artifacts, arguments.processes)
-    prepare_prefect(artifacts)
     from flows.pipeline import pipeline
 
     report = pipeline(preset, path, overrides, artifacts)
