@@ -4,7 +4,7 @@ SHELL := /bin/bash
 # A uv on the path counts only where it runs: version managers leave shims that answer "not found".
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .bootstrap/bin/uv)
 RUN := $(UV) run --frozen
-# Where this is set (many containers), every process would compile again what it imports.
+# Where the environment sets this (many containers), every process compiles its imports again.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo docs wheels test test-slow lint install install-scale record clean

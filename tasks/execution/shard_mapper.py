@@ -152,8 +152,8 @@ def process_runner(workers: int) -> Any:
         and this process would then never end. Its thread sends them with the settings of the run: without, it would know
         neither address nor password of a temporary server.
 
-        Each task waits for its inputs in a thread of its own. Prefect has as many threads as workers, where tasks that wait
-        keep back others that could start."""
+        Each task waits for its inputs in its own thread. Prefect uses only as many threads as workers, so that waiting tasks
+        block others that are ready."""
 
         def __enter__(self) -> Self:
             self._context = copy_context()

@@ -281,7 +281,7 @@ class StillView:
             squares = float((error**2).sum())
             weight = 1.0 / max(squares / max(cells, 1.0), 1e-9)
             left_open = squares / max(float((seen**2).sum()), 1e-9)
-            # As many samples for all cameras: the more a camera covers, the more likely it would seem.
+            # The sample count must not depend on the camera: one that covers more would seem more likely.
             likelihood -= len(channels) * float((trust**2 * moving).sum()) / 2 * np.log(max(left_open, 1e-9))
             for c, channel in enumerate(channels):
                 slope = across[channel] * shift[0]

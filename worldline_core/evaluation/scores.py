@@ -82,7 +82,7 @@ def bootstrap_mean(
 
 @lru_cache(maxsize=4)
 def _times_drawn(count: int, resamples: int, seed: int) -> Float[np.ndarray, "resamples count"]:
-    """How often each resample has each value; the same for all metrics of as many trajectories."""
+    """Count each value in each resample. Cached, because metrics with equally many trajectories draw the same resamples."""
     chosen = np.random.default_rng(seed).integers(0, count, size=(resamples, count))
     flat = np.bincount((chosen + count * np.arange(resamples)[:, None]).ravel(), minlength=resamples * count)
     times = flat.reshape(resamples, count).astype(np.float64)

@@ -30,7 +30,7 @@ FINE_WIDTH, MASKED_WIDTH = 2 * GRAY_WIDTH, 320
 CHANGE_FROM, TEXTURE_FROM, SURE_ABOVE, LEAST_TRUST = 2.0, 2.0, 6.0, 0.15
 """Grey levels; and the trust in flow where nothing is to be seen."""
 REACH_OF_CHANGE = 1
-"""Cells from one that changes within which flow is believed. In flat parts farther away it is a guess, of any length."""
+"""Distance in cells from a changing cell up to which flow is used. Farther away, in flat parts, flow is a guess of any length."""
 SHARED_SURFACES, SHARED_CAPSULES = 2.0, 8.0
 """Variance of a still camera that more episodes do not reduce, in variances of one episode; from recordings whose cameras are known."""
 MOST_FRAMES, FEWEST_FRAMES = 800, 9
@@ -144,7 +144,7 @@ class RecordedView:
 
 
 def near_changes(motion: Motion) -> Motion:
-    """Motion before a camera that stands still: no flow where nothing near changes."""
+    """Drop flow where nothing changes nearby; for cameras that stand still."""
     size = 2 * REACH_OF_CHANGE + 1
     changes = (motion.change > CHANGE_FROM).astype(np.uint8)
     near = np.stack([cv2.dilate(cells, np.ones((size, size), np.uint8)) for cells in changes])

@@ -37,7 +37,7 @@ class StillCamera:
         halves: of the even and of the odd episodes.
         agreements: (e,) of each episode with the camera of the half that it does not belong to.
         rival: the best camera elsewhere, and its agreements.
-        mirrored: (e,) log-likelihood that mirrored pictures gain, at the rough size, and their median agreement then.
+        mirrored: (e,) gain in log-likelihood of mirrored pictures at the rough size; mirrored_agreement: their median agreement.
     """
 
     fitted: FittedCamera
@@ -113,7 +113,7 @@ def _by_halves(
 
 
 def _settled(views: Sequence[StillView], fit: FittedCamera, shared: float) -> FittedCamera:
-    """The fit to some episodes, made that of all at the rough size."""
+    """Refine a fit to some episodes on all of them, at the rough size."""
     return fit_still(views, fit.camera, fit.lag, ROUGH_BLURS[-1:], 5, shared)
 
 

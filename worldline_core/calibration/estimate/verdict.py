@@ -57,8 +57,8 @@ FEWEST_EPISODES = 3
 LEAST_TRAVEL_M, LEAST_CHANGE = 1.5, 0.02
 """Travel of the busiest tool over all episodes together; after less, a mirrored camera can look right."""
 MOVED_SHARE, MOVED_DEVIATIONS, STILL_MOVED_DEVIATIONS = 2.5, 5.0, 4.5
-"""Displacement of the robot in the picture from one episode on: shares of the width, standard deviations, and those of a
-still camera. Where it stands they are up to 2.4, from recordings whose cameras are known."""
+"""Displacement of the robot in the picture from one episode on: percent of the width, standard deviations, and the
+standard deviations for still cameras. Cameras that did not move reach 2.4 (recordings with known cameras)."""
 MOVED = "from episode {} on the camera stands elsewhere: give the two parts a source each"
 LEAST_SPREAD = 0.5
 """Standard deviation [% of the width] of an episode's place in the picture, however much it shows."""
