@@ -102,6 +102,7 @@ def test_commands_land_where_their_published_poses_put_them(shared_data):
         assert np.abs(by_action.gripper - by_state.gripper).max() > 0.15
 
 
+@pytest.mark.slow
 def test_curated_and_resized_samples_keep_their_projections(shared_data, tmp_path):
     """The whole way: reader, resize, EpisodeSet on disk, `render_actions`."""
     folder = shared_data / "agibot_gesim"

@@ -238,6 +238,7 @@ def test_a_mistake_is_found_and_the_printed_line_repairs_it(project_root, tmp_pa
     assert (content["consistent"], content["episodes"][0]["verdict"]) == (True, "consistent")
 
 
+@pytest.mark.slow
 def test_a_clean_set_and_one_that_few_pictures_judge(project_root, shared_data, tmp_path, capsys):
     clean = ("--artifact", str(project_root / "artifacts/shipped/recordings"), "--episode", CLEAN)
     assert run(*clean, "--output", str(tmp_path / "clean")) == 0

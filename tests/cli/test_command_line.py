@@ -89,6 +89,7 @@ def test_a_mistake_ends_with_a_clear_error(
     assert "Traceback" not in error
 
 
+@pytest.mark.slow
 def test_artifacts_are_listed_by_the_names_of_calls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = "{kind: episode_set, path: artifacts/shipped/banks, include: [bank_lift_viperx-000]}"
     given = ["--artifacts", str(tmp_path), "--set", f"curate_banks.sources=[{source}]"]

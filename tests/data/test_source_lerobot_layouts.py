@@ -210,6 +210,7 @@ def test_a_calibration_file_beside_the_dataset_is_used(tmp_path: Path, name: str
     assert curated.rows[0].stage2_ok
 
 
+@pytest.mark.slow
 def test_a_wrist_camera_may_be_where_the_robot_mounts_it(tmp_path: Path) -> None:
     write_robocoin(tmp_path / "raw")
     mounted = {key: calibration()[key] for key in ("width", "height", "K")} | {"mount": "embodiment"}

@@ -298,6 +298,7 @@ def test_the_end_of_a_clip_is_compared_as_the_whole_decoded_clip_shows_it(weight
         torch.testing.assert_close(PerceptualLoss(tokenizer, network)(predicted, target), expected.detach())
 
 
+@pytest.mark.slow
 def test_decoding_in_bfloat16_costs_little_accuracy(weights):
     torch.manual_seed(0)
     vae, network = small_wan_autoencoder().requires_grad_(False), load_lpips(weights)

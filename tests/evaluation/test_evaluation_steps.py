@@ -262,6 +262,7 @@ def test_planning_chooses_by_predicted_videos(planned):
     assert over["gain"]["mean"] == pytest.approx(1.0 - best)
 
 
+@pytest.mark.slow
 def test_choices_do_not_depend_on_labels(planned, bank, recordings, tmp_path):
     inputs, output, *_ = planned
     made = inputs | {"banks": shutil.copytree(inputs["banks"], tmp_path / "banks")}

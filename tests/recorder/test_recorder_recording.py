@@ -103,6 +103,7 @@ def test_the_wrist_camera_moves_with_the_arm_and_the_head_stands(recording: Reco
         assert bool(is_rigid(torch.from_numpy(camera.T_base_camera)).all())
 
 
+@pytest.mark.slow
 def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, tmp_path: Path) -> None:
     groups = (RecordGroup(embodiment="xarm7_single", count=2, families=("lift", "close")),)
     defects: Any = {"xarm7_single": {"frozen_camera": 1}}

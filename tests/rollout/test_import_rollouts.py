@@ -146,6 +146,7 @@ def test_ctrl_world_s_pictures_of_two_rows_are_taken_apart(videos, episodes):
         run(videos.parent / "synthetic_traj", episodes, **config | {"tiles": [["head", None, None], *[[None] * 3] * 4]})
 
 
+@pytest.mark.slow
 def test_oscar_s_outputs_are_compared_from_their_start_frames_on(tmp_path):
     """As its README and its script say: recordings below assets, 81 frames of each from a frame of its own on."""
     grey = np.arange(40, 212, 2, dtype=np.uint8)[:, None, None, None]
