@@ -127,6 +127,20 @@ def test_end_effector_error_is_the_displacement_of_the_gripper():
     assert end_effector_error(true, noise, points)[0, 0] == 16.0  # found nowhere: the search radius
 
 
+def test_a_tool_is_not_found_on_the_table_behind_it():
+    """A copy of a first frame, in which the small tool was 10 pixels to the left: the table's texture is where it always is."""
+    table = np.random.default_rng(2).normal(110, 25, (64, 96, 3)).clip(0, 255).astype(np.uint8)
+    true, copy = (np.repeat(table[None], 1, axis=0) for _ in range(2))
+    for video, column in ((true, 48), (copy, 38)):
+        video[0, 28:33, column - 2 : column + 3] = np.array([[[240, 40, 20]]])
+        video[0, 30, column] = 10
+    points = np.array([[[48.0, 30.0]]])
+    assert end_effector_error(true, copy, points)[0, 0] == 0.0
+    background = table.astype(np.float32)
+    assert end_effector_error(true, copy, points, background)[0, 0] == 10.0
+    assert end_effector_error(true, true, points, background)[0, 0] == 0.0
+
+
 def test_interval_covers_the_true_mean_about_as_often_as_it_says():
     generator = np.random.default_rng(0)
     samples = generator.normal(3.0, 2.0, (200, 40))

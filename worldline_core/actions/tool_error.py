@@ -4,11 +4,11 @@ End-effector error: how far from the commanded place the gripper appears. The pa
 projected tool centre of a frame a patch of the *true* frame is taken, and the place where it fits the *predicted* frame
 best (normalised correlation) is searched within a radius. The distance from that place to the projected point is the
 error [px of the recording's frame]. A gripper that correlates with nothing within reach counts with the search radius.
-True videos score 0 by construction; a video in which the robot does not move scores about the distance it should have
-moved, at most the radius.
+True videos score 0 by construction.
 
-Where no camera is known, the part of the picture that has moved most stands for the tool, and frames are compared by what differs from
-the recording's background: still edges around a small robot would be found where they always are.
+Frames of a camera that stands still are compared by how they differ from the recording's background. Otherwise the table
+behind a small robot would be found where it always is, and a video in which the robot does not move would score 0. Where no
+camera is known, the part of the picture that has moved most stands for the tool.
 """
 
 from __future__ import annotations

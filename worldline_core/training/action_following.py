@@ -1,8 +1,7 @@
 """Action following while a model trains: a second of held-out clips is predicted under its own controls, under another clip's, and by
 copying the first picture; then each tool is looked for in the predicted picture (`actions/tool_error.py`).
 
-Where no camera is known, the part of the recorded picture that has changed most stands for the tool, and pictures are compared by
-what differs from the recording's own background: the still edges around a small robot are found where they always are.
+Where no camera is known, the part of the recorded picture that has changed most stands for the tool.
 """
 
 from __future__ import annotations
@@ -58,8 +57,8 @@ class ClipPredictor(Protocol):
 
 @dataclass(frozen=True)
 class Place:
-    """A clip, and where its tools are after a second: (arms, 2) u, v [px of the model's picture], NaN where they do not move; without a
-    camera also the recording's background (h, w, 3)."""
+    """A clip, and where its tools are after a second: (arms, 2) u, v [px of the model's picture], NaN where they do not move;
+    of a camera that stands still also the recording's background (h, w, 3)."""
 
     clip: Clip
     points: np.ndarray
@@ -144,21 +143,20 @@ class ActionFollowing:
 
     def _moved(self, clips: Sequence[Clip], view: str) -> list[Place]:
         """Clips of one episode with the places of the tools that move, else of the part of the picture that does."""
-        height, width = self.loader.source.image_size
-        tracks = (
-            None if self.loader.tracks is None else self.loader.tracks.tracks(clips[0].episode_id) if clips else None
-        )
+        if not clips:
+            return []
+        episode_id = clips[0].episode_id
+        tracks = None if self.loader.tracks is None else self.loader.tracks.tracks(episode_id)
         if tracks is None or not tracks.valid[:, tracks.views.index(view)].any():
-            background = self._background(clips[0].episode_id, view) if clips else np.zeros(0)
+            background = self._background(episode_id, view)
             pictures = [self._recorded(clip, view, (0, self.frame)) for clip in clips]
             return [
                 Place(clip, moving_part(first, later, background), background)
                 for clip, (first, later) in zip(clips, pictures, strict=True)
             ]
-        column, scale = (
-            tracks.views.index(view),
-            np.array([width / tracks.image_size[1], height / tracks.image_size[0]]),
-        )
+        (height, width), column = self.loader.source.image_size, tracks.views.index(view)
+        scale = np.array([width / tracks.image_size[1], height / tracks.image_size[0]])
+        background = self._background(episode_id, view) if tracks.camera_motion[column] == "static" else None
         found: list[Place] = []
         for clip in clips:
             cut = tracks.clip([clip.start, clip.start + self.frame])
@@ -166,7 +164,7 @@ class ActionFollowing:
             points[~cut.valid[:, column].astype(bool)] = np.nan
             still = ~(np.linalg.norm(points[1] - points[0], axis=-1) >= LEAST_MOTION * height)
             outside = ~_inside(points[1], height, width)
-            found.append(Place(clip, np.where((still | outside)[:, None], np.nan, points[1])))
+            found.append(Place(clip, np.where((still | outside)[:, None], np.nan, points[1]), background))
         return found
 
     def _background(self, episode_id: str, view: str) -> np.ndarray:

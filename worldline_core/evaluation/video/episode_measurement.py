@@ -56,6 +56,7 @@ class _Piece:
         first: the video's first frame, and its mask by the first segmenter.
         moved: exact masks of the thing that the task moves (n, h, w), and in which frames it has moved (n,).
         labels: of things (n, h, w), and of the first frame (h, w).
+        still: what a camera that stands still sees behind everything that moves (h, w, 3).
         begin: number of the first of these frames.
     """
 
@@ -67,6 +68,7 @@ class _Piece:
     moved: tuple[np.ndarray, np.ndarray] | None
     labels: tuple[np.ndarray, np.ndarray] | None
     background: Background | None
+    still: np.ndarray | None
     begin: int
 
 
@@ -244,9 +246,10 @@ class EpisodeMeasurement:
             if images is not None:
                 _require_length(len(images), count, f"{name} of {self.episode_id}, view {HEAD}")
         points = tool_points(tracks, self.episode_id, count, stride)
-        background = None
-        if exact is not None and tracks.tracks(self.episode_id).camera_motion[VIEWS.index(HEAD)] == "static":
-            background = Background.of(true.frames, exact, labels)
+        background, still = None, None
+        if tracks.tracks(self.episode_id).camera_motion[VIEWS.index(HEAD)] == "static":
+            still = background_of(len(true.frames), lambda frames: true.frames[frames])
+            background = None if exact is None else Background.of(true.frames, exact, labels)
         exact_pieces, label_pieces = (None if x is None else pieces(x, PIECE_FRAMES) for x in (exact, labels))
         first: tuple[np.ndarray, np.ndarray] | None = None
         first_labels: np.ndarray | None = None
@@ -274,7 +277,7 @@ class EpisodeMeasurement:
                     accuracy["robot_iou_difference"] = background.robot_iou(robot, frames)
                     accuracy["robot_iou_difference"][: int(begin == 0)] = np.nan
                 true.add(**{name: _null_if_nan(values) for name, values in accuracy.items()})
-            yield _Piece(frames, own_points, masks, first, robot, moved, labelled, background, begin)
+            yield _Piece(frames, own_points, masks, first, robot, moved, labelled, background, still, begin)
 
     def _add_full_frame(self, video: _Video, predicted: np.ndarray, true: np.ndarray, where: str) -> None:
         if predicted.shape != true.shape:
@@ -291,7 +294,7 @@ class EpisodeMeasurement:
         """Metrics of predicted head frames, compared with the first as many recorded ones."""
         part = slice(0, len(predicted))
         points = true.points[part]
-        errors = end_effector_error(true.frames[part], predicted, points)
+        errors = end_effector_error(true.frames[part], predicted, points, true.still)
         video.add(end_effector_error_px=[finite_mean(row) for row in errors])
         found = video.masks(predicted, points)
         for suffix, masks in found.items():
