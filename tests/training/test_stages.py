@@ -124,7 +124,7 @@ def test_native_control_vectors_take_the_place_of_maps(inputs, tmp_path):
     for changes, given, error, message in (
         ({}, without, ConfigError, "drawn from action tracks.*run render_actions"),
         ({"native_size": 1}, inputs, DataError, "driven by control vectors.*up to 1 numbers.*got: 2"),
-        ({}, film, CheckpointError, "driven otherwise.*vectors, native_size 3.*maps, native_size None"),
+        ({"native_size": 4}, film, ConfigError, "vectors of another size.*expected: 3.*got: 4"),
     ):
         with pytest.raises(error, match=f"(?s){message}"):
             train_stage2(stage2(2, **changes), given, tmp_path / "refused")
@@ -184,9 +184,9 @@ def test_outcomes_choose_episodes_and_do_not_reach_the_model(inputs, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "value", "found"),
-    [("sigma_px_ref", 10.0, "60\\.0"), ("controls", "state", "action"), ("fps", 30.0, "8\\.0")],
+    [("sigma_px_ref", 10.0, "60\\.0"), ("tokenizer", "another", "synthetic")],
 )
-def test_stage2_goes_on_with_maps_of_the_same_meaning_only(
+def test_stage2_goes_on_with_latents_and_maps_of_the_same_meaning_only(
     world, model_config, make_contract, tmp_path, name, value, found
 ):
     other = make_contract(**({"sigma_px_ref": 60.0, "tokenizer": "synthetic"} | {name: value}))
@@ -213,6 +213,24 @@ def test_stage2_goes_on_with_another_robot_and_says_so(
     assert (after["start"]["kind"], set(after["embodiments"])) == ("stage2", {"square"})
     assert ("it now learns" in caplog.text) is (told is not None)
     assert told is None or told in caplog.text
+
+
+def test_stage2_goes_on_at_another_rate_with_other_controls_and_says_so(
+    world, model_config, make_contract, tmp_path, caplog
+):
+    """What robots of one's own have: 7.5 of 30 frames, commands where the start had measured states, vectors instead of maps."""
+    other = make_contract(sigma_px_ref=60.0, tokenizer="synthetic", controls="state", fps=7.5)
+    save_checkpoint(tmp_path / "before", fresh(model_config, towers="generation"), kind="stage2", action_contract=other)
+    vectors = stage2(2, native_size=3, vector_share=1.0, action_dropout=0.0)
+    train_stage2(vectors, {**world.inputs, "stage1": tmp_path / "before"}, tmp_path / "after")
+    contract = read_checkpoint_info(tmp_path / "after").action_contract
+    assert (contract.controls, contract.fps, contract.sigma_px_ref) == ("action", 8.0, None)
+    for change in (
+        "controls: action, before state",
+        "frames per second: 8.0, before 7.5",
+        "conditioning: vectors, before maps",
+    ):
+        assert change in caplog.text
 
 
 def test_wrong_checkpoint_and_missing_teacher_are_named(inputs, model_config, make_contract, make_spec, tmp_path):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import open_controls
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import CheckpointError, ConfigError
+from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, WorldModelConfig
@@ -43,7 +43,14 @@ def stage2_model_config(config: Stage2Config, start: WorldModelConfig, *, drawn:
 
     Args:
         drawn: there are action tracks to draw maps from.
+
+    Raises: ConfigError: the checkpoint takes vectors of another size.
     """
+    if start.native_size is not None and config.native_size not in (None, start.native_size):
+        raise ConfigError(
+            "The model that Stage II starts from takes vectors of another size", where="train_stage2.native_size",
+            expected=start.native_size, got=config.native_size,
+        )  # fmt: skip
     takes = "maps" if config.native_size is None else "either" if drawn and config.vector_share < 1 else "vectors"
     controls = {"action_frames": config.action_frames, "native_size": config.native_size, "action_conditioning": takes}
     return start.model_copy(update={"towers": "generation", **controls})
@@ -51,12 +58,13 @@ def stage2_model_config(config: Stage2Config, start: WorldModelConfig, *, drawn:
 
 def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Train on ``episodes`` and ``tracks`` from the checkpoint ``stage1``, a base, Stage I or Stage II one; ``teacher`` for the
-    relational terms. A Stage II model goes on with maps of the same meaning, of any embodiment; one that is new to it is said.
+    relational terms. A Stage II model goes on with latents and maps of the same meaning; robots, rates and controls that are new to
+    it are logged.
 
     Clips are cached ``latents``, or frames that ``tokenizer`` encodes on the way.
 
     Raises:
-        CheckpointError: if the checkpoint is of the wrong kind, or was trained on maps of another meaning.
+        CheckpointError: if the checkpoint is of the wrong kind, or was trained on latents or maps of another meaning.
         ConfigError: if relational terms are asked for without a teacher.
         DataError: if no clip fits, or one cannot be read.
     """
@@ -82,28 +90,9 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
             "tokenizer": stage.source.description["tokenizer"],
         }
     )
-    before = read_checkpoint_info(parent)
-    learnt = before.action_contract
-    if learnt is not None:
-        was, now = before.config, model.config
-        if was.native_size not in (None, now.native_size) or was.takes_maps > now.takes_maps:
-            raise CheckpointError(
-                "The Stage II model is driven otherwise", where=f"{parent}: native_size, vector_share",
-                expected=f"{was.action_conditioning}, native_size {was.native_size}",
-                got=f"{now.action_conditioning}, native_size {now.native_size}",
-            )  # fmt: skip
-        kept = {"sigma_px_ref", "tokenizer", "fps"}
-        learnt.require_tracks((row.episode_id for row in stage.rows), tracks)
-        learnt.require(where=tracks.root, **contract.model_dump(include=kept))
+    contract.require_tracks((row.episode_id for row in stage.rows), tracks)
     seen = Counter(row.embodiment for row in stage.training_rows)
-    if learnt is not None:
-        known = before.metadata.get("embodiments")
-        known_robots = "does not say which embodiments it saw" if known is None else f"saw {sorted(known)}"
-        new = sorted(name for name in seen if known is None or name not in known)
-        if new:
-            logger.warning("The Stage II model that training goes on from %s; it now learns %s.", known_robots, new)
-        if learnt.grid_size != contract.grid_size:
-            logger.warning("It saw latents of %s, and now sees %s.", learnt.grid_size, contract.grid_size)
+    _require_same_meaning(parent, contract, model.config, seen, tracks.root)
     loader = stage.loader(tracks=tracks)
     objective = FlowMatchingObjective(
         model,
@@ -126,6 +115,36 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     counts = stage.save(result, kind="stage2", action_contract=contract, facts=facts)
     trained = sum(value.numel() for group in groups for value in group.parameters.values())
     return {**counts, "trained_parameters": trained, **result.metrics}
+
+
+def _require_same_meaning(
+    start: Path, contract: ActionContract, config: WorldModelConfig, robots: Collection[str], tracks: Path
+) -> None:
+    """Refuse latents and maps that mean something else to the Stage II model that training goes on from, and log what is new to it.
+
+    Raises: CheckpointError: another tokenizer, or another width of the maps.
+    """
+    info = read_checkpoint_info(start)
+    learnt, was = info.action_contract, info.config
+    if learnt is None:
+        return
+    drawn = {"sigma_px_ref"} if was.takes_maps and config.takes_maps else set()
+    learnt.require(where=tracks, **contract.model_dump(include={"tokenizer", *drawn}))
+    known = info.metadata.get("embodiments")
+    new = sorted(name for name in robots if known is None or name not in known)
+    if new:
+        saw = "does not say which embodiments it saw" if known is None else f"saw {sorted(known)}"
+        logger.warning("The Stage II model that training goes on from %s; it now learns %s.", saw, new)
+    for name, before, now in (
+        ("controls", learnt.controls, contract.controls),
+        ("frames per second", learnt.fps, contract.fps),
+        ("size of the latents", learnt.grid_size, contract.grid_size),
+        ("conditioning", was.action_conditioning, config.action_conditioning),
+    ):
+        if before != now:
+            logger.warning(
+                "The Stage II model that training goes on from learns another %s: %s, before %s.", name, now, before
+            )
 
 
 def _relational(config: Stage2Config, inputs: Mapping[str, Path], model: WorldModel) -> RelationalTerm | None:
