@@ -50,8 +50,12 @@ def test_a_folder_of_videos(tmp_path: Path) -> None:
     for n in range(3):
         write_video(tmp_path / f"raw/{n}/clip.mp4", pictures(motion(5, 40, n), "still", n), 10)
     (tmp_path / "raw/captions.csv").write_text("video,caption\n")
-    found, _, counts = init(tmp_path)
+    found, config, counts = init(tmp_path)
     assert (found.kind, found.state_size, counts["kept"]) == ("video_folder", None, 3)
+    assert config.train_stage1 is not None and (
+        config.train_stage1.trainer.minutes,
+        config.train_stage1.trainer.steps,
+    ) == (20, None)
     assert any("captions.csv" in note for note in found.notes)
 
 

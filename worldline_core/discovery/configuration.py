@@ -18,6 +18,13 @@ BASE_RATES = {"my_robot": 8.0}
 """Frames a second that a preset's base model knows: episodes are thinned to the nearest rate."""
 OTHER_RATE = 15.0
 """Frames a second for Cosmos3, which knows any rate: a clip of 33 frames lasts two seconds."""
+_VIDEOS_ALONE = """
+# Videos alone: Stage I learns from them, from the shipped base.
+models: {base: artifacts/shipped/models/base}
+train_stage1:
+  weighting: {kind: velocity, motion: 1.0}
+  sigma: {kind: uniform, shift: 3.0}
+  trainer: {minutes: 20, batch_size: 8, ema_decay: 0.98, optimizer: {learning_rate: 5.0e-4, warmup_steps: 20, decay: 0.3125}}"""
 _CLIP_FRAMES = 33
 _WIDTH = 120
 
@@ -67,7 +74,7 @@ def config_text(found: Discovery, given: str, preset: str = "my_robot") -> str:
     lines += ["curate:", "  sources:"]
     first, *others = _block(found.source, (), found, 6)
     lines += [*_comment(found.evidence.get(("kind",), ""), 4), f"    - {first.lstrip()}", *others]
-    lines += [*_rate(found, BASE_RATES.get(preset, OTHER_RATE)), *_splits(found), *_stages(found)]
+    lines += [*_rate(found, BASE_RATES.get(preset, OTHER_RATE)), *_splits(found), *_stages(found, preset)]
     return "\n".join(lines) + "\n"
 
 
@@ -101,10 +108,10 @@ def _splits(found: Discovery) -> list[str]:
     return ["  # One episode: nothing is held out, so nothing can be measured.", "  splits: {test: 0, validation: 0}"]
 
 
-def _stages(found: Discovery) -> list[str]:
+def _stages(found: Discovery, preset: str) -> list[str]:
     """Sections that depend on views and cameras."""
     if found.state_size is None:
-        return ["", "# Videos alone: Stage I learns from them."]
+        return _VIDEOS_ALONE.split("\n") if preset == "my_robot" else ["", "# Videos alone: Stage I learns from them."]
     views = f"[{', '.join(found.views)}]"
     lines = [
         "",
