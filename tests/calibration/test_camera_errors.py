@@ -187,6 +187,7 @@ def test_episodes_beyond_their_bounds_are_mixed() -> None:
     assert source(*[20.0] * 8) == "off"
 
 
+@pytest.mark.slow
 def test_exchanged_wrist_videos_are_found(healthy_episodes: list) -> None:
     found = []
     for item in healthy_episodes[4:8]:

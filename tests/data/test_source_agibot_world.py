@@ -245,6 +245,7 @@ FAULTS: dict[str, tuple[Damage, str]] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_fault_quarantines_its_episode_alone(tmp_path: Path) -> None:
     check_faults(tmp_path / "raw", settings(tmp_path), lambda root, n: write_episode(root, n, n), FAULTS)
 

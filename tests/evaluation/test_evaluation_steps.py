@@ -327,6 +327,7 @@ def test_odd_values_of_a_judge_go_through_the_whole_step(recordings, tmp_path, m
     assert seen == {"", r"\ud800 \x1b[2J"}
 
 
+@pytest.mark.slow
 def test_methods_are_compared_over_the_views_that_both_predicted(recordings, tmp_path):
     inputs = recordings.inputs | rewritten(recordings, tmp_path / "head_only", source="copy", views=("head",))
     found, means = measure(inputs, tmp_path / "out")

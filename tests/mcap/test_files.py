@@ -217,6 +217,7 @@ def test_time_ranges_cut_a_long_file(tmp_path: Path) -> None:
         source(toy.declared(tmp_path, episodes={"by": "ranges", "ranges": [{"name": "x", "start_s": 2, "stop_s": 1}]}))
 
 
+@pytest.mark.slow
 def test_markers_bound_episodes(tmp_path: Path) -> None:
     recording = toy.robot(8.0)
     texts = {

@@ -20,6 +20,7 @@ from worldline_core.store.remote import parse_location
 LIMITS = ReaderLimits(memory_gb=2, seconds=60)
 
 
+@pytest.mark.slow
 def test_threads_read_side_by_side() -> None:
     """Each with a reader of its own: the pauses do not add up."""
     with ThreadPoolExecutor(2) as threads:
@@ -75,6 +76,7 @@ def test_too_much_memory_or_time() -> None:
     assert time.monotonic() - started < 30
 
 
+@pytest.mark.slow
 def test_signs_of_life_put_the_deadline_off() -> None:
     code = """
 import time
@@ -87,6 +89,7 @@ for _ in range(6):
     read_limited(ReaderLimits(seconds=0.8), exec, code)
 
 
+@pytest.mark.slow
 def test_what_a_function_imports_is_no_time_of_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy machine the first recording of a reader, whose imports took longer than the limit, was `out_of_time`."""
     slow = "import os, time\n'PYTEST_CURRENT_TEST' in os.environ or time.sleep(0.8)\ndef answer(): return 42\n"

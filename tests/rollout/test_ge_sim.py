@@ -178,6 +178,7 @@ BAD_ANSWERS = {
 }
 
 
+@pytest.mark.slow
 def test_a_bad_answer_puts_its_episode_into_quarantine(server, tmp_path):
     """Every second episode gets a good one: three bad ones in a row would end the step."""
     names = [name for bad in sorted(BAD_ANSWERS) for name in (bad, f"{bad} good")]  # in the order of their names
