@@ -37,7 +37,8 @@ class StillCamera:
         halves: of the even and of the odd episodes.
         agreements: (e,) of each episode with the camera of the half that it does not belong to.
         rival: the best camera elsewhere, and its agreements.
-        mirrored: (e,) gain in log-likelihood of mirrored pictures at the rough size; mirrored_agreement: their median agreement.
+        mirrored: (e,) gain in log-likelihood of mirrored pictures at the rough size; mirrored_agreement: their median agreement;
+            mirrored_apart: median distance [widths] of the places that the tools would then have in the picture.
     """
 
     fitted: FittedCamera
@@ -48,6 +49,7 @@ class StillCamera:
     rival_agreements: np.ndarray | None
     mirrored: np.ndarray
     mirrored_agreement: float
+    mirrored_apart: float
 
 
 def estimate_still(recorded: RecordedView) -> StillCamera:
@@ -75,6 +77,7 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
     other = _settled(mirrored_views, max(mirrored, key=lambda fit: fit.likelihood), recorded.shared)
     gains = _likelihoods(mirrored_views, other) - _likelihoods(rough_views, own)
     agreed = float(np.median([agreement(view, other) for view in mirrored_views]))
+    apart = tools_apart(own.camera, _of_unmirrored_pictures(other.camera), recorded)
     views = recorded.still_views(fine=True)
     fine = recorded.unknown_camera(fine=True)
     fits = [
@@ -86,7 +89,7 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
     halves, agreements = _by_halves(views, best, recorded.shared)
     rival = next((fit for fit in fits[1:] if tools_apart(best.camera, fit.camera, recorded) > RIVAL_APART), None)
     rivals = None if rival is None else np.array([agreement(view, rival) for view in views])
-    return StillCamera(best, halves, agreements, found[0].score, rival, rivals, gains, agreed)
+    return StillCamera(best, halves, agreements, found[0].score, rival, rivals, gains, agreed, apart)
 
 
 def refine_with_masks(masked: RecordedView, found: StillCamera) -> StillCamera:
@@ -137,6 +140,12 @@ def tools_apart(one: CameraTrack, other: CameraTrack, recorded: RecordedView) ->
     size = (one.height, one.width)
     shown = (inside_image(a * one.width, size) & (near > 0)) | (inside_image(b * one.width, size) & (near_b > 0))
     return float(np.median(np.linalg.norm(a - b, axis=1)[shown])) if shown.any() else np.inf
+
+
+def _of_unmirrored_pictures(camera: CameraTrack) -> CameraTrack:
+    """The camera of mirrored pictures, with the columns of the pictures as they are."""
+    flip = np.array([[-1.0, 0.0, camera.width - 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    return replace(camera, K=flip @ camera.K)
 
 
 def tools_in_view(camera: CameraTrack, recorded: RecordedView) -> float:

@@ -25,6 +25,7 @@ from worldline_core.calibration.estimate.recordings import FEWEST_FRAMES, Record
 from worldline_core.calibration.estimate.refine import FOCAL, FittedCamera, equations_at, inflation
 from worldline_core.calibration.estimate.still_camera import (
     AGREEMENT_BLUR,
+    RIVAL_APART,
     StillCamera,
     shown_by,
     tools_apart,
@@ -174,6 +175,7 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     zoom[5], zoom[FOCAL] = -ZOOM_ERROR * depth, ZOOM_ERROR
     kinds = _intervals(recorded, fitted, shown_by(fitted, views), recorded.shared, zoom)
     reasons: list[str] = []
+    notes: list[str] = []
     typical = float(np.median(found.agreements))
     if typical < LEAST_AGREEMENT:
         reasons.append(
@@ -195,7 +197,9 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
             " robot is declared, its columns or units are others, or other things move"
         )
     elif mirrored > MIRRORED_GAIN or _deviations(-found.mirrored) < RIVAL_DEVIATIONS:
-        reasons.append("mirrored pictures fit as well: the motion shows no difference")
+        text = "mirrored pictures fit as well: the motion shows no difference"
+        # Controls are drawn at the tools' places: where these are the same, it does not matter.
+        (reasons if found.mirrored_apart > RIVAL_APART else notes).append(text)
     if found.rival is not None and found.rival_agreements is not None:
         apart = 100 * tools_apart(fitted.camera, found.rival.camera, recorded)
         gain = found.agreements - found.rival_agreements
@@ -212,7 +216,8 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
     if moved is not None:
         reasons.insert(0, MOVED.format(moved))
     low = [e.episode_id for e, a in zip(recorded.episodes, found.agreements, strict=True) if a < LEAST_EPISODE]
-    notes = (f"episodes that do not fit: {', '.join(low)}",) if low and moved is None else ()
+    if low and moved is None:
+        notes.append(f"episodes that do not fit: {', '.join(low)}")
     if 2 * len(low) > len(recorded.episodes):
         reasons.append(f"{len(low)} of {len(recorded.episodes)} episodes do not fit")
     if typical < LEAST_AGREEMENT and moved is None:  # then nothing else means anything
@@ -223,7 +228,7 @@ def judge_still(recorded: RecordedView, found: StillCamera) -> ViewEstimate:
         estimate,
         rival=None if found.rival is None else full_size(found.rival.camera, recorded.image_size),
         rival_agreement=None if agreements is None else float(np.median(agreements)),
-        notes=notes,
+        notes=tuple(notes),
         moved_at=moved,
     )
 
