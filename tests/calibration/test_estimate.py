@@ -20,7 +20,12 @@ from worldline_core.calibration.estimate.estimate import camera_file, estimate_v
 from worldline_core.calibration.estimate.estimate_report import estimate_text
 from worldline_core.calibration.estimate.recordings import RecordedView, near_changes, recorded_views
 from worldline_core.calibration.estimate.refine import FittedCamera, fit_still
-from worldline_core.calibration.estimate.still_camera import agreement, tools_apart
+from worldline_core.calibration.estimate.still_camera import (
+    StillCamera,
+    agreement,
+    of_unmirrored_pictures,
+    tools_apart,
+)
 from worldline_core.calibration.estimate.verdict import (
     BasePose,
     SourceEstimate,
@@ -28,6 +33,7 @@ from worldline_core.calibration.estimate.verdict import (
     cause_of_disagreement,
     clearest_step,
     full_size,
+    judge_still,
 )
 from worldline_core.calibration.estimate.wrist_camera import WristCamera, mounts_around
 from worldline_core.calibration.observation import CELL_PX, CLEAR_CHANGE
@@ -68,6 +74,18 @@ def test_a_camera_is_made_exact_from_a_start_nearby(bank: Loaded, kinematics: Ar
     assert tools_apart(fitted.camera, true, recorded) < 0.04
     assert abs(fitted.lag) < 0.2
     assert min(agreement(view, fitted) for view in views) > 0.6
+    # Mirrored pictures that fit as well matter where they would show the tools elsewhere.
+    flipped = replace(fitted.camera, K=np.array([[-1, 0, size.width - 1], [0, 1, 0], [0, 0, 1]]) @ fitted.camera.K)
+    same = tools_apart(fitted.camera, of_unmirrored_pictures(flipped), recorded)
+    elsewhere = tools_apart(fitted.camera, of_unmirrored_pictures(start), recorded)
+    agreements = np.array([agreement(view, fitted) for view in views])
+    for apart, doubted in ((same, False), (elsewhere, True)):
+        found = StillCamera(fitted, (fitted, fitted), agreements, 1.0, None, None, np.zeros(len(views)), 0.5, apart)
+        judged = judge_still(recorded, found)
+        assert [any("mirrored" in text for text in texts) for texts in (judged.reasons, judged.notes)] == [
+            doubted,
+            not doubted,
+        ]
 
 
 @pytest.fixture(scope="module")
