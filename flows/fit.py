@@ -33,7 +33,7 @@ def fit(config: Path, overrides: tuple[str, ...] = (), artifacts: Path = STORE) 
 
 def with_cameras(settings: PipelineConfig, cameras: Path) -> PipelineConfig:
     """The run with the estimate of its one source: controls are drawn into the views of the calibration file, the others take the
-    commands, and pictures are read as late as they were measured to be.
+    commands (which a model of maps alone does not learn), and pictures are read as late as they were measured to be.
     """
     source = settings.curate.sources[0]
     lags = json.loads((cameras.parent / ESTIMATE).read_text())["image_lags"]
@@ -41,5 +41,9 @@ def with_cameras(settings: PipelineConfig, cameras: Path) -> PipelineConfig:
     source = source.model_copy(update=update)
     curate = settings.curate.model_copy(update={"sources": (source,)})
     drawn = settings.render_actions or PipelineConfig.load("tiny").render_actions
-    segmenter = settings.train_segmenter if HEAD in json.loads(cameras.read_text())["views"] else None
-    return settings.model_copy(update={"curate": curate, "render_actions": drawn, "train_segmenter": segmenter})
+    views = json.loads(cameras.read_text())["views"]
+    stage2, segmenter = settings.train_stage2, settings.train_segmenter if HEAD in views else None
+    if set(settings.encode_latents.views) <= set(views):
+        stage2 = stage2.model_copy(update={"native_size": None})
+    update = {"curate": curate, "render_actions": drawn, "train_segmenter": segmenter, "train_stage2": stage2}
+    return settings.model_copy(update=update)

@@ -73,6 +73,10 @@ def test_cameras_are_estimated_where_a_robot_is_known_and_no_file_is_named(own: 
     (here / "cameras.json").write_text(json.dumps({"views": views}))
     found = with_cameras(config, here / "cameras.json")
     assert found.render_actions is not None and config.render_actions is None
+    sizes = [each.train_stage2.native_size for each in (config, found)]
+    assert sizes == [6, 6]  # the wrist view has no camera
+    (here / "both.json").write_text(json.dumps({"views": views | {"right_wrist": {}}}))
+    assert with_cameras(config, here / "both.json").train_stage2.native_size is None
     assert found.curate.sources[0].conventions == RecordedConventions(image_lag_frames=-2)
     assert found.train_segmenter is not None and found.train_segmenter.labels == "kinematic"
     assert EstimateConfig.of(found.curate, {}) is None
