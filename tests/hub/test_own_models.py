@@ -15,6 +15,8 @@ from worldline_core.errors import CheckpointError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.store.store import ArtifactStore
 
+pytestmark = pytest.mark.slow
+
 SMALL = (
     "models.tokenizer=null", "models.base=null", "models.teacher=null", "models.segmenter=null",
     "train_tokenizer={channels: 8, steps: 2, fit_clips: 2, refinement_width: 8, refinement_depth: 1, batch_size: 2}",
