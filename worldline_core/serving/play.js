@@ -14,6 +14,7 @@ const tell = (message) => socket.readyState === 1 && socket.send(JSON.stringify(
 const say = (text, bad) => { $("said").textContent = text; $("said").className = bad ? "bad" : "muted"; };
 socket.addEventListener("close", (event) => { run(false); say(`Disconnected${event.reason ? `: ${event.reason}` : ""}. Load the page again; a server with a token wants …/play#token=TOKEN.`, true); });
 
+const counted = (views) => `${views.length} ${views.length === 1 ? "view" : "views"}`;
 const bool = (on) => (on ? 1 : 0);
 const down = (more, less) => bool(keys.has(more)) - bool(keys.has(less));
 const dead = (value) => (Math.abs(value || 0) < 0.15 ? 0 : value);
@@ -51,7 +52,7 @@ function frame() {
     play.shown += 1;
     seen.push(performance.now());
     seen = seen.filter((time) => time > performance.now() - 3000);
-    if (seen.length > 3) $("rate").textContent = `${(1000 * (seen.length - 1) / (seen.at(-1) - seen[0])).toFixed(1)} frames/s of ${started.views.length} views`;
+    if (seen.length > 3) $("rate").textContent = `${(1000 * (seen.length - 1) / (seen.at(-1) - seen[0])).toFixed(1)} frames/s of ${counted(started.views)}`;
   }
   if (running && $("driver").value && wished(wish())) { byHand(); run(true); }
   const policy = $("driver").value;
@@ -118,8 +119,9 @@ async function block(data) {
   else {
     queue.push(...frames);
     if (due.length) { const waited = performance.now() - due.shift(); play.latency.push(waited); $("latency").textContent = `${(waited / 1000).toFixed(2)} s`; }
-    $("computed").textContent = `${head.seconds.toFixed(2)} s`;
-    $("ratio").textContent = `${(head.frames / hello.fps / head.seconds).toFixed(1)} ×`;
+    const ahead = head.seconds < 0.001;  // it was there when it was asked for
+    $("computed").textContent = ahead ? "advance" : `${head.seconds.toFixed(2)} s`;
+    if (!ahead) $("ratio").textContent = `${(head.frames / hello.fps / head.seconds).toFixed(1)} ×`;
   }
   tree();
   draw();
@@ -167,7 +169,7 @@ socket.addEventListener("message", ({ data }) => {
     for (const name of message.policies) $("driver").add(new Option(`by ${name}`, name));
     const wanted = new URLSearchParams(location.search).get("episode");
     if (wanted) $("episode").value = wanted;
-    $("about").textContent = `${message.episodes.length} recordings to start from · ${message.fps} frames/s · ${message.views.length} views`;
+    $("about").textContent = `${message.episodes.length} recordings to start from · ${message.fps} frames/s · ${counted(message.views)}`;
     setInterval(frame, 1000 / message.fps);
     start();
   } else if (message.type === "started") {
