@@ -208,7 +208,8 @@ def with_exchanged_extrinsics(episode: Episode) -> Episode:
     return replace(episode, cameras=dict(episode.cameras) | exchanged)
 
 
-@pytest.mark.parametrize(("truth", "declared"), [("ur5e", "viperx_graphite"), *slow(("panda", "xarm7_white"))])
+@pytest.mark.slow
+@pytest.mark.parametrize(("truth", "declared"), [("ur5e", "viperx_graphite"), ("panda", "xarm7_white")])
 def test_another_robot_than_declared_is_named(healthy: list, truth: str, declared: str) -> None:
     item = of_robot(healthy, truth)
     diagnosis = declared_as(item, declared)
@@ -244,6 +245,7 @@ def test_flange_poses_do_not_turn_the_wrist_cameras(agibot: Agibot) -> None:
     assert all("camera_axes: opengl" in diagnosis.nearest[0] for diagnosis in diagnoses)
 
 
+@pytest.mark.slow
 def test_exchanged_wrist_extrinsics_are_not_exchanged_arms(healthy: list) -> None:
     item = of_robot(healthy, "ur5e")
     diagnosis = diagnose(with_exchanged_extrinsics(item.joints), item.gray, item.kinematics)

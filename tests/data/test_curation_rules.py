@@ -60,6 +60,7 @@ def refused(root: Path) -> dict[str, tuple[str, dict[str, Any]]]:
     return {row.episode_id: (row.reason, row.numbers) for row in EpisodeSet.open(root).quarantine()}
 
 
+@pytest.mark.slow
 def test_a_copy_that_was_encoded_resized_and_cut_is_taken_out(tmp_path: Path) -> None:
     samples = [room(number, f"e{number}") for number in range(6)]
     episode, frames = room(2, "z-copy", split="train")

@@ -101,6 +101,7 @@ def test_pictures_are_new_at_every_step_unless_told_otherwise(physics, monkeypat
     assert changed == [False, False, False, True, False]
 
 
+@pytest.mark.slow
 def test_both_worlds_begin_alike_at_any_frame_and_score_alike(physics, world, shipped):
     """In MuJoCo the things have moved as they did when it was recorded; commands are held within the same limits."""
     recordings = EpisodeSet.open(shipped / "recordings")

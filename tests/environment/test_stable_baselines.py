@@ -36,6 +36,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [ENVIRONMENT, MUJOCO_ENVIRONMENT])
 def test_its_checker_finds_nothing(world: WorldLine, name: str, request: pytest.FixtureRequest) -> None:
     options: dict[str, Any] = {"model": world} if name == ENVIRONMENT else {}

@@ -123,6 +123,7 @@ def test_videos_are_compared_with_videos_without_action_tracks(recordings, evalu
         assert "have no action tracks" in found["unavailable"][name]
 
 
+@pytest.mark.slow
 def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, evaluated, tmp_path, monkeypatch):
     again = shutil.copytree(evaluated, tmp_path / "again")
     parts = sorted((again / "run/parts").rglob("*.json"))
@@ -341,6 +342,7 @@ def test_methods_are_compared_over_the_views_that_both_predicted(recordings, tmp
     assert rows["copy", "good", "ssim"] == pytest.approx(copy["ssim"]["mean"] - good["ssim"]["mean"])
 
 
+@pytest.mark.slow
 def test_strided_predictions_are_compared_with_every_second_frame(recordings, tmp_path):
     inputs = {name: path for name, path in recordings.inputs.items() if not name.startswith("rollouts.")}
     inputs |= rewritten(recordings, tmp_path / "strided", lambda frames: frames[::2], fps=4.0)

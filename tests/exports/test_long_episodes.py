@@ -96,15 +96,6 @@ def read_mcap(recorded: Recorded, output: Path) -> None:
 WITH_THUMBNAILS = "episode as lerobot"
 """Keeps grey thumbnails of 72 x 96 until the episode is whole, 0.19 of a view's frames each: those of three views, one of them
 twice while it is stacked, and what they are packed into: 0.97 when measured."""
-SLOW = (
-    "side by side",
-    "episode as mcap",
-    "episode as rrd",
-    "rollout as mcap and rrd",
-    "inspect",
-    "curate",
-    "exact masks",
-)
 
 OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
     "side by side": lambda r, out: write_side_by_side(
@@ -130,9 +121,8 @@ def lengths(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Recorded]:
     return {count: Recorded(root / str(count)) for count in (SHORT, LONG)}
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in OUTPUTS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OUTPUTS)
 def test_memory_does_not_grow_with_the_frames(
     lengths: dict[int, Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:

@@ -53,6 +53,7 @@ def digests(root: Path) -> dict[str, str]:
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+@pytest.mark.slow
 def test_an_episode_is_a_function_of_its_entropy(recorder: EpisodeRecorder, recording: Recording) -> None:
     recorder.record(replace(JOB, split="test", family="press", entropy=(9,)))
     again = recorder.record(JOB)

@@ -147,6 +147,7 @@ def test_a_view_keeps_its_slot_whichever_others_are_there(inputs):
     assert not torch.allclose(pair, wrong, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_whole_recordings_are_predicted_to_their_end(mixed, tmp_path):
     summary = rollout(CONFIG.model_copy(update={"num_frames": "whole", "crf": 0}), mixed, tmp_path)
     rollouts = RolloutSet.open(tmp_path)

@@ -97,6 +97,7 @@ class ForkingMapper:
             yield shard, WorkerDiedError("A worker ended without an answer") if status else None
 
 
+@pytest.mark.slow
 def test_a_shard_with_one_file_is_made_again_without_the_episode_that_kills(tmp_path: Path) -> None:
     map_episodes(ForkingMapper(), NumberFileWork(tmp_path), [[8, 9], [12, 13, 14]])
     assert (tmp_path / "-1").read_text() == "8:kept 9:kept"

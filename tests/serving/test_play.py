@@ -327,6 +327,7 @@ def in_this_process(world: WorldLine, shipped: Path, output: Path) -> Iterator[D
     assert not [message for message in sent if message["type"] == "error"]
 
 
+@pytest.mark.slow
 def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(
     small_world: WorldLine, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -357,6 +358,7 @@ def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(
         assert sent[-1]["frames"] == 9
 
 
+@pytest.mark.slow
 def test_the_next_block_is_computed_ahead_in_a_session_alone(
     small_world: WorldLine, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
