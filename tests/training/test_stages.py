@@ -221,14 +221,15 @@ def test_stage2_goes_on_at_another_rate_with_other_controls_and_says_so(
     """What robots of one's own have: 7.5 of 30 frames, commands where the start had measured states, vectors instead of maps."""
     other = make_contract(sigma_px_ref=60.0, tokenizer="synthetic", controls="state", fps=7.5)
     save_checkpoint(tmp_path / "before", fresh(model_config, towers="generation"), kind="stage2", action_contract=other)
+    caplog.set_level("INFO")
     vectors = stage2(2, native_size=3, vector_share=1.0, action_dropout=0.0)
     train_stage2(vectors, {**world.inputs, "stage1": tmp_path / "before"}, tmp_path / "after")
     contract = read_checkpoint_info(tmp_path / "after").action_contract
     assert (contract.controls, contract.fps, contract.sigma_px_ref) == ("action", 8.0, None)
     for change in (
-        "controls: action, before state",
-        "frames per second: 8.0, before 7.5",
-        "conditioning: vectors, before maps",
+        "controls action, before state",
+        "frames per second 8.0, before 7.5",
+        "conditioning vectors, before maps",
     ):
         assert change in caplog.text
 

@@ -128,8 +128,8 @@ def _require_same_meaning(
     learnt, was = info.action_contract, info.config
     if learnt is None:
         return
-    drawn = {"sigma_px_ref"} if was.takes_maps and config.takes_maps else set()
-    learnt.require(where=tracks, **contract.model_dump(include={"tokenizer", *drawn}))
+    kept = {"tokenizer", "sigma_px_ref"} if was.takes_maps and config.takes_maps else {"tokenizer"}
+    learnt.require(where=tracks, **contract.model_dump(include=kept))
     known = info.metadata.get("embodiments")
     new = sorted(name for name in robots if known is None or name not in known)
     if new:
@@ -142,9 +142,7 @@ def _require_same_meaning(
         ("conditioning", was.action_conditioning, config.action_conditioning),
     ):
         if before != now:
-            logger.warning(
-                "The Stage II model that training goes on from learns another %s: %s, before %s.", name, now, before
-            )
+            logger.info("New to the Stage II model that training goes on from: %s %s, before %s.", name, now, before)
 
 
 def _relational(config: Stage2Config, inputs: Mapping[str, Path], model: WorldModel) -> RelationalTerm | None:
