@@ -69,11 +69,11 @@ def test_train_on_a_lerobot_dataset(project_root: Path, tmp_path: Path) -> None:
     dataset = tmp_path / "dataset"
     shutil.copytree(project_root / "artifacts/shipped/recordings/datasets/viperx_pearl", dataset)
     shutil.rmtree(dataset / "meta" / "worldline")  # what a foreign dataset does not have
-    short = [f"train_stage1.trainer.{value}" for value in ("minutes=null", "steps=2", "validation_batches=0")]
+    short = [f"train_stage2.trainer.{value}" for value in ("minutes=null", "steps=2", "validation_batches=0")]
     options = [text for each in short for text in ("--set", each)]
     printed = _run(project_root, "train_on_lerobot.py", dataset, *options, cwd=tmp_path)
     assert "angle_unit: " in printed
-    (trained,) = (tmp_path / "artifacts/train_stage1").glob("*/manifest.json")
+    (trained,) = (tmp_path / "artifacts/train_stage2").glob("*/manifest.json")
     assert json.loads(trained.read_text())["metrics"]["steps"] == 2
 
 
