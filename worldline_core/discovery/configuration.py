@@ -111,7 +111,7 @@ def _splits(found: Discovery) -> list[str]:
 def _stages(found: Discovery, preset: str) -> list[str]:
     """Sections that depend on views and cameras."""
     if found.state_size is None:
-        return _VIDEOS_ALONE.split("\n") if preset == "my_robot" else ["", "# Videos alone: Stage I learns from them."]
+        return [_VIDEOS_ALONE if preset == "my_robot" else "\n# Videos alone: Stage I learns from them."]
     views = f"[{', '.join(found.views)}]"
     lines = [
         "",
