@@ -23,8 +23,8 @@ from worldline_core.calibration.estimate.refine import FittedCamera, fit_still
 from worldline_core.calibration.estimate.still_camera import (
     StillCamera,
     agreement,
-    of_unmirrored_pictures,
     tools_apart,
+    unmirrored,
 )
 from worldline_core.calibration.estimate.verdict import (
     BasePose,
@@ -76,8 +76,8 @@ def test_a_camera_is_made_exact_from_a_start_nearby(bank: Loaded, kinematics: Ar
     assert min(agreement(view, fitted) for view in views) > 0.6
     # Mirrored pictures that fit as well matter where they would show the tools elsewhere.
     flipped = replace(fitted.camera, K=np.array([[-1, 0, size.width - 1], [0, 1, 0], [0, 0, 1]]) @ fitted.camera.K)
-    same = tools_apart(fitted.camera, of_unmirrored_pictures(flipped), recorded)
-    elsewhere = tools_apart(fitted.camera, of_unmirrored_pictures(start), recorded)
+    same = tools_apart(fitted.camera, unmirrored(flipped), recorded)
+    elsewhere = tools_apart(fitted.camera, unmirrored(start), recorded)
     agreements = np.array([agreement(view, fitted) for view in views])
     for apart, doubted in ((same, False), (elsewhere, True)):
         found = StillCamera(fitted, (fitted, fitted), agreements, 1.0, None, None, np.zeros(len(views)), 0.5, apart)

@@ -128,7 +128,7 @@ def test_end_effector_error_is_the_displacement_of_the_gripper():
 
 
 def test_a_tool_is_not_found_on_the_table_behind_it():
-    """A copy of a first frame, in which the small tool was 10 pixels to the left: the table's texture is where it always is."""
+    """A copied first frame shows the tool 10 pixels too far left, before an unchanged table."""
     table = np.random.default_rng(2).normal(110, 25, (64, 96, 3)).clip(0, 255).astype(np.uint8)
     true, copy = (np.repeat(table[None], 1, axis=0) for _ in range(2))
     for video, column in ((true, 48), (copy, 38)):

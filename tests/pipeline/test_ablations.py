@@ -83,6 +83,24 @@ def test_each_variant_changes_what_it_says_and_nothing_else(calls: dict[str, Tas
     assert calls["rollout.stage2.native_film"].config == calls["rollout.stage2"].config
 
 
+def test_start_models_are_compared_from_the_seeds_of_every_stage(project_root: Path) -> None:
+    """Stage I is what the variant from nothing adds, and what the others do not have."""
+    source = "curate.sources=[{kind: video_folder, path: x}]"
+    variants = choose_variants(file=project_root / "configs/variants/start.yaml")
+    found = {
+        name: variant_config(lambda changes: PipelineConfig.load("my_robot", None, [source, *changes]), variant, 3)
+        for name, variant in variants.items()
+    }
+    bases = {name: None if c.models.base is None else c.models.base.name for name, c in found.items()}
+    assert bases == {"full": "stage2", "base": "base", "scratch": None}
+    assert {name: c.train_stage2.trainer.seed for name, c in found.items()} == dict.fromkeys(found, 3)
+    first = found.pop("scratch")
+    assert first.train_stage1 is not None and (first.train_stage1.kind, first.train_stage1.trainer.seed) == ("base", 3)
+    minutes = (first.train_stage1.trainer.minutes or 0) + (first.train_stage2.trainer.minutes or 0)
+    assert {c.train_stage2.trainer.minutes for c in found.values()} == {minutes}
+    assert all(c.train_stage1 is None for c in found.values())
+
+
 def test_compute_is_matched_by_video_tokens() -> None:
     mixed = load(["train_stage2.clips={lengths: [17, 33], view_weights: {joint: 1, head: 1}, single_view_factor: 2}",
                   "train_stage1.trainer.steps=300", "train_stage2.trainer.steps=100"])  # fmt: skip

@@ -218,7 +218,7 @@ def test_stage2_goes_on_with_another_robot_and_says_so(
 def test_stage2_goes_on_at_another_rate_with_other_controls_and_says_so(
     world, model_config, make_contract, tmp_path, caplog
 ):
-    """What robots of one's own have: 7.5 of 30 frames, commands where the start had measured states, vectors instead of maps."""
+    """A user's robot: another frame rate, commands instead of measured states, vectors instead of maps."""
     other = make_contract(sigma_px_ref=60.0, tokenizer="synthetic", controls="state", fps=7.5)
     save_checkpoint(tmp_path / "before", fresh(model_config, towers="generation"), kind="stage2", action_contract=other)
     caplog.set_level("INFO")
@@ -227,9 +227,9 @@ def test_stage2_goes_on_at_another_rate_with_other_controls_and_says_so(
     contract = read_checkpoint_info(tmp_path / "after").action_contract
     assert (contract.controls, contract.fps, contract.sigma_px_ref) == ("action", 8.0, None)
     for change in (
-        "controls action, before state",
-        "frames per second 8.0, before 7.5",
-        "conditioning vectors, before maps",
+        "controls action, previously state",
+        "frames per second 8.0, previously 7.5",
+        "conditioning vectors, previously maps",
     ):
         assert change in caplog.text
 

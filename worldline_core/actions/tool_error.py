@@ -6,9 +6,9 @@ best (normalised correlation) is searched within a radius. The distance from tha
 error [px of the recording's frame]. A gripper that correlates with nothing within reach counts with the search radius.
 True videos score 0 by construction.
 
-Frames of a camera that stands still are compared by how they differ from the recording's background. Otherwise the table
-behind a small robot would be found where it always is, and a video in which the robot does not move would score 0. Where no
-camera is known, the part of the picture that has moved most stands for the tool.
+For a static camera, the recording's background is subtracted first. Otherwise the correlation would match the table behind a
+small robot, and a video in which the robot does not move would score 0. Without a known camera, the part of the picture that
+has moved most stands for the tool.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def end_effector_error(
 
 
 def _apart(frames: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Half of the difference, around 128: OpenCV matches uint8 ten times as fast as float32."""
+    """Halve the difference and centre it on 128: OpenCV matches uint8 ten times as fast as float32."""
     return np.rint((frames - background) / 2 + 128).clip(0, 255).astype(np.uint8)
 
 

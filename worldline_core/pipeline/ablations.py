@@ -45,10 +45,11 @@ def variant_config(load: LoadConfig, variant: Variant, seed: int | None = None) 
         ConfigError: the run has no rollout of its Stage II model, or no base model.
     """
     full = _with_row(load([]))
-    changes = [change for change in variant.changes if _section(full, change) is not None]
+    changes = [change for change in variant.changes if _can_change(full, change)]
     if seed is not None:
+        own_stages = load(changes)
         stages = ("train_stage1", "train_stage2")
-        changes += [f"{stage}.trainer.seed={seed}" for stage in stages if getattr(full, stage) is not None]
+        changes += [f"{stage}.trainer.seed={seed}" for stage in stages if getattr(own_stages, stage) is not None]
     # Its rollouts are not rows of the table, and a variant may train no Stage I.
     changes += [f"rollouts.{name}=null" for name, run in load([]).rollouts.items() if run.checkpoint == "stage1"]
     if variant.matched_compute:
@@ -135,6 +136,7 @@ def _checked(values: dict[str, object]) -> RolloutConfig:
     return validate(RolloutConfig, values, where="a rollout of the ablations")
 
 
-def _section(config: PipelineConfig, change: str) -> object:
-    """The section that a change is of; None where the run has none."""
-    return getattr(config, change.partition(".")[0].partition("=")[0], None)
+def _can_change(config: PipelineConfig, change: str) -> bool:
+    """Returns whether a change sets a whole section, or a field of a section that the run has."""
+    section, dot, _ = change.partition("=")[0].partition(".")
+    return not dot or getattr(config, section, None) is not None

@@ -58,7 +58,7 @@ class ClipPredictor(Protocol):
 @dataclass(frozen=True)
 class Place:
     """A clip, and where its tools are after a second: (arms, 2) u, v [px of the model's picture], NaN where they do not move;
-    of a camera that stands still also the recording's background (h, w, 3)."""
+    for a static camera also the recording's background (h, w, 3)."""
 
     clip: Clip
     points: np.ndarray

@@ -120,7 +120,7 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
 def _require_same_meaning(
     start: Path, contract: ActionContract, config: WorldModelConfig, robots: Collection[str], tracks: Path
 ) -> None:
-    """Refuse latents and maps that mean something else to the Stage II model that training goes on from, and log what is new to it.
+    """Refuse latents and maps that mean something else to the Stage II start model; log what else has changed.
 
     Raises: CheckpointError: another tokenizer, or another width of the maps.
     """
@@ -142,7 +142,7 @@ def _require_same_meaning(
         ("conditioning", was.action_conditioning, config.action_conditioning),
     ):
         if before != now:
-            logger.info("New to the Stage II model that training goes on from: %s %s, before %s.", name, now, before)
+            logger.info("Changed from the Stage II start model: %s %s, previously %s.", name, now, before)
 
 
 def _relational(config: Stage2Config, inputs: Mapping[str, Path], model: WorldModel) -> RelationalTerm | None:

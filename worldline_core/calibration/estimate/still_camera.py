@@ -77,7 +77,7 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
     other = _settled(mirrored_views, max(mirrored, key=lambda fit: fit.likelihood), recorded.shared)
     gains = _likelihoods(mirrored_views, other) - _likelihoods(rough_views, own)
     agreed = float(np.median([agreement(view, other) for view in mirrored_views]))
-    apart = tools_apart(own.camera, of_unmirrored_pictures(other.camera), recorded)
+    apart = tools_apart(own.camera, unmirrored(other.camera), recorded)
     views = recorded.still_views(fine=True)
     fine = recorded.unknown_camera(fine=True)
     fits = [
@@ -142,8 +142,8 @@ def tools_apart(one: CameraTrack, other: CameraTrack, recorded: RecordedView) ->
     return float(np.median(np.linalg.norm(a - b, axis=1)[shown])) if shown.any() else np.inf
 
 
-def of_unmirrored_pictures(camera: CameraTrack) -> CameraTrack:
-    """The camera of mirrored pictures, with the columns of the pictures as they are."""
+def unmirrored(camera: CameraTrack) -> CameraTrack:
+    """Convert the camera of mirrored pictures to that of the original pictures."""
     flip = np.array([[-1.0, 0.0, camera.width - 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     return replace(camera, K=flip @ camera.K)
 

@@ -56,7 +56,7 @@ class _Piece:
         first: the video's first frame, and its mask by the first segmenter.
         moved: exact masks of the thing that the task moves (n, h, w), and in which frames it has moved (n,).
         labels: of things (n, h, w), and of the first frame (h, w).
-        still: what a camera that stands still sees behind everything that moves (h, w, 3).
+        still: background of a static camera (h, w, 3) float32.
         begin: number of the first of these frames.
     """
 
