@@ -80,13 +80,20 @@ class UNet(nn.Module):
         return cast(Tensor, self.head(features))[:, 0, :height, :width]
 
 
+class _GroupNorm(nn.GroupNorm):
+    """Normalises in contiguous order, in which a CPU takes a fifteenth of the time in bfloat16; convolutions run channels-last."""
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - the base class's name
+        return super().forward(input.contiguous()).contiguous(memory_format=torch.channels_last)
+
+
 def _double_convolution(cin: int, cout: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(cin, cout, 3, padding=1, bias=False),
-        nn.GroupNorm(_GROUPS, cout),
+        _GroupNorm(_GROUPS, cout),
         nn.SiLU(),
         nn.Conv2d(cout, cout, 3, padding=1, bias=False),
-        nn.GroupNorm(_GROUPS, cout),
+        _GroupNorm(_GROUPS, cout),
         nn.SiLU(),
     )
 
