@@ -16,7 +16,7 @@ from flows.fit_command import add_fit_command
 from flows.full_size_commands import add_plan_command, add_rehearse_command
 from tasks.execution.artifact_task import find_task, task_names
 from tasks.execution.command_line import add_config_arguments, add_overrides, add_task_arguments
-from tasks.execution.temporary_server import prepare_prefect
+from tasks.execution.temporary_server import prepare_prefect, start_server_early
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -204,6 +204,7 @@ def _checked_preset(arguments: argparse.Namespace, *, weights: bool = False) -> 
 def _pipeline(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments, weights=True)
     prepare_prefect(arguments.artifacts)
+    start_server_early()
     from flows.pipeline import pipeline
     from tasks.execution.prefect_artifacts import run_flow
 
@@ -221,6 +222,7 @@ def _nightly(arguments: argparse.Namespace) -> None:
         return
     preset = _checked_preset(arguments)
     prepare_prefect(arguments.artifacts)
+    start_server_early()
     from flows.nightly_evaluation import nightly_evaluation
     from tasks.execution.prefect_artifacts import run_flow
 
@@ -231,6 +233,7 @@ def _nightly(arguments: argparse.Namespace) -> None:
 def _ablations(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments, weights=True)
     prepare_prefect(arguments.artifacts)
+    start_server_early()
     from flows.ablations import ablations
     from tasks.execution.prefect_artifacts import run_flow
 

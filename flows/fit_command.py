@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tasks.execution.command_line import add_overrides
-from tasks.execution.temporary_server import prepare_prefect
+from tasks.execution.temporary_server import prepare_prefect, start_server_early
 
 if TYPE_CHECKING:
     from worldline_core.pipeline.pipeline_config import PipelineConfig
@@ -140,6 +140,7 @@ def fit_command(arguments: argparse.Namespace) -> None:
     if arguments.gpu is not None:
         check_card(config, arguments.config, arguments.gpu)
     prepare_prefect(arguments.artifacts)
+    start_server_early()
     from flows.fit import fit
     from tasks.execution.prefect_artifacts import run_flow
 

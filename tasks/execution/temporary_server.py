@@ -1,10 +1,15 @@
-"""Prefect's temporary server, which a run without a server starts for itself: how it is set up."""
+"""Prefect's temporary server, which a run without a server starts for itself: how it is set up, and started early."""
 
 from __future__ import annotations
 
+import atexit
 import functools
 import os
 import secrets
+import socket
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,6 +49,66 @@ def prepare_prefect(artifacts: Path) -> None:
     set_up_temporary_server()
 
 
+_started: tuple[subprocess.Popen[bytes], int] | None = None
+
+
+def start_server_early() -> None:
+    """Start the server beside the imports of this process: it takes ten seconds, and Prefect would start it after them.
+
+    Where Prefect is imported already, or a server may be configured, it is left to Prefect. Call `prepare_prefect` first.
+    """
+    global _started
+    home = Path(os.environ.get("PREFECT_HOME", "~/.prefect")).expanduser()
+    if _started or "prefect" in sys.modules or "PREFECT_API_URL" in os.environ or (home / "profiles.toml").exists():
+        return
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    own = {
+        "PREFECT_UI_ENABLED": "0",
+        "PREFECT__SERVER_EPHEMERAL": "1",
+        "PREFECT__SERVER_FINAL": "1",
+        "PREFECT_API_AUTH_STRING": _password(),
+        "PREFECT_SERVER_API_AUTH_STRING": _password(),
+    }
+    app = ["uvicorn", "--factory", "prefect.server.api.server:create_app", "--log-level", "error", "--lifespan", "on"]
+    process = subprocess.Popen(  # noqa: S603 - as Prefect starts it
+        [sys.executable, "-m", *app, "--host", "127.0.0.1", "--port", str(port)], env=os.environ | own
+    )
+    atexit.register(_stop, process)
+    _started = process, port
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(timeout=5)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _use_started_server() -> None:
+    """Make the server that was started early the one that Prefect's clients find; one that ended is left to Prefect."""
+    global _started
+    if _started is None:
+        return
+    (process, port), _started = _started, None
+    import httpx
+    from prefect.server.api.server import SubprocessASGIServer
+
+    deadline = time.monotonic() + float(os.environ["PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS"])
+    while process.poll() is None and time.monotonic() < deadline:
+        try:
+            if httpx.get(f"http://127.0.0.1:{port}/api/health").is_success:
+                server = SubprocessASGIServer()
+                server.port, server.server_process, server.running = port, process, True
+                return
+        except httpx.TransportError:
+            time.sleep(0.1)
+    _stop(process)
+
+
 @functools.cache
 def _password() -> str:
     """The password of this process's temporary server, which its task runs know as well."""
@@ -64,4 +129,5 @@ def private_server() -> Iterator[None]:
         yield
         return
     with temporary_settings({PREFECT_API_AUTH_STRING: _password(), PREFECT_SERVER_API_AUTH_STRING: _password()}):
+        _use_started_server()
         yield

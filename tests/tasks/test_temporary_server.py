@@ -13,9 +13,11 @@ import pytest
 SERVER = """
     import os, signal
     from pathlib import Path
-    from tasks.execution.temporary_server import set_up_temporary_server
+    from tasks.execution.temporary_server import set_up_temporary_server, start_server_early
 
     set_up_temporary_server()
+    if EARLY:
+        start_server_early()
     import httpx
     from prefect import flow, task
     from prefect.client.orchestration import get_client
@@ -23,14 +25,18 @@ SERVER = """
     from tasks.execution.prefect_artifacts import run_flow, show_in_prefect
     from tasks.execution.shard_mapper import shared_server
 
-    def kill_server():
+    def servers():
         for entry in Path("/proc").glob("[0-9]*"):
             try:
                 parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
                 if parent == os.getpid() and b"uvicorn" in (entry / "cmdline").read_bytes():
-                    os.kill(int(entry.name), signal.SIGKILL)
+                    yield int(entry.name)
             except OSError:
                 continue
+
+    def kill_server():
+        (server,) = servers()
+        os.kill(server, signal.SIGKILL)
 
     @task
     def node(number: int) -> int:
@@ -104,20 +110,21 @@ SHARDS = """
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("program", "printed"),
+    ("program", "early", "printed"),
     [
-        (KILLED, ["sum", "6"]),
-        (KILLED_EARLY, ["UnavailableError", "continues"]),
-        (ATTACKED, ["sum", "3", "runs", "1"]),
-        (SHARDS, ["numbers", "3"]),
+        (KILLED, True, ["sum", "6"]),
+        (KILLED_EARLY, False, ["UnavailableError", "continues"]),
+        (ATTACKED, False, ["sum", "3", "runs", "1"]),
+        (ATTACKED, True, ["sum", "3", "runs", "1"]),
+        (SHARDS, False, ["numbers", "3"]),
     ],
-    ids=["killed at the end", "killed early", "attacked", "shards in processes"],
+    ids=["killed at the end", "killed early", "attacked", "attacked, started early", "shards in processes"],
 )
-def test_a_temporary_server(tmp_path: Path, project_root: Path, program: str, printed: list[str]) -> None:
+def test_a_temporary_server(tmp_path: Path, project_root: Path, program: str, early: bool, printed: list[str]) -> None:
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     environment |= {"PREFECT_HOME": str(tmp_path), "PYTHONPATH": str(project_root), "PREFECT_CLIENT_MAX_RETRIES": "0"}
     ended = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(SERVER) + textwrap.dedent(program)],
+        [sys.executable, "-c", f"EARLY = {early}\n" + textwrap.dedent(SERVER) + textwrap.dedent(program)],
         cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert (ended.returncode, ended.stdout.split()) == (0, printed), ended.stderr
