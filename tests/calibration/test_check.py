@@ -112,6 +112,7 @@ def test_a_bad_episode_is_listed_and_the_rest_goes_on(episode: Episode, images: 
     assert [entry["reason"] for entry in stored["episodes"]] == reasons
 
 
+@pytest.mark.slow
 def test_recordings_are_read_in_a_process_with_limits_first(project_root: Path) -> None:
     config = EpisodeSetSourceConfig(kind="episode_set", path=project_root / "artifacts/shipped/recordings")
     source = GuardedSource(config, ReaderLimits())

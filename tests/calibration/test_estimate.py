@@ -334,6 +334,7 @@ def test_sure_cameras_are_read_back_as_a_calibration_file(tmp_path, bank, kinema
     assert np.allclose(cameras.tracks["head"].K[:2, 2], (95.5, 63.5))
 
 
+@pytest.mark.slow
 def test_the_command_writes_cameras_pages_and_pictures(tmp_path, bank, monkeypatch, capsys):
     (tmp_path / "my.yaml").write_text(
         f"curate:\n  sources:\n  - {{kind: episode_set, path: {BANKS}, name: banks, include: ['bank_carry_ur5e-00[0-3]']}}\n"

@@ -84,6 +84,7 @@ def test_pictures_may_be_asked_for_more_often(world: WorldLine, starts: Recorded
     assert np.array_equal(seen[15], simulation.step(driven)[0]["head"][-1])
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: RecordedStarts) -> None:
     """Against Gymnasium's own vector environment, to the end of the episodes and the first frame of the next ones."""
     options = {"model": world, "episode_frames": 18, **SHORT}

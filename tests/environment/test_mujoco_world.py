@@ -145,6 +145,7 @@ def test_both_worlds_begin_alike_at_any_frame_and_score_alike(physics, world, sh
     assert renderers() is None
 
 
+@pytest.mark.slow
 def test_it_is_an_environment_with_the_spaces_of_the_simulator(physics: MujocoEnv, world: WorldLine) -> None:
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")

@@ -337,6 +337,7 @@ def test_a_planner_stays_within_the_limits_of_the_robot(start, planner_of):
     assert not np.array_equal(robot.follow(wild)[1], wild)
 
 
+@pytest.mark.slow
 def test_a_planner_carries_on_what_it_chose_unless_something_is_better_by_the_margin(start, planner_of):
     for margin, score in ((0.2, 0.5), (0.05, 0.6)):
         # The first choice looks for nothing that is kept: its second candidate wins. At the second the first of the two is

@@ -207,6 +207,7 @@ def test_the_step_marks_what_begins_later_than_any_training_recording(trained, t
     assert "5 of each are needed" in found["methods"]["good"]["reason"]
 
 
+@pytest.mark.slow
 def test_trust_needs_tracks_and_training_recordings_and_a_comparison_sources(
     recordings, trained, tmp_path, monkeypatch
 ):

@@ -70,6 +70,7 @@ def speed_of(output):
     return json.loads((output / "run" / "speed.json").read_text())
 
 
+@pytest.mark.slow
 def test_times_lie_beside_the_predictions_and_outside_their_digest(inputs, predicted, tmp_path):
     output, _ = predicted
     speed = speed_of(output)

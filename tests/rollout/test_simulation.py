@@ -257,6 +257,7 @@ def test_a_simulation_begins_in_the_middle_of_a_recording(causal, recordings):
             causal.start(start.images, start.cameras, **begun | {"earlier": wrong})
 
 
+@pytest.mark.slow
 def test_stage2_is_stepped_clip_by_clip(shipped, start):
     folder = shipped / "models" / "stage2"
     world = WorldLine.from_pretrained(folder, steps=1, clip_frames=17)

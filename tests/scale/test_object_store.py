@@ -165,7 +165,8 @@ def test_a_set_is_pushed_and_pulled(tmp_path: Path, recordings: Path, store: Obj
         pull(where, tmp_path / "back")
 
 
-@pytest.mark.parametrize("refused", [pytest.param(".json", marks=pytest.mark.slow), ".txt"])
+@pytest.mark.slow
+@pytest.mark.parametrize("refused", [".json", ".txt"])
 def test_an_interrupted_second_push_goes_on(tmp_path: Path, recordings: Path, store: ObjectStore, refused: str) -> None:
     """Files that the second set lacks are removed and those of another content sent, also after an interruption."""
     store.upload(tmp_path / "nothing", "x")

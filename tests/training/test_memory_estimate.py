@@ -77,9 +77,9 @@ EIGHT_BITS = {"weights": "bf16", "optimizer": {"moments": "8bit"}, "average": "h
         pytest.param(2, {"precision": "fp32", "accumulation": 2}, marks=pytest.mark.slow),
         pytest.param(0, {"precision": "fp32"}, id="gradients come as activations go"),
         pytest.param(3, {"precision": "fp32", "accumulation": 2}, id="Wan", marks=pytest.mark.slow),
-        (0, {"accumulation": 2, "sharding": {"checkpointing": "block"}}),
+        pytest.param(0, {"accumulation": 2, "sharding": {"checkpointing": "block"}}, marks=pytest.mark.slow),
         pytest.param(1, {"accumulation": 2, "sharding": {"checkpointing": "block"}}, marks=pytest.mark.slow),
-        (0, {"accumulation": 2, **EIGHT_BITS}),
+        pytest.param(0, {"accumulation": 2, **EIGHT_BITS}, marks=pytest.mark.slow),
         pytest.param(2, {"accumulation": 2, **EIGHT_BITS}, marks=pytest.mark.slow),
         (0, {"accumulation": 2, "lora": LoRAConfig(rank=16)}),
         pytest.param(2, {"accumulation": 2, "lora": LoRAConfig(rank=16)}, marks=pytest.mark.slow),
@@ -112,6 +112,7 @@ def test_estimated_memory_is_what_the_allocator_hands_out(size, values, tmp_path
     assert -0.02 * taken < estimated.total + host - taken < 0.02 * taken + over
 
 
+@pytest.mark.slow
 def test_a_deep_model_holds_what_two_shallow_ones_predict(monkeypatch):
     # The backward pass of deep models holds most where shallow ones do before it.
     assert memory_trace.extrapolated(lambda layers: Held(10 + layers, 2 * layers, 3 + layers), 36) == (46, 72, 39)

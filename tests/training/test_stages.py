@@ -337,6 +337,7 @@ def test_stage2_goes_on_with_the_same_bytes(world, recorded, first_stage, teache
     assert all(row["relational_intra"] > 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_the_teacher_is_shown_the_frames_that_were_read(world, tokenizer, latents, first_stage, teacher, tmp_path):
     given = {"episodes": world.episodes, "tracks": world.tracks, "stage1": first_stage, "teacher": teacher}
     found = []
