@@ -6,6 +6,7 @@ import ctypes
 import functools
 import logging
 import multiprocessing
+import multiprocessing.util
 import os
 import sys
 import threading
@@ -37,12 +38,24 @@ def end_with_parent(end: Callable[[], object]) -> None:
 
 @functools.cache
 def end_with_pool() -> None:
-    """Let this process of a pool end with the one that started it, at once where that has ended already."""
+    """Let this process of a pool end with the one that started it, at once where that has ended already.
+
+    Its own end is quick: a spawned process would take all modules apart, with torch and Prefect for three seconds of a core.
+    """
     parent = multiprocessing.parent_process()
     if parent is not None:
+        # Below the priorities of multiprocessing's own, which send what queues hold and end children.
+        multiprocessing.util.Finalize(None, _exit_flushed, exitpriority=-100)
         end_with_parent(lambda: os._exit(1))
         if not parent.is_alive():
             os._exit(1)
+
+
+def _exit_flushed() -> None:
+    if sys.exc_info()[0] is None:  # an error is shown first
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
 
 
 @contextmanager
