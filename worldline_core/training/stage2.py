@@ -133,8 +133,8 @@ def _require_same_meaning(
     known = info.metadata.get("embodiments")
     new = sorted(name for name in robots if known is None or name not in known)
     if new:
-        saw = "does not say which embodiments it saw" if known is None else f"saw {sorted(known)}"
-        logger.warning("The Stage II model that training goes on from %s; it now learns %s.", saw, new)
+        was_of = "robots that it does not name" if known is None else ", ".join(sorted(known))
+        logger.info("The Stage II start model learned from %s; it now learns %s.", was_of, ", ".join(new))
     for name, before, now in (
         ("controls", learnt.controls, contract.controls),
         ("frames per second", learnt.fps, contract.fps),
