@@ -231,15 +231,15 @@ class _Following:
         if self._previous is None:
             cv2.setRNGSeed(0)  # GrabCut starts its colour models by k-means
             labels = self._first_labels(lab, self._start)
-            self._colours = colour_ratio(lab, np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)))
+            self._colours = colour_ratio(lab, _robot(labels))
         else:
             labels = self._carried_labels(self._previous, robot_likely(lab, self._colours))
-        if np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).any() and np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():
+        if _robot(labels).any() and not _robot(labels).all():
             mode = cv2.GC_INIT_WITH_MASK if begins else cv2.GC_EVAL_FREEZE_MODEL
             rounds = 3 if begins else 1
             picture = np.ascontiguousarray(frame[..., ::-1])
             cv2.grabCut(picture, labels, (0, 0, 0, 0), self._background, self._foreground, rounds, mode)
-            mask = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+            mask = _robot(labels)
             if begins:
                 self._colours = colour_ratio(lab, mask)
         self._previous = mask
@@ -274,6 +274,11 @@ class _Following:
         labels[near] = cv2.GC_PR_BGD
         labels[near & likely] = cv2.GC_PR_FGD
         return labels
+
+
+def _robot(labels: np.ndarray) -> np.ndarray:
+    """Sure and likely foreground of GrabCut's labels."""
+    return (labels & cv2.GC_FGD).astype(bool)  # GC_FGD is 1, GC_PR_FGD 3; the background's are even
 
 
 def colour_ratio(lab: np.ndarray, mask: np.ndarray) -> np.ndarray:

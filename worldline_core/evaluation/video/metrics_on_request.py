@@ -79,9 +79,9 @@ def _fit(true: np.ndarray, predicted: np.ndarray, point: np.ndarray, start: np.n
 
 
 def _around(mask: np.ndarray, u: int, v: int, half: int) -> np.ndarray:
-    """float32 (2 half + 1, 2 half + 1) of a mask around a pixel; zeros outside of the frame."""
+    """uint8 (2 half + 1, 2 half + 1) of a mask around a pixel; zeros outside of the frame. OpenCV takes 20 times as long for float32."""
     height, width = mask.shape
-    cut = np.zeros((2 * half + 1, 2 * half + 1), dtype=np.float32)
+    cut = np.zeros((2 * half + 1, 2 * half + 1), dtype=np.uint8)
     rows, columns = (slice(max(0, c - half), max(0, min(size, c + half + 1))) for c, size in ((v, height), (u, width)))
     top, left = rows.start - (v - half), columns.start - (u - half)
     part = mask[rows, columns]
