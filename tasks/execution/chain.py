@@ -32,6 +32,15 @@ def load_chain() -> Callable[..., object]:
     return found.load()
 
 
+def calls_after(calls: Mapping[str, TaskCall]) -> dict[str, int]:
+    """Length of the longest way from each call of an outline to the end of the run, in calls."""
+    after = dict.fromkeys(calls, 0)
+    for call in reversed([*calls.values()]):  # each comes after those that it needs
+        for source in call.upstream:
+            after[source.name] = max(after[source.name], after[call.name] + 1)
+    return after
+
+
 def find_call(calls: Mapping[str, TaskCall], task: str, name: str | None = None) -> TaskCall:
     """The call of a task: the named one, or the only one.
 

@@ -33,11 +33,12 @@ from prefect.settings import PREFECT_LOCAL_STORAGE_PATH
 from prefect.task_runners import ProcessPoolTaskRunner
 
 from tasks.execution.artifact_task import Outline, TaskCall, activated, find_task
+from tasks.execution.chain import calls_after
 from tasks.execution.command_line import log_to_stderr
+from tasks.execution.process_pool import process_runner
 from tasks.execution.run_page import LATEST_REPORT, RunPage
 from tasks.execution.shard_mapper import (
     limited_threads,
-    process_runner,
     shard_mapper,
     shared_server,
     shorten_errors,
@@ -69,12 +70,13 @@ class PrefectRun(Outline):
     """A context in a flow: every call in it becomes a task of the flow run; leaving it waits for all of them.
 
     With ``runner.steps_at_once`` of 1 each call is made at once, in this process. Otherwise calls whose artifact is not
-    there yet go to Prefect's pool of processes, where each starts when its inputs are finished. When a task fails, those
-    that have not started are cancelled, what runs is allowed to finish, and the error is raised.
+    there yet go to Prefect's pool of processes, where each starts when its inputs are finished; of those that could start, the
+    one with the longest way to the end of the run. When a task fails, those that have not started are cancelled, what runs is
+    allowed to finish, and the error is raised.
 
     Args:
         artifacts: root of the store.
-        page_of: an outline of the run; its page then shows how far the run is.
+        page_of: an outline of the run; its page then shows how far the run is, and the longest way is known.
 
     Attributes:
         artifacts: results by the calls' names; complete when the context has been left.
@@ -86,6 +88,7 @@ class PrefectRun(Outline):
         self._store = ArtifactStore(artifacts, runner.verify)
         self._runner = runner
         self._page = None if page_of is None else RunPage(artifacts, page_of, runner.steps_at_once)
+        self._calls_after = calls_after(page_of or {})
         self._ended: dict[str, State[Any]] = {}
         self._futures: dict[str, PrefectConcurrentFuture[Any]] = {}
         self._results: SimpleQueue[tuple[str, BaseException | None]] = SimpleQueue()
@@ -240,7 +243,7 @@ class PrefectRun(Outline):
         cores = len(os.sched_getaffinity(0))
         self._stack.enter_context(limited_threads(max(1, cores // self._runner.steps_at_once)))
         self._stack.enter_context(shared_server())
-        return self._stack.enter_context(process_runner(self._runner.steps_at_once))
+        return self._stack.enter_context(process_runner(self._runner.steps_at_once, self._calls_after))
 
 
 def _prefect_task(call: TaskCall, *, refresh: bool) -> Task[..., dict[str, Any]]:

@@ -11,13 +11,12 @@ import pickle
 import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import copy_context
-from typing import Any, Self
+from typing import Any
 
 import httpx
 
+from tasks.execution.process_pool import process_runner
 from tasks.execution.temporary_server import private_server, set_up_temporary_server
 from worldline_core.errors import UnavailableError, WorldLineError, installing
 from worldline_core.scale.mapping import (
@@ -36,7 +35,6 @@ _DEATHS = frozenset(
     {"BrokenProcessPool", "KilledWorker", "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "OwnerDiedError"}
 )
 """Errors of the runners for a worker that ended without an answer (concurrent.futures, distributed, ray)."""
-_MOST_WAITING = 4096
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -141,37 +139,6 @@ def _outcome(shard: Shard[Any], future: Any) -> Exception | None:
             got="a crash in compiled code, or killed for its memory",
         )
     return None
-
-
-def process_runner(workers: int) -> Any:
-    """Prefect's pool of processes of this machine."""
-    from prefect.task_runners import ProcessPoolTaskRunner
-
-    class ProcessRunner(ProcessPoolTaskRunner):
-        """Does not wait for its queue of messages: a worker that was killed while it wrote there never releases the lock,
-        and this process would then never end. Its thread sends them with the settings of the run: without, it would know
-        neither address nor password of a temporary server.
-
-        Each task waits for its inputs in its own thread. Prefect uses only as many threads as workers, so that waiting tasks
-        block others that are ready."""
-
-        def __enter__(self) -> Self:
-            self._context = copy_context()
-            entered = super().__enter__()
-            if self._resolver_executor is not None:
-                self._resolver_executor.shutdown()
-            self._resolver_executor = ThreadPoolExecutor(_MOST_WAITING)
-            return entered
-
-        def _forward_subprocess_messages(self) -> None:
-            self._context.run(super()._forward_subprocess_messages)
-
-        def _stop_message_forwarding(self) -> None:
-            if self._subprocess_message_queue is not None:
-                self._subprocess_message_queue.cancel_join_thread()
-            super()._stop_message_forwarding()
-
-    return ProcessRunner(max_workers=workers)
 
 
 def _dask_runner(workers: int, address: str | None) -> Any:

@@ -31,7 +31,8 @@ from tasks.execution.artifact_task import ArtifactTask, task_names, variant
 from tasks.execution.chain import outline
 from tasks.execution.prefect_artifacts import show_in_prefect
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
-from tasks.execution.shard_mapper import process_runner, shared_server
+from tasks.execution.process_pool import process_runner
+from tasks.execution.shard_mapper import shared_server
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, DataError, WorldLineError
 from worldline_core.pipeline import memory_estimate
