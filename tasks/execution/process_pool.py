@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import threading
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from contextvars import ContextVar, copy_context
@@ -12,10 +14,14 @@ from itertools import count
 from typing import Any, Self
 
 _MOST_WAITING = 4096
+_SUCCESSOR_SECONDS = 0.5
+"""Within this time what waited for finished work is submitted."""
 
 
 class RankedPool:
     """Gives an executor no more work than it has workers: of what waits, the highest rank goes first, then the oldest.
+
+    The worker of finished work waits a moment for a successor, whose rank is lower by one at most, where it would go first.
 
     Args:
         rank: of the work that is submitted, asked in the thread that submits it.
@@ -25,6 +31,7 @@ class RankedPool:
         self._executor, self._free, self._rank = executor, workers, rank
         self._waiting: list[tuple[int, int, Callable[[], Any], Future[Any]]] = []
         self._numbers, self._lock = count(), threading.Lock()
+        self._kept_for, self._kept_until = 0, 0.0
         # An executor that breaks ends its futures with its lock held: nothing may be submitted from their callbacks.
         self._starter = ThreadPoolExecutor(1)
 
@@ -47,31 +54,50 @@ class RankedPool:
 
     def _start(self) -> None:
         while (found := self._next()) is not None:
-            work, future = found
+            work, future, rank = found
             if not future.set_running_or_notify_cancel():
                 self._release()
                 continue
             try:
-                self._executor.submit(work).add_done_callback(partial(self._end, future))
+                self._executor.submit(work).add_done_callback(partial(self._end, future, rank))
             except RuntimeError as error:  # it is broken, or shut down
                 self._release()
                 future.set_exception(error)
 
-    def _next(self) -> tuple[Callable[[], Any], Future[Any]] | None:
+    def _next(self) -> tuple[Callable[[], Any], Future[Any], int] | None:
         with self._lock:
-            if not self._free or not self._waiting:
+            if not self._free or not self._waiting or self._is_kept():
                 return None
             self._free -= 1
-            *_, work, future = heapq.heappop(self._waiting)
-            return work, future
+            below, _, work, future = heapq.heappop(self._waiting)
+            return work, future, -below
+
+    def _is_kept(self) -> bool:
+        """Returns whether a worker is kept for work that goes before all that waits."""
+        return time.monotonic() < self._kept_until and -self._waiting[0][0] < self._kept_for
+
+    def _keep(self, rank: int) -> None:
+        """Keep workers for a moment for work of this rank."""
+        with self._lock:
+            kept = self._kept_for if time.monotonic() < self._kept_until else 0
+            self._kept_for, self._kept_until = max(kept, rank), time.monotonic() + _SUCCESSOR_SECONDS
+        later = threading.Timer(_SUCCESSOR_SECONDS, self._start_later)
+        later.daemon = True
+        later.start()
+
+    def _start_later(self) -> None:
+        with contextlib.suppress(RuntimeError):  # it has been shut down
+            self._starter.submit(self._start)
 
     def _release(self) -> None:
         with self._lock:
             self._free += 1
 
-    def _end(self, future: Future[Any], done: Future[Any]) -> None:
+    def _end(self, future: Future[Any], rank: int, done: Future[Any]) -> None:
+        if rank > 1:
+            self._keep(rank - 1)
         self._release()
-        self._starter.submit(self._start)
+        self._start_later()
         error = CancelledError() if done.cancelled() else done.exception()
         if error is None:
             future.set_result(done.result())

@@ -31,6 +31,21 @@ def test_of_what_waits_the_highest_rank_goes_first_and_what_is_cancelled_never()
     pool.shutdown(wait=True, cancel_futures=True)
 
 
+def test_a_successor_that_ranks_higher_goes_before_what_waits() -> None:
+    ranks, done = iter([4, 1, 3]), list[str]()
+    pool = RankedPool(ThreadPoolExecutor(1), 1, lambda: next(ranks))
+    hold = threading.Event()
+    first = pool.submit(hold.wait)
+    waiting = pool.submit(lambda: done.append("waiting"))
+    first.add_done_callback(
+        lambda _: threading.Timer(0.1, lambda: pool.submit(lambda: done.append("successor"))).start()
+    )
+    hold.set()
+    waiting.result(10)
+    assert done == ["successor", "waiting"]
+    pool.shutdown(wait=True, cancel_futures=True)
+
+
 def test_an_error_and_a_worker_that_ends_reach_who_waits() -> None:
     pool = RankedPool(ProcessPoolExecutor(1), 1, lambda: 0)
     with pytest.raises(FileNotFoundError):
