@@ -50,7 +50,7 @@ class ForeignArm:
 
 @dataclass(frozen=True)
 class LeRobotForm:
-    """How LeRobot's recorders name and count this robot's readings; `tick` is that of its motors, in units of the joints."""
+    """Names and units of a robot in LeRobot's format. `tick` is the resolution of its motors, in the unit of the joints."""
 
     robot_type: str
     fps: float
@@ -312,13 +312,9 @@ def record_lerobot(name: str, site: Path, output: Path, source: int, episodes: i
     features = {**dict.fromkeys(keys.values(), picture), "observation.state": vector, "action": vector}
     folder = output / f"{name}_{source}_{len(views)}"
     written = LeRobotDataset.create(
-        f"local/{folder.name}",
-        int(form.fps),
-        features,
-        root=folder,
-        robot_type=form.robot_type,
-        streaming_encoding=True,
-    )
+        f"local/{folder.name}", int(form.fps), features,
+        root=folder, robot_type=form.robot_type, streaming_encoding=True,
+    )  # fmt: skip
     for each in drawn(name, robot, site, output, source, episodes, size, views):
         readings = each.state * scale
         ticks = np.round(readings / form.tick) * form.tick

@@ -33,7 +33,7 @@ def load_chain() -> Callable[..., object]:
 
 
 def calls_after(calls: Mapping[str, TaskCall]) -> dict[str, int]:
-    """Length of the longest way from each call of an outline to the end of the run, in calls."""
+    """Length of the longest path from each call of an outline to the end of the run, in calls."""
     after = dict.fromkeys(calls, 0)
     for call in reversed([*calls.values()]):  # each comes after those that it needs
         for source in call.upstream:

@@ -70,13 +70,13 @@ class PrefectRun(Outline):
     """A context in a flow: every call in it becomes a task of the flow run; leaving it waits for all of them.
 
     With ``runner.steps_at_once`` of 1 each call is made at once, in this process. Otherwise calls whose artifact is not
-    there yet go to Prefect's pool of processes, where each starts when its inputs are finished; of those that could start, the
-    one with the longest way to the end of the run. When a task fails, those that have not started are cancelled, what runs is
+    there yet go to Prefect's pool of processes, where each starts when its inputs are finished; among those that are ready, the
+    one on the longest remaining path starts first. When a task fails, those that have not started are cancelled, what runs is
     allowed to finish, and the error is raised.
 
     Args:
         artifacts: root of the store.
-        page_of: an outline of the run; its page then shows how far the run is, and the longest way is known.
+        page_of: an outline of the run; its page then shows how far the run is, and remaining paths order the tasks.
 
     Attributes:
         artifacts: results by the calls' names; complete when the context has been left.

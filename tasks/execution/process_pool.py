@@ -1,8 +1,7 @@
-"""Prefect's pool of processes of this machine: the step with the longest way to the end of the run goes first."""
+"""Prefect's pool of processes of this machine, in which steps on the longest remaining path start first."""
 
 from __future__ import annotations
 
-import contextlib
 import heapq
 import threading
 import time
@@ -15,44 +14,48 @@ from typing import Any, Self
 
 _MOST_WAITING = 4096
 _SUCCESSOR_SECONDS = 0.5
-"""Within this time what waited for finished work is submitted."""
+"""Prefect submits the successors of a finished task within this time."""
 
 
 class RankedPool:
-    """Gives an executor no more work than it has workers: of what waits, the highest rank goes first, then the oldest.
+    """Gives an executor one piece of work per worker: the highest rank first, the oldest among equals.
 
-    The worker of finished work waits a moment for a successor, whose rank is lower by one at most, where it would go first.
+    When work of rank r ends, its worker waits up to `_SUCCESSOR_SECONDS` for a successor of rank r - 1, unless something of that rank
+    is waiting already.
 
     Args:
-        rank: of the work that is submitted, asked in the thread that submits it.
+        rank: called in the thread that submits work; returns the rank of that work.
     """
 
     def __init__(self, executor: Executor, workers: int, rank: Callable[[], int]) -> None:
         self._executor, self._free, self._rank = executor, workers, rank
         self._waiting: list[tuple[int, int, Callable[[], Any], Future[Any]]] = []
-        self._numbers, self._lock = count(), threading.Lock()
+        self._numbers, self._changed, self._ended = count(), threading.Condition(), False
         self._kept_for, self._kept_until = 0, 0.0
-        # An executor that breaks ends its futures with its lock held: nothing may be submitted from their callbacks.
-        self._starter = ThreadPoolExecutor(1)
+        # Work is not submitted from callbacks: a broken executor calls them while it holds its own lock.
+        threading.Thread(target=self._dispatch, name="ranked pool", daemon=True).start()
 
     def submit(self, work: Callable[[], Any]) -> Future[Any]:
-        """The future of the work's result; it can be cancelled as long as the work waits."""
+        """Returns a future of the work's result, which can be cancelled while the work waits."""
         future: Future[Any] = Future()
-        with self._lock:
+        with self._changed:
+            if self._ended:
+                raise RuntimeError("the pool has been shut down")
             heapq.heappush(self._waiting, (-self._rank(), next(self._numbers), work, future))
-        self._starter.submit(self._start)
+            self._changed.notify()
         return future
 
     def shutdown(self, *, wait: bool, cancel_futures: bool) -> None:
-        """Cancel what waits, and end the executor as it ends."""
-        with self._lock:
+        """Cancel all waiting work, then shut the executor down."""
+        with self._changed:
+            self._ended = True
             waiting, self._waiting = self._waiting, []
+            self._changed.notify()
         for *_, future in waiting:
             future.cancel()
         self._executor.shutdown(wait=wait, cancel_futures=cancel_futures)
-        self._starter.shutdown(wait=wait)
 
-    def _start(self) -> None:
+    def _dispatch(self) -> None:
         while (found := self._next()) is not None:
             work, future, rank = found
             if not future.set_running_or_notify_cancel():
@@ -60,44 +63,33 @@ class RankedPool:
                 continue
             try:
                 self._executor.submit(work).add_done_callback(partial(self._end, future, rank))
-            except RuntimeError as error:  # it is broken, or shut down
+            except RuntimeError as error:  # broken, or shut down
                 self._release()
                 future.set_exception(error)
 
     def _next(self) -> tuple[Callable[[], Any], Future[Any], int] | None:
-        with self._lock:
-            if not self._free or not self._waiting or self._is_kept():
-                return None
-            self._free -= 1
-            below, _, work, future = heapq.heappop(self._waiting)
-            return work, future, -below
-
-    def _is_kept(self) -> bool:
-        """Returns whether a worker is kept for work that goes before all that waits."""
-        return time.monotonic() < self._kept_until and -self._waiting[0][0] < self._kept_for
-
-    def _keep(self, rank: int) -> None:
-        """Keep workers for a moment for work of this rank."""
-        with self._lock:
-            kept = self._kept_for if time.monotonic() < self._kept_until else 0
-            self._kept_for, self._kept_until = max(kept, rank), time.monotonic() + _SUCCESSOR_SECONDS
-        later = threading.Timer(_SUCCESSOR_SECONDS, self._start_later)
-        later.daemon = True
-        later.start()
-
-    def _start_later(self) -> None:
-        with contextlib.suppress(RuntimeError):  # it has been shut down
-            self._starter.submit(self._start)
+        """Wait for a free worker and work for it; None once the pool has been shut down."""
+        with self._changed:
+            while not self._ended:
+                kept = self._kept_until - time.monotonic()
+                if self._free and self._waiting and (kept <= 0 or -self._waiting[0][0] >= self._kept_for):
+                    self._free -= 1
+                    below, _, work, future = heapq.heappop(self._waiting)
+                    return work, future, -below
+                self._changed.wait(kept if kept > 0 else None)
+        return None
 
     def _release(self) -> None:
-        with self._lock:
+        with self._changed:
             self._free += 1
+            self._changed.notify()
 
     def _end(self, future: Future[Any], rank: int, done: Future[Any]) -> None:
-        if rank > 1:
-            self._keep(rank - 1)
+        with self._changed:
+            now = time.monotonic()
+            kept = self._kept_for if now < self._kept_until else 0
+            self._kept_for, self._kept_until = max(kept, rank - 1), now + _SUCCESSOR_SECONDS
         self._release()
-        self._start_later()
         error = CancelledError() if done.cancelled() else done.exception()
         if error is None:
             future.set_result(done.result())
@@ -106,10 +98,10 @@ class RankedPool:
 
 
 def process_runner(workers: int, ranks: Mapping[str, int] | None = None) -> Any:
-    """A task runner of this many processes.
+    """Returns a task runner with this many processes.
 
     Args:
-        ranks: of tasks by the names of their runs; of those that are ready, the highest goes first.
+        ranks: rank of each task by the name of its run; among tasks that are ready, the highest starts first.
     """
     from prefect import Task
     from prefect.task_runners import ProcessPoolTaskRunner

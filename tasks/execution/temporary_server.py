@@ -1,4 +1,4 @@
-"""Prefect's temporary server, which a run without a server starts for itself: how it is set up, and started early."""
+"""Prefect's temporary server: its settings, and its early start for a run that has no other server."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ _started: tuple[subprocess.Popen[bytes], int] | None = None
 
 
 def start_server_early() -> None:
-    """Start the server beside the imports of this process: it takes ten seconds, and Prefect would start it after them.
+    """Start the server while this process still imports: it takes ten seconds, and Prefect would start it afterwards.
 
-    Where Prefect is imported already, or a server may be configured, it is left to Prefect. Call `prepare_prefect` first.
+    Does nothing if Prefect is already imported, or if a server may be configured. Call `prepare_prefect` first.
     """
     global _started
     home = Path(os.environ.get("PREFECT_HOME", "~/.prefect")).expanduser()
@@ -89,7 +89,7 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def _use_started_server() -> None:
-    """Make the server that was started early the one that Prefect's clients find; one that ended is left to Prefect."""
+    """Hand the early server to Prefect's clients once it answers; if it has ended, Prefect starts its own."""
     global _started
     if _started is None:
         return
@@ -105,7 +105,8 @@ def _use_started_server() -> None:
                 server.port, server.server_process, server.running = port, process, True
                 return
         except httpx.TransportError:
-            time.sleep(0.1)
+            pass
+        time.sleep(0.1)
     _stop(process)
 
 
@@ -126,6 +127,8 @@ def private_server() -> Iterator[None]:
     )
 
     if PREFECT_API_URL.value():
+        if _started is not None:  # the server is named in a file that Prefect alone reads
+            _stop(_started[0])
         yield
         return
     with temporary_settings({PREFECT_API_AUTH_STRING: _password(), PREFECT_SERVER_API_AUTH_STRING: _password()}):

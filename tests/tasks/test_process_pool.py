@@ -1,4 +1,4 @@
-"""What is given to the processes of a pool, and in which order."""
+"""The ranked process pool: order of work, errors, dead workers and shutdown."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 
 
 def test_of_what_waits_the_highest_rank_goes_first_and_what_is_cancelled_never() -> None:
-    ranks, done, hold = iter([0, 1, 3, 3, 2]), list[str](), threading.Event()
+    ranks, done, taken, hold = iter([0, 1, 3, 3, 2]), list[str](), threading.Event(), threading.Event()
     pool = RankedPool(ThreadPoolExecutor(2), 1, lambda: next(ranks))
-    first = pool.submit(hold.wait)
-    while not first.running():  # the worker is taken
-        pass
+    pool.submit(lambda: (taken.set(), hold.wait()))
+    assert taken.wait(10)
     others = [pool.submit(lambda name=name: done.append(name)) for name in ("low", "high", "high too", "cancelled")]
     assert others[-1].cancel()
     hold.set()
@@ -61,12 +60,16 @@ def test_an_error_and_a_worker_that_ends_reach_who_waits() -> None:
 def test_what_waits_at_the_end_is_cancelled() -> None:
     hold = threading.Event()
     pool = RankedPool(ThreadPoolExecutor(1), 1, lambda: 0)
-    first, second = pool.submit(hold.wait), pool.submit(hold.wait)
+    taken = threading.Event()
+    first, second = pool.submit(lambda: taken.set() or hold.wait()), pool.submit(hold.wait)
+    assert taken.wait(10)
     threading.Timer(0.1, hold.set).start()
     pool.shutdown(wait=True, cancel_futures=True)
     assert first.result(10) is True
     with pytest.raises(CancelledError):
         second.result(10)
+    with pytest.raises(RuntimeError, match="shut down"):
+        pool.submit(hold.wait)
 
 
 def test_the_chain_of_models_goes_before_predictions_by_finished_ones() -> None:

@@ -40,11 +40,11 @@ def end_with_parent(end: Callable[[], object]) -> None:
 def end_with_pool() -> None:
     """Let this process of a pool end with the one that started it, at once where that has ended already.
 
-    Its own end is quick: a spawned process would take all modules apart, with torch and Prefect for three seconds of a core.
+    It skips Python's own clean-up at exit, which takes a spawned process with torch and Prefect three seconds.
     """
     parent = multiprocessing.parent_process()
     if parent is not None:
-        # Below the priorities of multiprocessing's own, which send what queues hold and end children.
+        # A priority below multiprocessing's own finalizers, which flush queues and join children.
         multiprocessing.util.Finalize(None, _exit_flushed, exitpriority=-100)
         end_with_parent(lambda: os._exit(1))
         if not parent.is_alive():
@@ -52,7 +52,7 @@ def end_with_pool() -> None:
 
 
 def _exit_flushed() -> None:
-    if sys.exc_info()[0] is None:  # an error is shown first
+    if sys.exc_info()[0] is None:  # otherwise Python prints the error and exits with 1
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)

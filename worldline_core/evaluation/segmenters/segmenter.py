@@ -278,7 +278,7 @@ class _Following:
 
 def _robot(labels: np.ndarray) -> np.ndarray:
     """Sure and likely foreground of GrabCut's labels."""
-    return (labels & cv2.GC_FGD).astype(bool)  # GC_FGD is 1, GC_PR_FGD 3; the background's are even
+    return (labels & cv2.GC_FGD).astype(bool)  # GC_FGD is 1 and GC_PR_FGD is 3; background labels are even
 
 
 def colour_ratio(lab: np.ndarray, mask: np.ndarray) -> np.ndarray:
