@@ -91,6 +91,7 @@ def test_a_full_disk_ends_the_check(episode, images, tmp_path, monkeypatch):
     assert not (tmp_path / "diagnoses.json").exists()
 
 
+@pytest.mark.slow
 def test_a_bad_episode_is_listed_and_the_rest_goes_on(episode: Episode, images: Images, tmp_path: Path) -> None:
     def refuse() -> LoadedEpisode:
         raise RejectedInputError("truncated_video", "The file ends early", expected=24, got=12)

@@ -170,6 +170,7 @@ def test_agibot_v1_extrinsics_are_camera_to_base_and_may_trail(agibot: Agibot) -
     assert (together.verdict, together.best.mistake) == ("consistent", "none")
 
 
+@pytest.mark.slow
 def test_agibot_v2_wrist_extrinsics_follow_the_action(shared_data: Path, agibot: Agibot) -> None:
     description = shared_data / "agibot_g1_urdf" / "G1_omnipicker_calibrated.urdf"
     kinematics = ArmKinematics(load_embodiment("agibot_g1", description))
@@ -223,6 +224,7 @@ def test_another_robot_than_declared_is_named(healthy: list, truth: str, declare
     assert repairing_lines(replace(listed, declares_robot=False), together.best) == ()
 
 
+@pytest.mark.slow
 def test_a_reading_that_leaves_the_recording_ill_does_not_win(healthy: list, monkeypatch: pytest.MonkeyPatch) -> None:
     """Degrees bring the joints of an unknown robot within their limits, and explain nothing."""
     monkeypatch.setattr(calibration_doctor, "robots_like", lambda _: ())

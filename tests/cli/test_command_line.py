@@ -26,6 +26,7 @@ print(sorted({'torch', 'prefect', 'lerobot', 'diffusers', 'transformers', 'cv2',
     assert python(project_root, code).stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_recordings_configurations_and_their_mistakes_are_read_without_torch_and_prefect(project_root: Path) -> None:
     """Curation and the parsing of commands start seconds faster without these modules."""
     mistakes = {

@@ -136,7 +136,8 @@ def test_pictures_have_the_colours_that_ffmpeg_shows(made: dict[Path, Made]) -> 
     decoder.close()
 
 
-@pytest.mark.parametrize("image_size", [pytest.param(None, marks=pytest.mark.slow), (96, 120)])
+@pytest.mark.slow
+@pytest.mark.parametrize("image_size", [None, (96, 120)])
 def test_colours_stay_through_curation_and_export(tmp_path: Path, made: dict[Path, Made], image_size: Any) -> None:
     folder = next(iter(made)).parent
     source = {"kind": "video_folder", "path": str(folder), "name": "web", "split": "train"}

@@ -143,6 +143,7 @@ def test_the_teacher_is_in_the_memory_sheet(make_model, monkeypatch):
     assert 2 * taught.parameters < taught.parts["frozen scores"] < 4 * taught.parameters
 
 
+@pytest.mark.slow
 def test_scores_that_share_their_weights_are_planned_once(make_model, monkeypatch):
     monkeypatch.setattr(Training, "_held", lambda *_args, **_named: Held(100, 0))
     source = Sources(None, None, (32, 32), (4, 4))

@@ -35,6 +35,7 @@ def commands(starts: RecordedStarts, seeds: list[int], count: int) -> np.ndarray
     return np.stack([rows[np.minimum(np.arange(count), len(rows) - 1)] for rows in recorded], axis=1)
 
 
+@pytest.mark.slow
 def test_gymnasiums_checker_finds_nothing(world: WorldLine) -> None:
     environment = gymnasium.make(ENVIRONMENT, model=world, observe_every=8, episode_frames=20, **SHORT).unwrapped
     with warnings.catch_warnings(record=True) as found:

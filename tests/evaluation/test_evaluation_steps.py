@@ -74,7 +74,11 @@ def rewritten(world, output, change=lambda frames: frames, *, source="good", nam
 
 @pytest.mark.parametrize(
     ("floor", "camera", "reason"),
-    [(-1.0, "static", None), (0.7, "static", r"box_arm: its masks .* by 0\.\d\d \(of"), (-1.0, "absent", "unchecked")],
+    [
+        pytest.param(-1.0, "static", None, marks=pytest.mark.slow),
+        (0.7, "static", r"box_arm: its masks .* by 0\.\d\d \(of"),
+        (-1.0, "absent", "unchecked"),
+    ],
 )
 def test_a_segmenter_without_exact_masks_is_measured_first(recordings, tmp_path, monkeypatch, floor, camera, reason):
     monkeypatch.setattr(EpisodeSet, "robot_masks", lambda *_: None)
@@ -311,6 +315,7 @@ class OddJudge:
         return f'{{{self._facts}, "wrong_object_or_drop": null, "selected_labels": ["A", "B", "\\ud800"], "score": 50, {next(self._odd)}}}'
 
 
+@pytest.mark.slow
 def test_odd_values_of_a_judge_go_through_the_whole_step(recordings, tmp_path, monkeypatch):
     judge, seen = OddJudge(), set()
     monkeypatch.setattr("worldline_core.evaluation.policy.evaluate_policy.open_vlm", lambda kind, config: judge)

@@ -293,6 +293,7 @@ def test_a_horizon_of_the_whole_episode_is_open_loop_best_of_n(world, start, shi
     assert np.array_equal(plan.controls, plan.sequence[:16]) and plan.model_calls == 6
 
 
+@pytest.mark.slow
 def test_the_next_choice_begins_at_what_was_really_seen(start, planner_of):
     videos = []
 

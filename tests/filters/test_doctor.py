@@ -48,6 +48,7 @@ def test_frames_that_are_dropped_anyway_do_not_count(recording: Recording) -> No
     assert (nothing_left.passed, nothing_left.numbers["verdict"]) == (True, "too_little_evidence")
 
 
+@pytest.mark.slow
 def test_an_explanation_comes_before_what_it_explains(recording: Recording) -> None:
     episode, thumbnails, signals = recording
     wrong = corrupt(episode, RecordedConventions(extrinsics="base_to_camera"))

@@ -15,7 +15,8 @@ from worldline_core.errors import DataError, UnavailableError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 
 
-@pytest.mark.parametrize("version", [pytest.param("v2.1", marks=pytest.mark.slow), "v3.0"])
+@pytest.mark.slow
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_meta_and_some_episodes_are_fetched_and_the_others_come_to_the_same_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], hub: Hub, version: str
 ) -> None:

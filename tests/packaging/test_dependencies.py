@@ -99,6 +99,7 @@ def imported(project_root: Path) -> dict[str, set[str]]:
     return found
 
 
+@pytest.mark.slow
 def test_every_import_is_declared_and_every_dependency_imported(project_root: Path, project: dict) -> None:
     declared = names(project["dependencies"])
     extras = project["optional-dependencies"]

@@ -142,7 +142,10 @@ def test_what_nobody_can_record_is_refused() -> None:
 PLAIN = look_of("scene_12")
 
 
-@pytest.fixture(scope="module", params=["viperx_pearl", "ur5e_silver", "xarm7_white"])
+@pytest.fixture(
+    scope="module",
+    params=["ur5e_silver", *(pytest.param(name, marks=pytest.mark.slow) for name in ("viperx_pearl", "xarm7_white"))],
+)
 def contact(request: pytest.FixtureRequest) -> EpisodeRecorder:
     return EpisodeRecorder(request.param, contact=True)
 

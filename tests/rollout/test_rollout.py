@@ -159,7 +159,9 @@ def test_copying_needs_no_checkpoint_and_repeats_the_first_frame(inputs, tmp_pat
     assert RolloutSet.open(tmp_path).episode_ids == ["a-1", "b-1"]
 
 
-@pytest.mark.parametrize("kind", ["copy_first_frame", "text_to_video", "stage1", "film"])
+@pytest.mark.parametrize(
+    "kind", ["copy_first_frame", "text_to_video", pytest.param("stage1", marks=pytest.mark.slow), "film"]
+)
 def test_what_no_camera_is_needed_for_is_predicted_without_tracks(inputs, tmp_path, kind):
     """Recordings without cameras have no action tracks."""
     made = write_recordings(tmp_path, [("a", "test", 9, VIEWS, ()), ("b", "test", 9, VIEWS, ())])

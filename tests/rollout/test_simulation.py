@@ -207,6 +207,7 @@ def last(predicted):
     return {view: video[-1] for view, video in predicted.items()}
 
 
+@pytest.mark.slow
 def test_steps_give_the_bytes_of_a_prediction(causal, start):
     """With mounts that the file knows and ones solved at the start."""
     wrists = {view: Camera(start.cameras[view].K) for view in ("left_wrist", "right_wrist")}

@@ -199,7 +199,14 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any
 
 
 @pytest.mark.usefixtures("reading_in_this_process")  # which alone has a file system in memory
-@pytest.mark.parametrize("layout", ["robotwin", "lerobot_v21", "mcap", "video_folder", "droid_annotation"])
+@pytest.mark.parametrize(
+    "layout",
+    [
+        "lerobot_v21",
+        "mcap",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("robotwin", "video_folder", "droid_annotation")),
+    ],
+)
 def test_the_same_bytes_from_a_folder_and_from_elsewhere(
     sources: dict[str, dict[str, Any]], tmp_path: Path, layout: str
 ) -> None:

@@ -80,7 +80,8 @@ def test_peft_reads_the_adapter(inputs, trained):
     torch.testing.assert_close(layer.base_layer.weight, wanted, atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("form", [{}, pytest.param({"weights": "bf16", "average": "host"}, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("form", [{}, {"weights": "bf16", "average": "host"}])
 def test_a_killed_adapter_goes_on_with_the_same_bytes(inputs, tmp_path, killed_after, form):
     with killed_after(5):
         train_stage2(adapted(**form), inputs, tmp_path / "killed")

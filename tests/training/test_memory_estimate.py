@@ -75,7 +75,7 @@ EIGHT_BITS = {"weights": "bf16", "optimizer": {"moments": "8bit"}, "average": "h
     [
         (0, {"precision": "fp32", "accumulation": 2}),
         pytest.param(2, {"precision": "fp32", "accumulation": 2}, marks=pytest.mark.slow),
-        pytest.param(0, {"precision": "fp32"}, id="gradients come as activations go"),
+        pytest.param(0, {"precision": "fp32"}, id="gradients come as activations go", marks=pytest.mark.slow),
         pytest.param(3, {"precision": "fp32", "accumulation": 2}, id="Wan", marks=pytest.mark.slow),
         pytest.param(0, {"accumulation": 2, "sharding": {"checkpointing": "block"}}, marks=pytest.mark.slow),
         pytest.param(1, {"accumulation": 2, "sharding": {"checkpointing": "block"}}, marks=pytest.mark.slow),

@@ -350,6 +350,7 @@ def test_the_teacher_is_shown_the_frames_that_were_read(world, tokenizer, latent
     assert found[1] == pytest.approx(found[0], rel=5e-3)
 
 
+@pytest.mark.slow
 def test_resident_latents_train_the_same_bytes(world, latents, first_stage, tmp_path):
     inputs = {"episodes": world.episodes, "latents": latents, "tracks": world.tracks, "stage1": first_stage}
     weights = []
