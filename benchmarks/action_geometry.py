@@ -1,8 +1,8 @@
 """Speed of action maps against drawing them with OpenCV.
 
-    python benchmarks/action_geometry.py [--threads 1] [--device cpu]
+    python benchmarks/action_geometry.py [--device cpu]
 
-Both sides get the same input; the largest difference of their results is printed. The ratio carries over to other machines, the
+Both sides get the same input and one thread; the largest difference of their results is printed. The ratio carries over to other machines, the
 figures do not. 3 views, 2 arms, 33 latent frames on 30 x 40 cells; OpenCV draws the Gaussian as circles of falling
 intensity at the size of the video, and reduces them to the grid.
 """
@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.harness import best_seconds, command_line, print_table
-from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
+from benchmarks.harness import command_line, print_table, seconds_of
+from worldline_core.actions.action_maps import render_action_maps
 from worldline_core.actions.episode_tracks import TrackBatch
 
-IMAGE, GRID, VIEWS, ARMS = (480, 640), (30, 40), 3, 2
+IMAGE, GRID, LENGTH, VIEWS, ARMS = (480, 640), (30, 40), 33, 3, 2
 SIGMA_OF_WIDTH = 10 / 512
 
 
@@ -55,11 +55,10 @@ def drawn(tracks: TrackBatch) -> torch.Tensor:
 
 
 def measure_maps(device: str) -> None:
-    length = len(latent_frame_indices(129))
-    clip = random_tracks(length)
-    there, maps = clip.to(device), length * VIEWS
-    ours = best_seconds(lambda: render_action_maps(there, IMAGE, GRID)) / maps
-    by_opencv = best_seconds(lambda: drawn(clip)) / maps
+    clip = random_tracks(LENGTH)
+    there, maps = clip.to(device), LENGTH * VIEWS
+    ours = seconds_of(lambda: render_action_maps(there, IMAGE, GRID)) / maps
+    by_opencv = seconds_of(lambda: drawn(clip)) / maps
     rows = (("ours", 1e6 * ours, 1.0), ("circles of OpenCV at 480 x 640, reduced", 1e6 * by_opencv, by_opencv / ours))
     print_table(("30 x 40 maps", "us a map", "ours is faster by"), rows)
     apart = float((drawn(clip) - render_action_maps(clip, IMAGE, GRID)[0]).abs().max())
@@ -68,12 +67,9 @@ def measure_maps(device: str) -> None:
 
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    cv2.setNumThreads(arguments.threads)
-    measure_maps(arguments.device)
+    cv2.setNumThreads(1)
+    measure_maps(parser.parse_args().device)
 
 
 if __name__ == "__main__":

@@ -8,13 +8,13 @@ by true outcomes. Trees learn from the other banks of the same task, of all bodi
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.harness import command_line
 from worldline_core.errors import DataError
 from worldline_core.evaluation.planning.evaluate_planning import rule_choosers, tree_scores_by_shortcut
 from worldline_core.evaluation.scores import bootstrap_mean
@@ -66,7 +66,7 @@ def measure(
     """Figures of one task."""
     facts: dict[str, BankFacts] = {}
     ends: dict[str, list[bool]] = {}
-    drawn, scene_ids = 0, scenes("wide", training=False)
+    scene_ids = scenes("wide", training=False)
     shares: dict[str, list[float]] = {"careless": [], "knowing": []}
     for body, recorder in recorders.items():
         for number in range(banks):
@@ -78,7 +78,6 @@ def measure(
             except DataError as error:
                 print(error)
                 continue
-            drawn += 1
             facts[name] = facts_of(recorder, layout, list(motions.values()), spec.scene)
             ends[name] = [motion.outcome == "success" for motion in motions.values()]
             shares["careless"].append(float(np.mean(ends[name])))
@@ -93,7 +92,7 @@ def measure(
         chosen[rule] = [ends[name][int(np.argmax(own))] for name, own in scores.items()]
     figures = {rule: interval(successes) for rule, successes in chosen.items() if successes}
     return {
-        "banks": drawn,
+        "banks": len(facts),
         "success_careless": interval_of(shares["careless"]),
         "success_knowing": round(float(np.mean(shares["knowing"])), 3),
         "seen_things": sum(own.reach is not None for own in facts.values()),
@@ -108,7 +107,7 @@ def interval_of(shares: list[float]) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--families", nargs="+", default=list(CONTACT), choices=CONTACT)
     parser.add_argument("--bodies", nargs="+", default=["viperx_pearl", "ur5e_silver", "xarm7_white"])
     parser.add_argument("--banks", type=int, default=8, help="of each task with each body")

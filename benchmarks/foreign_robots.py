@@ -192,11 +192,10 @@ def _read_model(file: Path) -> mujoco.MjSpec:
 
 def head_camera(robot: ForeignRobot, random: np.random.Generator) -> np.ndarray:
     """T_world_camera (OpenCV axes) that looks near the middle of the workspace."""
-    middle = np.array(robot.middle)
     azimuth, rise = random.uniform(-np.pi, np.pi), random.uniform(np.radians(20), np.radians(65))
     away = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])
-    place = middle + random.uniform(*robot.distance) * away
-    z = middle + random.normal(0, 0.04, 3) - place
+    place = robot.middle + random.uniform(*robot.distance) * away
+    z = robot.middle + random.normal(0, 0.04, 3) - place
     z /= np.linalg.norm(z)
     x = np.cross(z, [0, 0, 1.0])
     x /= np.linalg.norm(x)
@@ -287,8 +286,7 @@ def record(name: str, site: Path, output: Path, source: int, episodes: int) -> N
             if number == 0:
                 cv2.imwrite(str(output / f"{name}_{source}_{view}.png"), images[len(images) // 2][..., ::-1])
     np.savez(output / f"{name}_{source}.npz", **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle
-    facts = {"robot": name, "episodes": episodes, "views": views}
-    (output / f"{name}_{source}.json").write_text(json.dumps(facts))
+    (output / f"{name}_{source}.json").write_text(json.dumps({"robot": name, "episodes": episodes, "views": views}))
 
 
 def record_lerobot(name: str, site: Path, output: Path, source: int, episodes: int, views: Sequence[str]) -> None:

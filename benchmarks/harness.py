@@ -35,24 +35,11 @@ def timed[T](work: Callable[[], T]) -> tuple[T, float, float]:
     return result, time.perf_counter() - wall, cpu_seconds() - processor
 
 
-def best_seconds(call: Callable[[], object]) -> float:
-    """Best time of one call over at least a second of calls.
+def seconds_of(call: Callable[[], object]) -> float:
+    """Median time of one call, on a GPU until it has finished."""
+    from torch.utils.benchmark import Timer
 
-    Processor time with one thread on a CPU, which a busy machine disturbs little, otherwise wall time.
-    """
-    import torch
-
-    clock = time.process_time if torch.get_num_threads() == 1 and not torch.cuda.is_available() else time.perf_counter
-    call()
-    best, spent = float("inf"), 0.0
-    while spent < 1.0:
-        start = clock()
-        call()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        took = clock() - start
-        best, spent = min(best, took), spent + took
-    return best
+    return Timer("call()", globals={"call": call}).blocked_autorange(min_run_time=1).median
 
 
 def read_recordings(

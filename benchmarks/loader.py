@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.harness import RECORDINGS, best_seconds, command_line, print_table
+from benchmarks.harness import RECORDINGS, command_line, print_table, seconds_of
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput
@@ -137,7 +137,7 @@ def latent_batches(root: Path) -> Iterator[tuple[str, float]]:
     )
     for name, source in (("read", store), ("resident", ResidentLatents(store, "cpu"))):
         load, steps = ClipLoader(source, views=VIEWS).batches(sampler), count()
-        yield name, 1000 * best_seconds(lambda load=load, steps=steps: load(next(steps)))
+        yield name, 1000 * seconds_of(lambda load=load, steps=steps: load(next(steps)))
 
 
 def main() -> None:
@@ -159,7 +159,7 @@ def main() -> None:
         print_table(("", "decoder", "raw", "loader", "loader over raw"), rows())
     if arguments.only in (None, "latents"):
         with tempfile.TemporaryDirectory() as folder:
-            print_table(("256 clips of latents", "ms of processor time"), latent_batches(Path(folder)))
+            print_table(("256 clips of latents", "ms"), latent_batches(Path(folder)))
 
 
 if __name__ == "__main__":

@@ -55,10 +55,11 @@ def main() -> None:
     parser.add_argument("--bodies", default="xarm7_single,ur5e_silver")
     parser.add_argument("--episodes", type=int, default=54)
     parser.add_argument("--seed", type=int, default=31)
-    arguments = parser.parse_args()
+    given = parser.parse_args()
     prepare_rendering()
-    count, seed = arguments.episodes, arguments.seed
-    rows = ((body, *measured(body, arguments.output / body, count, seed)) for body in arguments.bodies.split(","))
+    rows = (
+        (body, *measured(body, given.output / body, given.episodes, given.seed)) for body in given.bodies.split(",")
+    )
     print_table(("robot", "its own", "shipped"), rows)
 
 
