@@ -6,7 +6,7 @@
 
 Each source has its own head camera, light, table texture and camera noise. Smooth random motions of all joints. `--lerobot`
 writes these views of them with LeRobot's own classes, 480 x 640, without cameras: an SO-101 at 30 fps in degrees, grippers of 0 to
-100; an ALOHA at 50 fps in radians, grippers of 0 to 1.
+100; an ALOHA at 50 fps in radians, grippers of 0 to 1. There grippers move while the arms rest, as people grasp.
 """
 
 from __future__ import annotations
@@ -126,19 +126,16 @@ ROBOTS = {
 
 def embodiment_of(name: str, robot: ForeignRobot, description: Path) -> Embodiment:
     """The description as a user would write it for this file."""
-    arms = []
-    for arm in robot.arms:
-        (x, y, z), quaternion = arm.tool
-        arms.append({
+    return Embodiment.model_validate({
+        "name": f"foreign_{name}", "description": {"format": "mjcf", "file": description.name}, "base_link": "world",
+        "description_path": description,
+        "arms": [{
             "name": arm.name, "joints": arm.joints, "limits": [(-7.0, 7.0)] * len(arm.joints),
-            "end_effector_link": arm.hand, "T_link_tool": {"translation": (x, y, z), "rotation_wxyz": quaternion},
+            "end_effector_link": arm.hand, "T_link_tool": {"translation": arm.tool[0], "rotation_wxyz": arm.tool[1]},
             "gripper": {"closed": 0.0, "open": 1.0, "finger_joints": [
                 {"name": n, "closed": closed, "open": opened} for n, closed, opened in arm.fingers]},
             "link_radius": arm.radii[0], "hand_radius": arm.radii[1], "gripper_radius": arm.radii[2],
-        })  # fmt: skip
-    return Embodiment.model_validate({
-        "name": f"foreign_{name}", "description": {"format": "mjcf", "file": description.name}, "base_link": "world",
-        "arms": arms, "description_path": description,
+        } for arm in robot.arms],
     })  # fmt: skip
 
 
@@ -204,18 +201,20 @@ def head_camera(robot: ForeignRobot, random: np.random.Generator) -> np.ndarray:
     return pose
 
 
-def motion(robot: ForeignRobot, seconds: float, random: np.random.Generator) -> np.ndarray:
-    """(n, j) states: minimum-jerk moves between random postures, grippers included."""
+def motion(robot: ForeignRobot, seconds: float, random: np.random.Generator, grasps: bool) -> np.ndarray:
+    """(n, j) states: minimum-jerk moves between random postures; grippers move with the arms, or after them, as in a grasp."""
     home = np.concatenate([[*arm.home, 0.5] for arm in robot.arms])
     spread = np.concatenate([[*arm.spread, 0.5] for arm in robot.arms])
-    count = round(seconds * robot.fps)
+    grippers = [number >= len(arm.joints) for arm in robot.arms for number in range(len(arm.joints) + 1)]
     parts, now = [], home + spread * random.uniform(-1, 1, len(home))
-    while sum(map(len, parts)) < count:
+    while sum(map(len, parts)) < round(seconds * robot.fps):
         goal = home + spread * random.uniform(-1, 1, len(home))
-        s = np.linspace(0, 1, round(random.uniform(1.0, 2.2) * robot.fps), endpoint=False)[:, None]
-        parts += [now + (goal - now) * (10 * s**3 - 15 * s**4 + 6 * s**5)]
-        now = goal
-    return np.concatenate(parts)[:count]
+        moves = [(np.where(grippers, now, goal), (1.0, 2.2)), (goal, (0.4, 0.8))] if grasps else [(goal, (1.0, 2.2))]
+        for goal, duration in moves:
+            s = np.linspace(0, 1, round(random.uniform(*duration) * robot.fps), endpoint=False)[:, None]
+            parts += [now + (goal - now) * (10 * s**3 - 15 * s**4 + 6 * s**5)]
+            now = goal
+    return np.concatenate(parts)[: round(seconds * robot.fps)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,12 +228,14 @@ class Drawn:
 
 
 def drawn(
-    name: str, robot: ForeignRobot, site: Path, output: Path, source: int, episodes: int, size: tuple[int, int], views: Sequence[str]
+    name: str, robot: ForeignRobot, site: Path, output: Path, source: int, episodes: int, size: tuple[int, int], views: Sequence[str],
+    *, grasps: bool = False,
 ) -> Iterator[Drawn]:  # fmt: skip
     """Recordings of one source in pictures of this size; its description and table are written to `output`.
 
     Args:
         views: those to draw, of `head` and the wrists' that the model has; all when empty.
+        grasps: grippers move while the arms rest.
     """
     random = np.random.default_rng([source, len(name), ord(name[0])])
     model, text = model_of(robot, site, output / f"{name}_{source}_table.png", random)
@@ -252,7 +253,7 @@ def drawn(
     option.geomgroup[:] = [0 if name not in ("aloha", "so101") else 1, 1, 1, 0, 0, 0]
     with mujoco.Renderer(model, *size) as renderer:
         for _ in range(episodes):
-            state = motion(robot, float(random.uniform(3.5, 5.0)), random)
+            state = motion(robot, float(random.uniform(3.5, 5.0)), random, grasps)
             images: dict[str, list[np.ndarray]] = {view: [] for view in cameras}
             poses: dict[str, list[np.ndarray]] = {view: [] for view in cameras}
             for row in state:
@@ -303,21 +304,19 @@ def record_lerobot(name: str, site: Path, output: Path, source: int, episodes: i
         joints = [form.joint.format(arm=arm.name, joint=joint.split("/")[-1]) for joint in arm.joints]
         names += [*joints, form.gripper.format(arm=arm.name)]
     scale = np.concatenate([[form.per_radian] * len(arm.joints) + [form.gripper_open] for arm in robot.arms])
-    grippers = np.cumsum([len(arm.joints) + 1 for arm in robot.arms]) - 1
+    grippers = [number >= len(arm.joints) for arm in robot.arms for number in range(len(arm.joints) + 1)]
     vector = {"dtype": "float32", "shape": (len(names),), "names": names}
     keys = {view: f"observation.images.{form.cameras[view]}" for view in views}
     picture = {"dtype": "video", "shape": (*size, 3), "names": ["height", "width", "channels"]}
     features = {**dict.fromkeys(keys.values(), picture), "observation.state": vector, "action": vector}
     folder = output / f"{name}_{source}_{len(views)}"
     written = LeRobotDataset.create(
-        f"local/{folder.name}", int(form.fps), features,
-        root=folder, robot_type=form.robot_type, streaming_encoding=True,
-    )  # fmt: skip
-    for each in drawn(name, robot, site, output, source, episodes, size, views):
+        f"local/{folder.name}", int(form.fps), features, root=folder, robot_type=form.robot_type
+    )
+    for each in drawn(name, robot, site, output, source, episodes, size, views, grasps=True):
         readings = each.state * scale
         ticks = np.round(readings / form.tick) * form.tick
-        ticks[:, grippers] = readings[:, grippers]
-        readings = ticks.astype(np.float32)
+        readings = np.where(grippers, readings, ticks).astype(np.float32)
         for i, reading in enumerate(readings):
             images = {key: each.images[view][i] for view, key in keys.items()}
             action = readings[min(i + 1, len(readings) - 1)]
@@ -331,8 +330,9 @@ def read_source(facts_file: Path) -> tuple[Embodiment, list[tuple[Episode, dict[
     name = json.loads(facts_file.read_text())["robot"]
     robot = ROBOTS[name]
     embodiment = embodiment_of(name, robot, facts_file.with_suffix(".xml"))
-    names = embodiment.state_names
-    return embodiment, read_recordings(facts_file, "gray", embodiment.name, robot.fps, state_names=names)
+    return embodiment, read_recordings(
+        facts_file, "gray", f"foreign_{name}", robot.fps, state_names=embodiment.state_names
+    )
 
 
 def _set(model: mujoco.MjModel, data: mujoco.MjData, robot: ForeignRobot, row: np.ndarray) -> None:
