@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,17 @@ from tests.data.published_lerobot import (
     write_galaxea,
     write_robocoin,
 )  # fmt: skip
+from tools.labelled_clips import view_thumbnails
 from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.sources.lerobot import LeRobotSourceConfig, state_columns
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.filters.filter import inspect
+from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.filters.signals import measure
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.transforms import pose_from_rotation
 
 K = [[60.0, 0.0, 63.5], [0.0, 62.0, 35.5], [0.0, 0.0, 1.0]]
 POSE = [[1.0, 0.0, 0.0, 0.1], [0.0, 0.0, 1.0, -0.4], [0.0, -1.0, 0.0, 1.3], [0.0, 0.0, 0.0, 1.0]]
@@ -223,6 +230,26 @@ def test_a_wrist_camera_may_be_where_the_robot_mounts_it(tmp_path: Path) -> None
         assert np.allclose(episode.cameras[view].T_base_camera, poses[view], atol=1e-6)
     with pytest.raises(DataError, match="missing_calibration"):  # it mounts none
         run(tmp_path / "second", source | {"embodiment": "piper_pair"})
+
+
+@pytest.mark.slow
+def test_a_calibrated_mount_takes_the_place_of_the_described_one(tmp_path: Path) -> None:
+    write_robocoin(tmp_path / "raw")
+    T = pose_from_rotation(np.array([0.06, 0.02, -0.05]), Rotation.from_euler("x", 0.9).as_matrix())
+    mounted = {key: calibration()[key] for key in ("width", "height", "K")} | {"T_tool_camera": T.tolist()}
+    write_calibration(tmp_path / "raw", {"head": calibration(), "left_wrist": mounted}, "calibration.yaml")
+    source = robocoin(tmp_path, calibration="meta/calibration.yaml") | {"embodiment": "ur5e_silver"}
+    curated = run(tmp_path, source)[1]
+    episode, seen = curated.episode(0), {"head": view_thumbnails(curated.frames(0, "head"), 8.0)}
+    tools = ArmKinematics(load_embodiment("ur5e_silver")).tool_poses(episode.state.astype(np.float64)).numpy()
+    assert np.allclose(episode.cameras["left_wrist"].T_base_camera, tools[:, 0] @ T, atol=1e-6)
+
+    def hand_eye(recorded: Episode) -> bool:
+        (found,) = (f for f in inspect(FilterConfig(), measure(recorded, seen)) if f.detector == "hand_eye")
+        return found.verdict.passed
+
+    assert hand_eye(episode)
+    assert not hand_eye(replace(episode, conventions={}))  # the description mounts it elsewhere
 
 
 def lacking(key: str, **changes: Any) -> dict[str, Any]:

@@ -217,7 +217,10 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[ObservedArm, ...]:
-    """The arms of the embodiment; without kinematics, those of the recorded tool poses under the usual names."""
+    """The arms of the embodiment; without kinematics, those of the recorded tool poses under the usual names.
+
+    A mount that the recording's calibration gives takes the place of the described one.
+    """
     if kinematics is None:
         count = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
         names = {1: ("right",), 2: ("left", "right")}.get(count, tuple(f"arm_{i}" for i in range(count)))
@@ -230,7 +233,8 @@ def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Observe
             expected=f"{len(arms)} arms",
             got=f"{episode.T_base_ee.shape[1]} tool poses per frame",
         )
-    return arms
+    calibrated = episode.calibrated_mounts
+    return tuple(replace(arm, T_tool_mount=None) if arm.wrist_view in calibrated else arm for arm in arms)
 
 
 def arms_of_embodiment(kinematics: ArmKinematics) -> tuple[ObservedArm, ...]:

@@ -29,6 +29,8 @@ TRAINING_SPLITS = ("train", "validation")
 StateKind = Literal["joints", "ee_pose", "none"]
 REPEATS_STATE = "repeats the state"
 """Beginning of the note `action` in an episode's conventions where its source records no commands."""
+MOUNTED = "calibrated_mounts"
+"""Note in an episode's conventions: the wrist views whose mount a calibration file gives, whatever the robot's description says."""
 
 
 @dataclass(frozen=True)
@@ -248,6 +250,11 @@ class Episode(EpisodeDescription):
         """True if commands are recorded; if not, the source says so in the conventions, and the action repeats the state."""
         noted = self.conventions.get("action", "")
         return self.state_kind != "none" and not str(noted).startswith(REPEATS_STATE)
+
+    @property
+    def calibrated_mounts(self) -> list[str]:
+        """Wrist views whose mount a calibration file gives."""
+        return str(self.conventions.get(MOUNTED, "")).split()
 
     def cut(self, start: int, stop: int, step: int = 1) -> Episode:
         """The episode over frames start..stop (exclusive), every `step`-th; time starts at 0 again."""

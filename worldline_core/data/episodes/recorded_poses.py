@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode import MOUNTED, CameraTrack, Episode
 from worldline_core.data.guards.rejection import Reason, RejectedInputError
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.cameras import CameraAxes, CameraPose, Extrinsics
@@ -75,11 +75,13 @@ class RecordedCameras:
     Attributes:
         tracks: by view.
         lenses: of the views whose images are not those of a pinhole.
+        mounted: views whose camera is calibrated in the frame of its tool.
     """
 
     def __init__(self) -> None:
         self.tracks: dict[str, CameraTrack] = {}
         self.lenses: dict[str, Distortion] = {}
+        self.mounted: list[str] = []
         self._repairs: dict[str, RotationRepair] = {}
 
     def add(
@@ -96,8 +98,8 @@ class RecordedCameras:
             self.lenses[view] = lens
 
     def notes(self) -> dict[str, str | int | float]:
-        """`repair_notes` of the views."""
-        return repair_notes(self._repairs)
+        """`repair_notes` of the views, and which are mounted as their calibration says."""
+        return repair_notes(self._repairs) | ({MOUNTED: " ".join(sorted(self.mounted))} if self.mounted else {})
 
 
 def check_intrinsics(camera: CameraTrack, where: str) -> None:

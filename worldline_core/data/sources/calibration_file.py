@@ -150,6 +150,8 @@ def add_calibrated_view(
     pose = camera_pose(view, matrices, extrinsics=extrinsics, axes=axes, where=where)
     K = ImageTransform.of((entry.height, entry.width)).resize(image_size).intrinsics(np.asarray(entry.K))
     cameras.add(view, K, pose, image_size, None if entry.distortion is None else entry.distortion.distortion)
+    if entry.T_tool_camera is not None:
+        cameras.mounted.append(view)
 
 
 def mounted_camera(embodiment: str, state: np.ndarray, view: str, entry: CameraEntry, where: str) -> np.ndarray:
