@@ -15,7 +15,7 @@ from benchmarks import calibration as benchmark
 from benchmarks import hidden_cameras
 from flows.command_line import main
 from worldline_core.calibration.camera_errors import PARAMETERS, Equations, moved_camera
-from worldline_core.calibration.estimate import base_pose, estimate, wrist_camera
+from worldline_core.calibration.estimate import base_pose, estimate, estimate_report, wrist_camera
 from worldline_core.calibration.estimate.estimate import camera_file, estimate_views
 from worldline_core.calibration.estimate.estimate_report import estimate_text
 from worldline_core.calibration.estimate.recordings import RecordedView, near_changes, recorded_views
@@ -332,6 +332,21 @@ def test_sure_cameras_are_read_back_as_a_calibration_file(tmp_path, bank, kinema
     assert np.allclose(cameras.tracks["left_wrist"].T_base_camera, tools @ pose, atol=1e-5)
     assert np.allclose(cameras.tracks["head"].T_base_camera, pose[None])
     assert np.allclose(cameras.tracks["head"].K[:2, 2], (95.5, 63.5))
+
+
+def test_an_estimated_wrist_camera_is_drawn_where_its_tool_carries_it(bank, kinematics, monkeypatch):
+    episode, rows = bank[0][0], []
+    recorded = episode.cameras["left_wrist"]
+    tools = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()[:, 0]
+    mount = replace(recorded, T_base_camera=(rigid_inverse(tools) @ recorded.T_base_camera)[:1])
+    picture = np.full((recorded.height, recorded.width, 3), 90, np.uint8)
+    sheet = np.zeros((256, 384, 3), np.uint8)
+    monkeypatch.setattr(estimate_report, "contact_sheet", lambda found, **_: rows.extend(found) or sheet)
+    found = ViewEstimate("left_wrist", wrist=True, verdict="sure", camera=mount)
+    estimate_report.view_picture(found, [(episode, n, picture) for n in (4, 20)], kinematics)
+    above, below = (row.frames[:, :200] for row in rows)  # without the name of the episode
+    assert (below != 90).any(axis=-1).mean() > 0.02  # the tool is in the picture
+    assert np.abs(above.astype(int) - below).mean() < 0.5
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from worldline_core.pictures import Picture, SheetRow, contact_sheet, draw_tag, 
 
 if TYPE_CHECKING:
     from worldline_core.calibration.estimate.verdict import BasePose, SourceEstimate, ViewEstimate
-    from worldline_core.data.episodes.episode import Episode
+    from worldline_core.data.episodes.episode import CameraTrack, Episode
     from worldline_core.geometry.kinematics import ArmKinematics
 
 LEAST_LAG = 0.75
@@ -116,19 +116,17 @@ def _base_json(base: BasePose) -> dict[str, Any]:
 
 
 def _view_json(each: ViewEstimate) -> dict[str, Any]:
-    camera, rival = each.camera, each.rival
+    camera, rival, pose = each.camera, each.rival, "T_tool_camera" if each.wrist else "T_base_camera"
     return {
         "view": each.view,
         "verdict": each.verdict,
         "wrist": each.wrist,
         "K": None if camera is None else camera.K.tolist(),
-        "T_tool_camera" if each.wrist else "T_base_camera": None
-        if camera is None
-        else camera.T_base_camera[0].tolist(),
+        pose: None if camera is None else camera.T_base_camera[0].tolist(),
         "lag_frames": each.lag_frames,
         "intervals_95": {k.kind: {"half": k.half_interval, "unit": k.unit} for k in each.intervals},
         "agreement": each.agreement,
-        "rival": None if rival is None else {"K": rival.K.tolist(), "T_base_camera": rival.T_base_camera[0].tolist()},
+        "rival": None if rival is None else {"K": rival.K.tolist(), pose: rival.T_base_camera[0].tolist()},
         "rival_agreement": each.rival_agreement,
         "reasons": each.reasons,
         "notes": each.notes,
@@ -140,8 +138,10 @@ def _view_json(each: ViewEstimate) -> dict[str, Any]:
 def view_picture(
     estimate: ViewEstimate, shown: Sequence[tuple[Episode, int, np.ndarray]], kinematics: ArmKinematics
 ) -> Picture:
-    """Frames of some episodes; above as recorded, below with the robot where the estimated camera puts it."""
-    camera, style = estimate.camera, OverlayStyle(SIGMA_PX_REF, heat=0.5, outline=True)
+    """Frames of some episodes; above as recorded, below with the robot where the estimated camera puts it: its tools and outline, in a
+    wrist view the tools alone.
+    """
+    style = OverlayStyle(SIGMA_PX_REF, heat=0.5, outline=not estimate.wrist)
     before, after = [], []
     arms: Sequence[str] = ()
     for episode, n, image in shown:
@@ -154,14 +154,25 @@ def view_picture(
                 tile_height=TILE_HEIGHT, style=style,
             )  # fmt: skip
         before.append(draw_tag(tile, f"{episode.episode_id} frame {n}", size_px=11))
-        if camera is not None:
+        if (camera := _camera_in(episode, estimate, kinematics)) is not None:
             tracks = recorded_tracks(replace(episode, cameras={estimate.view: camera}), estimate.view, kinematics)
             arms = tracks.arms
             tile = draw_overlay(image, tracks, n, estimate.view, tile_height=TILE_HEIGHT, style=style)
         after.append(tile)
     rows = [SheetRow("recorded", np.stack(before)), SheetRow("estimated", np.stack(after))]
     body = contact_sheet(rows, tile_height=TILE_HEIGHT, title=headline(estimate))
-    return np.concatenate([body, legend_strip(arms, body.shape[1], outline=True)])
+    return np.concatenate([body, legend_strip(arms, body.shape[1], outline=style.outline)])
+
+
+def _camera_in(episode: Episode, estimate: ViewEstimate, kinematics: ArmKinematics) -> CameraTrack | None:
+    """The estimated camera in the frame of the robot's base; that of a wrist moves with its tool."""
+    if estimate.camera is None or not estimate.wrist:
+        return estimate.camera
+    tools = episode.T_base_ee
+    if tools is None:
+        tools = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()
+    arm = [each.camera_view for each in kinematics.embodiment.arms].index(estimate.view)
+    return replace(estimate.camera, T_base_camera=tools[:, arm] @ estimate.camera.T_base_camera)
 
 
 def page(found: SourceEstimate, pictures: Mapping[str, str]) -> str:
