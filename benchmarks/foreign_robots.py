@@ -6,7 +6,7 @@
 
 Each source has its own head camera, light, table texture and camera noise. Smooth random motions of all joints. `--lerobot`
 writes these views of them with LeRobot's own classes, 480 x 640, without cameras: an SO-101 at 30 fps in degrees, grippers of 0 to
-100; an ALOHA at 50 fps in radians, grippers of 0 to 1. There grippers move while the arms rest, as people grasp.
+100; an ALOHA at 50 fps in radians, grippers of 0 to 1.
 """
 
 from __future__ import annotations
@@ -229,13 +229,12 @@ class Drawn:
 
 def drawn(
     name: str, robot: ForeignRobot, site: Path, output: Path, source: int, episodes: int, size: tuple[int, int], views: Sequence[str],
-    *, grasps: bool = False,
+    grasps: bool,
 ) -> Iterator[Drawn]:  # fmt: skip
     """Recordings of one source in pictures of this size; its description and table are written to `output`.
 
     Args:
         views: those to draw, of `head` and the wrists' that the model has; all when empty.
-        grasps: grippers move while the arms rest.
     """
     random = np.random.default_rng([source, len(name), ord(name[0])])
     model, text = model_of(robot, site, output / f"{name}_{source}_table.png", random)
@@ -273,11 +272,11 @@ def drawn(
             yield Drawn(state, shown, stood, K)
 
 
-def record(name: str, site: Path, output: Path, source: int, episodes: int) -> None:
+def record(name: str, site: Path, output: Path, source: int, count: int, grasps: bool) -> None:
     """Writes one source, as `read_source` reads it."""
     arrays: dict[str, np.ndarray] = {}
     views: list[str] = []
-    for number, each in enumerate(drawn(name, ROBOTS[name], site, output, source, episodes, (HEIGHT, WIDTH), ())):
+    for number, each in enumerate(drawn(name, ROBOTS[name], site, output, source, count, (HEIGHT, WIDTH), (), grasps)):
         views = list(each.images)
         arrays[f"{number}/state"] = each.state.astype(np.float32)
         for view, images in each.images.items():
@@ -287,10 +286,10 @@ def record(name: str, site: Path, output: Path, source: int, episodes: int) -> N
             if number == 0:
                 cv2.imwrite(str(output / f"{name}_{source}_{view}.png"), images[len(images) // 2][..., ::-1])
     np.savez(output / f"{name}_{source}.npz", **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle
-    (output / f"{name}_{source}.json").write_text(json.dumps({"robot": name, "episodes": episodes, "views": views}))
+    (output / f"{name}_{source}.json").write_text(json.dumps({"robot": name, "episodes": count, "views": views}))
 
 
-def record_lerobot(name: str, site: Path, output: Path, source: int, episodes: int, views: Sequence[str]) -> None:
+def write_lerobot(name: str, site: Path, output: Path, source: int, count: int, grasps: bool, views: list[str]) -> None:
     """Writes one source with LeRobot's own classes, readings in whole ticks of its motors."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -313,7 +312,7 @@ def record_lerobot(name: str, site: Path, output: Path, source: int, episodes: i
     written = LeRobotDataset.create(
         f"local/{folder.name}", int(form.fps), features, root=folder, robot_type=form.robot_type
     )
-    for each in drawn(name, robot, site, output, source, episodes, size, views, grasps=True):
+    for each in drawn(name, robot, site, output, source, count, size, views, grasps):
         readings = each.state * scale
         ticks = np.round(readings / form.tick) * form.tick
         readings = np.where(grippers, readings, ticks).astype(np.float32)
@@ -355,12 +354,13 @@ def main() -> None:
     parser.add_argument("--sources", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--lerobot", metavar="VIEWS", help="write these views as a dataset of LeRobot's")
+    parser.add_argument("--grasps", action="store_true", help="grippers move while the arms rest, as people grasp")
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
-    write = partial(record_lerobot, views=arguments.lerobot.split(",")) if arguments.lerobot else record
+    write = partial(write_lerobot, views=arguments.lerobot.split(",")) if arguments.lerobot else record
     for name in arguments.robots.split(","):
         for source in range(arguments.sources):
-            write(name, arguments.site, arguments.output, source, arguments.episodes)
+            write(name, arguments.site, arguments.output, source, arguments.episodes, arguments.grasps)
             print(name, source, flush=True)
 
 
