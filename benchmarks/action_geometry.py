@@ -2,8 +2,8 @@
 
     python benchmarks/action_geometry.py [--device cpu]
 
-Both sides get the same input and one thread; the largest difference of their results is printed. The ratio carries over to other machines, the
-figures do not. 3 views, 2 arms, 33 latent frames on 30 x 40 cells; OpenCV draws the Gaussian as circles of falling
+Both sides get the same input and one thread; the largest difference of their results is printed. On a busy machine
+the ratio varies by a factor of two. 3 views, 2 arms, 33 latent frames on 30 x 40 cells; OpenCV draws the Gaussian as circles of falling
 intensity at the size of the video, and reduces them to the grid.
 """
 

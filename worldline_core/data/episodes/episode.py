@@ -254,7 +254,7 @@ class Episode(EpisodeDescription):
     @property
     def calibrated_mounts(self) -> list[str]:
         """Wrist views whose mount a calibration file gives."""
-        return str(self.conventions.get(MOUNTED, "")).split()
+        return str(self.conventions.get(MOUNTED, "")).split(", ")
 
     def cut(self, start: int, stop: int, step: int = 1) -> Episode:
         """The episode over frames start..stop (exclusive), every `step`-th; time starts at 0 again."""

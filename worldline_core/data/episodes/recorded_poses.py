@@ -99,7 +99,7 @@ class RecordedCameras:
 
     def notes(self) -> dict[str, str | int | float]:
         """`repair_notes` of the views, and which are mounted as their calibration says."""
-        return repair_notes(self._repairs) | ({MOUNTED: " ".join(sorted(self.mounted))} if self.mounted else {})
+        return repair_notes(self._repairs) | ({MOUNTED: ", ".join(sorted(self.mounted))} if self.mounted else {})
 
 
 def check_intrinsics(camera: CameraTrack, where: str) -> None:
