@@ -252,7 +252,7 @@ class _Search:
             views[1]: replace(two, T_base_camera=one.T_base_camera),
         }
         exchanged = replace(episode, cameras=dict(episode.cameras) | cameras)
-        observations = {"wrist_extrinsics": replace(self.observation, episode=exchanged, _stands={})}
+        observations = {"wrist_extrinsics": replace(self.observation, episode=exchanged)}
         if (videos := self.observation.with_exchanged_wrists()) is not None:
             observations["wrist_videos"] = videos
         for name, observation in observations.items():
@@ -490,7 +490,7 @@ def not_judged(observation: Observation) -> dict[str, str]:
             found[view] = f"{count} pictures are too few to compare motion with"
         elif view in observation.wrists and not camera.moving:
             found[view] = "its camera has one pose, though its hand moves"
-        elif view not in observation.wrists and not observation.stands_still(view):
+        elif view not in observation.wrists and view not in observation.still_views:
             found[view] = "its camera moves, and no hand carries it"
         elif not observation.motion(view).moves:
             found[view] = "its pictures do not change"

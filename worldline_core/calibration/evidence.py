@@ -16,11 +16,10 @@ import numpy as np
 
 from worldline_core.calibration.observation import (
     CELL_PX,
+    CLEAR_CHANGE,
     LONGEST_STEP_PX,
-    Motion,
     Observation,
     ObservedArm,
-    PredictedMotion,
     Reading,
     cell_centres,
     predict_motion,
@@ -221,7 +220,8 @@ def image_terms(observation: Observation, reading: Reading, *, wrist_flow: bool 
         elif view not in observation.wrists:
             flow, change, turn_deg = still_view_agreement(observation, reading, view)
             typical = (ARM_FLOW, ARM_CHANGE) if reading.shape != "hands" else (TOOL_FLOW, TOOL_CHANGE)
-            weight = min(1.0, observation.motion(view).clear_cells / FULL_CELLS)  # the same for all readings
+            clear = int((observation.motion(view).change > CLEAR_CHANGE).sum())
+            weight = min(1.0, clear / FULL_CELLS)  # the same for all readings
             terms[f"turn {view}"] = weight * turn_log_likelihood(turn_deg)
             terms[f"flow {view}"] = weight * correlation_log_likelihood(flow, typical[0])
             terms[f"change {view}"] = weight * correlation_log_likelihood(change, typical[1])
@@ -236,7 +236,7 @@ def observable_views(observation: Observation) -> list[str]:
         view
         for view in observation.episode.cameras
         if len(observation.gray.get(view, ())) > MIN_IMAGE_PAIRS
-        and (view in observation.wrists or observation.stands_still(view))
+        and (view in observation.wrists or view in observation.still_views)
         and observation.motion(view).moves
     ]
 
@@ -248,7 +248,7 @@ def frozen_views(observation: Observation, reading: Reading) -> list[str]:
         if len(observation.gray.get(view, ())) <= MIN_IMAGE_PAIRS:
             continue
         states, images = reading.steps(observation.num_images, view)
-        same = observation.motion(view).largest_change[images] < FROZEN_CHANGE
+        same = observation.motion(view).change[images].max(axis=(1, 2)) < FROZEN_CHANGE
         own = observation.wrists.get(view)
         speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
         travel = longest = 0.0
@@ -277,25 +277,25 @@ def still_view_agreement(observation: Observation, reading: Reading, view: str) 
     Returns: correlations of predicted with measured flow and change; angle [deg] by which the flow is turned as a whole,
         smaller where it hardly follows, and 0 where it does not.
     """
-    camera, motion = reading.cameras[view], observation.motion(view)
+    motion = observation.motion(view)
     states, images = reading.steps(observation.num_images, view)
-    inputs = (reading.points, reading.radii, camera.T_base_camera[:1], camera.K, states, images)
-    return motion.agreement(inputs, lambda: _still_view_agreement(motion, reading.predicted(view), states, images))
-
-
-def _still_view_agreement(
-    motion: Motion, predicted: PredictedMotion, states: slice, images: slice
-) -> tuple[float, float, float]:
-    moving = predicted.length[states] > MIN_STEP_PX
+    predicted = reading.predicted(view)[states]
+    length = lengths(predicted)
+    moving = length > MIN_STEP_PX
     if moving.sum() < 20:
         return 0.0, 0.0, 0.0
-    measured, expected = motion.flow[images][moving], predicted.shortened[states][moving]
+    measured, expected = motion.flow[images][moving], shortened(predicted[moving])
     agreement = cosine(measured, expected)
     across = cosine(measured, np.stack([-expected[:, 1], expected[:, 0]], axis=-1))
     follows = (np.hypot(agreement, across) - FOLLOWS_CORRELATION) / (FOLLOWS_WELL - FOLLOWS_CORRELATION)
     turn_deg = float(np.degrees(np.arctan2(across, agreement)) * np.sqrt(np.clip(follows, 0.0, 1.0)))
-    change = correlation(predicted.log_length[states].ravel(), motion.log_change[images].ravel())
-    return agreement, change, turn_deg
+    speed = np.log1p(np.minimum(length, LONGEST_STEP_PX))
+    return agreement, correlation(speed.ravel(), np.log1p(motion.change[images]).ravel()), turn_deg
+
+
+def shortened(steps: np.ndarray) -> np.ndarray:
+    """Steps (..., 2) [px] of at most LONGEST_STEP_PX."""
+    return steps * np.minimum(1.0, LONGEST_STEP_PX / np.maximum(lengths(steps)[..., None], 1e-9))
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
@@ -319,11 +319,6 @@ def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) 
     if not camera.moving:
         return 0.0
     states, images = reading.steps(observation.num_images, view)
-    inputs = (camera.T_base_camera, camera.K, states, images)
-    return motion.agreement(inputs, lambda: _wrist_flow_agreement(camera, motion, states, images))
-
-
-def _wrist_flow_agreement(camera: CameraTrack, motion: Motion, states: slice, images: slice) -> float:
     poses = camera.T_base_camera
     T_next_this = (rigid_inverse(poses[1:]) @ poses[:-1])[states]
     keep = (motion.texture[images] > MIN_TEXTURE) & (motion.change[images] > MIN_CHANGE)
@@ -338,8 +333,7 @@ def _wrist_flow_agreement(camera: CameraTrack, motion: Motion, states: slice, im
         ahead = moved[..., 2:] > 0.1
         step = np.where(ahead, moved[..., :2] / np.where(ahead, moved[..., 2:], 1.0) - centres[cells], 0.0)
         error = np.minimum(lengths(step - flow[cells]), LARGEST_FLOW_ERROR_PX).sum(axis=1)
-        best = step[error.argmin()]
-        expected.append(best * np.minimum(1.0, LONGEST_STEP_PX / np.maximum(lengths(best)[:, None], 1e-9)))
+        expected.append(shortened(step[error.argmin()]))
         measured.append(flow[cells])
     if sum(len(cells) for cells in measured) < 50:
         return 0.0
@@ -351,7 +345,7 @@ def energy_correlation(observation: Observation, reading: Reading, view: str) ->
     states, images = reading.steps(observation.num_images, view)
     own = observation.wrists.get(view)
     speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
-    change = observation.motion(view).mean_change[images]
+    change = observation.motion(view).change[images].mean(axis=(1, 2))
     return correlation(speed, change) if len(speed) >= 8 else 0.0
 
 
@@ -384,33 +378,20 @@ def finger_agreement(observation: Observation, reading: Reading, arm: int) -> fl
         return None
     if reading.shape == "hands" or not _moves(observation, reading, arm):
         return None
-    camera, motion, tool = reading.cameras[view], observation.motion(view), reading.tools[:, arm, :3, 3]
     states, images = reading.steps(observation.num_images, view)
-    inputs = (*reading.capsules, tool, camera.T_base_camera, camera.K, states, images)
-    return motion.agreement(inputs, lambda: _finger_agreement(motion, reading, arm, camera, states, images))
-
-
-def _finger_agreement(
-    motion: Motion, reading: Reading, arm: int, camera: CameraTrack, states: slice, images: slice
-) -> float:
-    predicted = _predicted_fingers(reading, arm, camera)[states]
-    moving = lengths(predicted) > MIN_FINGER_STEP_PX
-    if moving.sum() < 10:
-        return 0.0  # whether there is a term must not depend on the reading
-    return cosine(motion.flow[images][moving], predicted[moving])
-
-
-def _predicted_fingers(reading: Reading, arm: int, camera: CameraTrack) -> np.ndarray:
-    """`predict_motion` of the links near a tool as its wrist camera shows them, cached with the reading."""
-    name = f"fingers {arm}"
+    name, camera, flow = f"fingers {arm}", reading.cameras[view], observation.motion(view).flow[images]
     if name not in reading.predictions:
         tool, (points, radii) = reading.tools[:, arm, :3, 3], reading.capsules
         near = np.median(lengths(points - tool[:, None]), axis=0) < FINGER_LENGTH_M
         T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
         points = points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
         fixed = replace(camera, T_base_camera=np.eye(4)[None])
-        reading.predictions[name] = PredictedMotion(predict_motion(points, radii[near], fixed))
-    return reading.predictions[name].step
+        reading.predictions[name] = predict_motion(points, radii[near], fixed)
+    predicted = reading.predictions[name][states]
+    moving = lengths(predicted) > MIN_FINGER_STEP_PX
+    if moving.sum() < 10:
+        return 0.0  # whether there is a term must not depend on the reading
+    return cosine(flow[moving], predicted[moving])
 
 
 def _moves(observation: Observation, reading: Reading, arm: int) -> bool:

@@ -5,12 +5,11 @@ Axis legend: n frames, a arms, p points on the robot, r c rows and columns of im
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from hashlib import blake2b
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -63,36 +62,10 @@ class Motion:
     flow: np.ndarray
     change: np.ndarray
     texture: np.ndarray
-    _agreements: dict[bytes, Any] = field(default_factory=dict, repr=False)
-
-    def agreement[Agreement](self, inputs: Iterable[np.ndarray | slice], compute: Callable[[], Agreement]) -> Agreement:
-        """An agreement with predicted motion, cached by what it is computed from: most readings change little of it."""
-        parts = (each.tobytes() if isinstance(each, np.ndarray) else repr(each).encode() for each in inputs)
-        key = blake2b(b"|".join(parts)).digest()
-        if key not in self._agreements:
-            self._agreements[key] = compute()
-        return self._agreements[key]
-
-    @cached_property
-    def largest_change(self) -> np.ndarray:
-        return self.change.max(axis=(1, 2))
-
-    @cached_property
-    def log_change(self) -> np.ndarray:
-        return np.log1p(self.change)
 
     @cached_property
     def moves(self) -> bool:
-        return bool((self.largest_change > STILL_CHANGE).sum() >= 4)
-
-    @cached_property
-    def mean_change(self) -> np.ndarray:
-        return self.change.mean(axis=(1, 2))
-
-    @cached_property
-    def clear_cells(self) -> int:
-        """Number of cells that change clearly, over all steps."""
-        return int((self.change > CLEAR_CHANGE).sum())
+        return bool((self.change.max(axis=(1, 2)) > STILL_CHANGE).sum() >= 4)
 
 
 @dataclass(frozen=True)
@@ -104,7 +77,6 @@ class Observation:
     arms: tuple[ObservedArm, ...]
     kinematics: ArmKinematics | None
     _motion: dict[str, Motion] = field(default_factory=dict, repr=False)
-    _stands: dict[str, bool] = field(default_factory=dict, repr=False)
     moved_arms: dict[tuple[int, bytes], tuple[np.ndarray, ...]] = field(default_factory=dict, repr=False)
     """Cached by kinematics and joints: most readings leave both as they are."""
 
@@ -113,14 +85,16 @@ class Observation:
             self._motion[view] = measured_motion(self.gray[view])
         return self._motion[view]
 
-    def stands_still(self, view: str) -> bool:
-        """Returns whether a camera's recorded poses stay the same (2 cm, 2 degrees; at any unit of length)."""
-        if view not in self._stands:
-            poses = self.episode.cameras[view].T_base_camera
+    @cached_property
+    def still_views(self) -> set[str]:
+        """Views whose recorded camera poses stay the same (2 cm, 2 degrees; at any unit of length)."""
+        found = set[str]()
+        for view, camera in self.episode.cameras.items():
+            poses = camera.T_base_camera
             _, metres, degrees = hand_eye_residual(np.eye(4)[None].repeat(len(poses), axis=0), poses)
-            scale = max(1.0, float(np.linalg.norm(poses[0, :3, 3])))
-            self._stands[view] = bool(metres.max() < 0.02 * scale and degrees.max() < 2.0)
-        return self._stands[view]
+            if metres.max() < 0.02 * max(1.0, float(np.linalg.norm(poses[0, :3, 3]))) and degrees.max() < 2.0:
+                found.add(view)
+        return found
 
     def with_exchanged_wrists(self) -> Observation | None:
         """The same with the videos of two wrist cameras exchanged; None without two of one size."""
@@ -203,17 +177,12 @@ def measured_motion(gray: np.ndarray, *, exact: bool = False) -> Motion:
         part = gray[begin : begin + _STEPS_AT_ONCE + 1]
         flow = np.stack([engine.calc(a, b, None) for a, b in pairwise(part)])  # type: ignore[call-overload]
         across, down = np.zeros((2, *part[1:].shape), np.uint8)
-        across[:, :, :-1] = _apart(part[:-1, :, 1:], part[:-1, :, :-1])
-        down[:, :-1] = _apart(part[:-1, 1:], part[:-1, :-1])
-        change = _apart(part[1:], part[:-1])
+        across[:, :, :-1] = cv2.absdiff(part[:-1, :, 1:], part[:-1, :, :-1])
+        down[:, :-1] = cv2.absdiff(part[:-1, 1:], part[:-1, :-1])
+        change = cv2.absdiff(part[1:], part[:-1])
         parts.append((cell_means(flow), cell_means(change), cell_means(np.maximum(across, down))))
     flow, change, texture = (np.concatenate(part) for part in zip(*parts, strict=True))
     return Motion(flow, change, texture)
-
-
-def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Absolute differences of uint8 values."""
-    return np.maximum(a, b) - np.minimum(a, b)
 
 
 def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[ObservedArm, ...]:
@@ -250,25 +219,6 @@ def arms_of_embodiment(kinematics: ArmKinematics) -> tuple[ObservedArm, ...]:
 
 
 @dataclass(frozen=True)
-class PredictedMotion:
-    """Motion of the robot's points in the cells of one view: `step` (n - 1, r, c, 2) [px]."""
-
-    step: np.ndarray
-
-    @cached_property
-    def length(self) -> np.ndarray:
-        return lengths(self.step)
-
-    @cached_property
-    def log_length(self) -> np.ndarray:
-        return np.log1p(np.minimum(self.length, LONGEST_STEP_PX))
-
-    @cached_property
-    def shortened(self) -> np.ndarray:
-        return self.step * np.minimum(1.0, LONGEST_STEP_PX / np.maximum(self.length[..., None], 1e-9))
-
-
-@dataclass(frozen=True)
 class Reading:
     """An episode read under given conventions.
 
@@ -298,8 +248,8 @@ class Reading:
     shape: Literal["surfaces", "capsules", "hands"]
     capsules: tuple[np.ndarray, np.ndarray]
     first: int
-    predictions: dict[str, PredictedMotion] = field(default_factory=dict, repr=False)
-    """Cached motion of the robot's points; readings that differ by a lag of the images share it."""
+    predictions: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    """Cached results of `predict_motion`; readings that differ by a lag of the images share it."""
 
     def with_image_lag(self, frames: int) -> Reading:
         """The same geometry with images that trail the states by so many frames."""
@@ -313,10 +263,10 @@ class Reading:
         stop = max(start, min(len(self.tools), num_images - first) - 1)
         return slice(start, stop), slice(start + first, stop + first)
 
-    def predicted(self, view: str) -> PredictedMotion:
+    def predicted(self, view: str) -> np.ndarray:
         """`predict_motion` in a view, cached."""
         if view not in self.predictions:
-            self.predictions[view] = PredictedMotion(predict_motion(self.points, self.radii, self.cameras[view]))
+            self.predictions[view] = predict_motion(self.points, self.radii, self.cameras[view])
         return self.predictions[view]
 
 
