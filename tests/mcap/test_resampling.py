@@ -59,7 +59,7 @@ def test_instants_do_not_drift(fps: float) -> None:
 
 def test_a_clock_set_back_is_refused() -> None:
     regular = np.arange(300) * 10 * MS
-    assert in_order(regular[:1], "x").median_step_ns == 0
+    assert [each.tolist() for each in in_order(regular[[1, 0, 1]], "x")] == [[0, 10 * MS], [1, 0]]
     with pytest.raises(RejectedInputError, match="jump back"):
         in_order(np.concatenate([regular, regular]), "x")
 
@@ -68,6 +68,6 @@ def test_video_is_spoiled_from_a_gap_to_the_next_key_frame() -> None:
     times = np.delete(np.arange(12) * 33 * MS, 5)
     keys = np.zeros(11, bool)
     keys[[0, 7]] = True
-    assert np.flatnonzero(frames_after_loss(times, 33.0 * MS, keys)).tolist() == [5, 6]
+    assert np.flatnonzero(frames_after_loss(times, 33.0 * MS, keys, times)).tolist() == [5, 6]
     keys[5] = True
-    assert not frames_after_loss(times, 33.0 * MS, keys).any()
+    assert not frames_after_loss(times, 33.0 * MS, keys, times).any()

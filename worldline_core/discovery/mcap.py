@@ -13,7 +13,7 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files
 from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
 from worldline_core.data.mcap.file import McapFile, Stream
-from worldline_core.data.mcap.messages import IMAGE_KINDS, SCHEMA_KINDS, Kind
+from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, schema_kind
 from worldline_core.discovery.cameras import name_views
 from worldline_core.discovery.columns import ArmColumns, Column, Side, find_arms, words_of
 from worldline_core.discovery.findings import Discovery, Question, named, stated_licence
@@ -81,13 +81,9 @@ def _of_this_project(root: AnyPath, files: Sequence[AnyPath], episode_id: str) -
     return found
 
 
-def _kind(schema: str) -> Kind | None:
-    return SCHEMA_KINDS.get(schema.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove."))
-
-
 def _of_topics(root: AnyPath, files: Sequence[AnyPath], file: McapFile) -> Discovery:
     kinds: dict[str, Kind] = {
-        topic: kind for topic, schema in file.topics.items() if (kind := _kind(schema)) is not None
+        topic: kind for topic, schema in file.topics.items() if (kind := schema_kind(schema)) is not None
     }
     pictures = [
         topic

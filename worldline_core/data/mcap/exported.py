@@ -127,15 +127,12 @@ class _Messages:
         self.writer: Writer | Ros2Writer
         self._schemas: dict[str, Any] = {}
         self._channels: dict[str, int] = {}
+        self._static_transforms = STATIC_TRANSFORMS if encoding == "ros2" else "/tf"
         if encoding == "ros2":
-            self.writer, self._static_transforms = (
-                Ros2Writer(stream, compression=CompressionType.ZSTD),
-                STATIC_TRANSFORMS,
-            )
+            self.writer = Ros2Writer(stream, compression=CompressionType.ZSTD)
         else:
             self.writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
             self.writer.start(profile="", library="worldline")
-            self._static_transforms = "/tf"
 
     def add(self, topic: str, schema: _Schema, message: Message) -> None:
         seconds, nanoseconds = divmod(self.time_ns, 10**9)
@@ -333,10 +330,11 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
     images = {view: _all_of(streams, f"/{view}/image", video_frames, file) for view in views}
     masks = {view: _track(file, streams[topic]) for view in views if (topic := f"/{view}/robot_mask") in streams}
     poses: dict[str, list[Transform]] = {}
-    for topic in ("/tf", STATIC_TRANSFORMS):
-        for message in streams[topic].values if topic in streams else ():
-            for transform in message:
-                poses.setdefault(transform.child, []).append(transform)
+    messages = [
+        message for topic in ("/tf", STATIC_TRANSFORMS) if topic in streams for message in streams[topic].values
+    ]
+    for transform in (transform for message in messages for transform in message):
+        poses.setdefault(transform.child, []).append(transform)
 
     cameras = RecordedCameras()
     for view in moving:
@@ -384,16 +382,13 @@ def _all_of(streams: Mapping[str, Stream], topic: str, count: int, file: McapFil
 
 def _track(file: McapFile, stream: Stream, camera: CameraTrack | None = None) -> ImageTrack:
     every = np.arange(len(stream.log_ns))
-    return ImageTrack(file, stream.topic, stream.kind, (None, None), every, every, camera=camera)
+    return ImageTrack(file, stream, every, every, camera=camera)
 
 
 def _poses(found: Mapping[str, list[Transform]], child: str, count: int, file: McapFile) -> np.ndarray:
-    transforms = found.get(child, [])
-    if len(transforms) != count:
-        where = f"{file.path}, frame {child}"
-        raise RejectedInputError(
-            "missing_calibration", "Transforms are missing", where=where, expected=count, got=len(transforms)
-        )
-    values = np.array([transform.values for transform in transforms], dtype=np.float64)
-    with rejected_as("invalid_extrinsics", f"{file.path}, frame {child}", {"frame": child}):
+    where, values = f"{file.path}, frame {child}", np.array([each.values for each in found.get(child, [])], np.float64)
+    if len(values) != count:
+        what = "Transforms are missing"
+        raise RejectedInputError("missing_calibration", what, where=where, expected=count, got=len(values))
+    with rejected_as("invalid_extrinsics", where, {"frame": child}):
         return pose_from_quaternion_xyzw(values[:, :3], values[:, 3:])

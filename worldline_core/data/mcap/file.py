@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import chain
 from typing import Any, BinaryIO, cast
 
 import av
@@ -27,7 +28,13 @@ from mcap.summary import Summary
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.guards.plain_files import UPRIGHT, decode_image, turned_view
-from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, check_image_size, unreadable
+from worldline_core.data.guards.rejection import (
+    MAX_CHUNK_BYTES,
+    RejectedInputError,
+    check_image_size,
+    depth_picture,
+    unreadable,
+)
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.data.mcap.messages import (
     IMAGE_KINDS,
@@ -302,29 +309,33 @@ class ImageTrack:
     """Frames of a view as images of a topic.
 
     Attributes:
-        around_ns: log times between which the topic's messages were counted; None: the file's beginning or end.
-        order: (n,) index in the file of the i-th message in time.
+        order: (n,) index in the stream of the i-th message in time.
         chosen: (t,) index in time of each frame's image; ascending, an image may repeat.
-        key_frames: (n,) frames of a video, in order of time, with which decoding can begin.
-        log_ns: (n,) log times of a video's frames, in order of time: with B-frames these are in another order, that of
-            decoding.
+        around_ns: log times between which the stream was read; None: the file's beginning or end.
         camera: the images must have its size; None: any size.
     """
 
     file: McapFile
-    topic: str
-    kind: Kind
-    around_ns: tuple[int | None, int | None]
+    stream: Stream
     order: np.ndarray
     chosen: np.ndarray
-    key_frames: np.ndarray | None = None
-    log_ns: np.ndarray | None = None
+    around_ns: tuple[int | None, int | None] = (None, None)
     camera: CameraTrack | None = None
+
+    @property
+    def key_frames(self) -> np.ndarray:
+        """(n,) bool: frames of a video, in order of time, with which decoding can begin."""
+        return np.array(self.stream.key_frames, bool)[self.order]
+
+    @property
+    def log_ns(self) -> np.ndarray:
+        """(n,) log times in order of time: of a video with B-frames in another order, that of decoding."""
+        return np.array(self.stream.log_ns, np.int64)[self.order]
 
     def frames(self) -> Iterator[np.ndarray]:
         """uint8 (H, W, 3) RGB of each frame, in order; any fault is a RejectedInputError."""
-        where = f"{self.file.path}, topic {self.topic}"
-        decoded = self._video(where) if self.kind == "video" else self._images(where)
+        where = f"{self.file.path}, topic {self.stream.topic}"
+        decoded = self._video(where) if self.stream.kind == "video" else self._images(where)
         number, image = next(decoded)
         shape = image.shape
         if self.camera is not None and shape[:2] != (self.camera.height, self.camera.width):
@@ -345,28 +356,28 @@ class ImageTrack:
 
     def _images(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
         numbers = np.unique(self.chosen)
-        still = partial(_picture_of, calibrated=self.camera is not None)
         for number, value in zip(numbers.tolist(), self._messages(self.order[numbers]), strict=True):
             place = f"{where}, image {number}"
-            yield number, _raw_pixels(value, place) if isinstance(value, RawImage) else still(value, place)
+            raw = isinstance(value, RawImage)
+            yield number, _raw_pixels(value, place) if raw else _still(value, place, self.camera is not None)
 
     def _video(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
         """Frames from the last key frame before the first chosen one on, in order of time; none may be missing.
 
         Messages are decoded in the order in which they were logged, and each picture has the number of its message.
         """
-        keys = np.flatnonzero([] if self.key_frames is None else self.key_frames[: self.chosen[0] + 1])
-        if not len(keys) or self.log_ns is None:
+        keys, log_ns = np.flatnonzero(self.key_frames[: self.chosen[0] + 1]), self.log_ns
+        if not len(keys):
             what = "No key frame comes before the first frame of the episode"
             raise RejectedInputError("truncated_video", what, where=where, next_step="begin the episode later")
         first, last = int(keys[-1]), int(self.chosen[-1])
-        log_ns = int(self.log_ns[first])
-        logged = np.lexsort((self.order, self.log_ns))
+        logged = np.lexsort((self.order, log_ns))
         place = np.empty_like(logged)
         place[logged] = np.arange(len(logged))
         numbers = logged[place[first] : place[first : last + 1].max() + 1]
         packets = zip(numbers.tolist(), self._messages(self.order[numbers]), strict=True)
-        pictures = _decoded(packets, lambda: self._parameter_sets(log_ns), where, calibrated=self.camera is not None)
+        earlier_sets = partial(self._parameter_sets, int(log_ns[first]))
+        pictures = _decoded(packets, earlier_sets, where, calibrated=self.camera is not None)
         expected, previous = first, -1
         for number, image in pictures:
             # Before the first: pictures that lean on an earlier key frame; after the last: what is shown later.
@@ -391,7 +402,7 @@ class ImageTrack:
     def _parameter_sets(self, log_ns: int) -> bytes:
         """Those of the file up to a log time, the last ones last."""
         found: dict[bytes, None] = {}
-        for *_, value in self.file.messages([self.topic], None, log_ns + 1):
+        for *_, value in self.file.messages([self.stream.topic], None, log_ns + 1):
             for unit in value.parameter_sets():
                 found.pop(unit, None)
                 found[unit] = None
@@ -404,7 +415,7 @@ class ImageTrack:
         indices = wanted.tolist()
         waiting: dict[int, Any] = {}
         needed, done = set(indices), 0
-        for message, (*_, value) in enumerate(self.file.messages([self.topic], *self.around_ns)):
+        for message, (*_, value) in enumerate(self.file.messages([self.stream.topic], *self.around_ns)):
             if message in needed:
                 waiting[message] = value
             while done < len(indices) and indices[done] in waiting:
@@ -413,23 +424,20 @@ class ImageTrack:
             if done == len(indices):
                 return
         what = "File holds fewer images than when it was first read"
-        where = f"{self.file.path}, topic {self.topic}"
+        where = f"{self.file.path}, topic {self.stream.topic}"
         raise RejectedInputError("changed_while_reading", what, where=where, expected=len(indices), got=done)
 
 
-def frames_after_loss(
-    times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray, log_ns: np.ndarray | None = None
-) -> np.ndarray:
+def frames_after_loss(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray, log_ns: np.ndarray) -> np.ndarray:
     """(n,) bool: video frames between a gap of more than 1.5 steps and the next key frame.
 
     After a lost message a decoder returns wrong pictures, without an error, until the next key frame. B-frames before the
     gap may depend on it too: as many as a picture is logged before its turn.
     """
     lost = np.concatenate([[False], np.diff(times_ns) > 1.5 * step_ns])
-    if log_ns is not None:
-        early = int((np.arange(len(lost)) - np.argsort(np.argsort(log_ns, kind="stable"))).max())
-        for gap in np.flatnonzero(lost):
-            lost[max(gap - early, 0) : gap] = True
+    early = int((np.arange(len(lost)) - np.argsort(np.argsort(log_ns, kind="stable"))).max())
+    for gap in np.flatnonzero(lost):
+        lost[max(gap - early, 0) : gap] = True
     last_loss = np.maximum.accumulate(np.where(lost, np.arange(len(lost)), -1))
     last_key = np.maximum.accumulate(np.where(key_frames, np.arange(len(lost)), -1))
     return last_loss > last_key
@@ -442,38 +450,34 @@ def _decoded(
     *,
     calibrated: bool = False,
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """(number, RGB) of video messages, each one frame in Annex B, in the order in which they are shown.
+    """(number, RGB) of video messages (at least one), each one frame in Annex B, in the order in which they are shown.
 
     Args:
         earlier_sets: parameter sets from before the first message, asked for where it has none.
     """
-    decoder: VideoCodecContext | None = None
-    try:
-        for place, (number, image) in enumerate(messages):
-            data = image.data
-            if decoder is None:
-                decoder = cast("VideoCodecContext", VideoCodecContext.create(VIDEO_CODECS[image.format], "r"))
-                decoder.thread_type = "NONE"
-                if not image.parameter_sets():
-                    data = earlier_sets() + data
-            packet = av.Packet(data)
+    first = next(messages)
+    decoder = cast("VideoCodecContext", VideoCodecContext.create(VIDEO_CODECS[first[1].format], "r"))
+    decoder.thread_type = "NONE"
+    sets = b"" if first[1].parameter_sets() else earlier_sets()
+
+    def packets() -> Iterator[av.Packet | None]:
+        for place, (number, image) in enumerate(chain([first], messages)):
+            packet = av.Packet(image.data if place else sets + image.data)
             packet.pts, packet.dts = number, place
-            for frame in decoder.decode(packet):
-                yield _picture(frame, where, calibrated=calibrated)
-        for frame in decoder.decode(None) if decoder is not None else ():
-            yield _picture(frame, where, calibrated=calibrated)
+            yield packet
+        yield None  # what the decoder still holds
+
+    try:
+        for frame in (frame for packet in packets() for frame in decoder.decode(packet)):
+            check_image_size(frame.width, frame.height, where)
+            if frame.is_corrupt or frame.pts is None:
+                raise _lost_frame(f"{where}, frame {frame.pts}")
+            picture = Picture(frame, where)
+            if calibrated and picture.orientation != UPRIGHT:
+                raise turned_view(where, picture.orientation)
+            yield int(frame.pts), picture.rgb
     except av.error.FFmpegError as error:
         raise RejectedInputError("truncated_video", "Video cannot be decoded", where=where, got=str(error)) from error
-
-
-def _picture(frame: av.VideoFrame, where: str, *, calibrated: bool) -> tuple[int, np.ndarray]:
-    check_image_size(frame.width, frame.height, where)
-    if frame.is_corrupt or frame.pts is None:
-        raise _lost_frame(f"{where}, frame {frame.pts}")
-    picture = Picture(frame, where)
-    if calibrated and picture.orientation != UPRIGHT:
-        raise turned_view(where, picture.orientation)
-    return int(frame.pts), picture.rgb
 
 
 def _lost_frame(where: str) -> RejectedInputError:
@@ -481,32 +485,16 @@ def _lost_frame(where: str) -> RejectedInputError:
     return RejectedInputError("truncated_video", what, where=where, next_step=next_step)
 
 
-def _picture_of(image: EncodedImage, where: str, *, calibrated: bool) -> np.ndarray:
-    """RGB of a JPEG or PNG of 8 bits.
-
-    A PNG of 16-bit grey (header: bit depth 16, colour type 0) is depth, and so is one behind the 12 bytes that ROS'
-    compressedDepth puts before it.
-    """
-    data = image.data
-    if _DEPTH.search(image.format) or (data[:4] == _PNG and data[24:26] == b"\x10\0") or data[12:16] == _PNG:
-        raise _depth(where, f"{image.format!r} with a PNG of 16 bits" if _PNG in data[:16] else repr(image.format))
-    return decode_image(data, where, calibrated=calibrated)
-
-
-def _depth(where: str, got: str) -> RejectedInputError:
-    return RejectedInputError(
-        "unknown_schema",
-        "Images are depth, or other readings of more than 8 bits, not colour",
-        where=where,
-        expected="JPEG or PNG of 8 bits; raw " + ", ".join(_ENCODINGS),
-        got=got,
-        next_step="name the topic of the camera's colour images",
-    )
+def _still(image: EncodedImage, where: str, calibrated: bool) -> np.ndarray:
+    """RGB of a JPEG or PNG; ROS' compressedDepth puts 12 bytes before a PNG."""
+    if _DEPTH.search(image.format) or image.data[12:16] == _PNG:
+        raise depth_picture(where, repr(image.format))
+    return decode_image(image.data, where, calibrated=calibrated)
 
 
 def _raw_pixels(image: RawImage, where: str) -> np.ndarray:
     if _DEPTH.search(image.encoding):
-        raise _depth(where, image.encoding)
+        raise depth_picture(where, image.encoding)
     if image.encoding not in _ENCODINGS:
         what, expected = "Pixel encoding is not supported", ", ".join(_ENCODINGS)
         raise RejectedInputError("unreadable", what, where=where, expected=expected, got=image.encoding)

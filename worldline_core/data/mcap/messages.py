@@ -56,7 +56,12 @@ SCHEMA_KINDS: dict[str, Kind] = {
     "foxglove.PoseInFrame": "pose",
     "foxglove.JointStates": "joints",
 }
-"""Schemas that can be read, without `/msg`; Foxglove's may also come as `foxglove_msgs`."""
+"""Schemas that can be read, by the names that `schema_kind` compares."""
+
+
+def schema_kind(name: str) -> Kind | None:
+    """Kind of the messages of `sensor_msgs/msg/Image`, `foxglove_msgs/msg/RawImage`, ...; None for a schema that is not read."""
+    return SCHEMA_KINDS.get(name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove."))
 
 
 VIDEO_CODECS = {"h264": "h264", "h265": "hevc"}
@@ -76,12 +81,9 @@ class EncodedImage:
         """(type, bytes with a start code) of a video message's NAL units (ITU-T H.264 and H.265, 7.3 and annex B)."""
         start = self.data.find(_START_CODE)
         while 0 <= start < len(self.data) - 3:
-            stop = self.data.find(_START_CODE, start + 3)
-            header = self.data[start + 3]
-            yield (
-                ((header >> 1) & 0x3F if self.format == "h265" else header & 0x1F),
-                self.data[start : stop if stop > 0 else None],
-            )
+            stop, header = self.data.find(_START_CODE, start + 3), self.data[start + 3]
+            kind = (header >> 1) & 0x3F if self.format == "h265" else header & 0x1F
+            yield kind, self.data[start : stop if stop > 0 else None]
             start = stop
 
     @property
@@ -279,14 +281,13 @@ class MessageDecoder:
             what, where = "Message cannot be decoded", f"{self._where}, topic {channel.topic}"
             raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200]) from error
         if kind in ("joints", "numbers"):
-            names = value.names if isinstance(value, Joints) else value
-            check_columns(len(names), f"{self._where}, topic {channel.topic}")
+            columns = len(value.names if isinstance(value, Joints) else value)
+            check_columns(columns, f"{self._where}, topic {channel.topic}")
         return kind, stamp_ns, value
 
     def _channel(self, channel: Channel, schema: Schema | None) -> tuple[Kind, Callable[[bytes], Any]]:
         name = schema.name if schema is not None else ""
-        # `sensor_msgs/msg/Image` and `foxglove_msgs/msg/RawImage` as `SCHEMA_KINDS` lists them.
-        kind = SCHEMA_KINDS.get(name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove."))
+        kind = schema_kind(name)
         decoder = self._decoder(channel, schema) if kind is not None else None
         if kind is None or decoder is None:
             encoding = schema.encoding if schema is not None else "no schema"
@@ -315,11 +316,10 @@ class MessageDecoder:
         if schema is not None and schema.encoding == "ros2msg" and _EMPTY_ARRAY.search(schema.data):
             what = "Schema definition has arrays of length 0, which no message needs"
             raise RejectedInputError("unknown_schema", what, where=where, got=schema.name)
+        factory = Ros2DecoderFactory() if channel.message_encoding == "cdr" else ProtobufDecoderFactory()
         try:
             with redirect_stderr(StringIO()):  # the ROS 2 parser prints the line at fault as it is
-                factories = Ros2DecoderFactory(), ProtobufDecoderFactory()
-                found = (factory.decoder_for(channel.message_encoding, schema) for factory in factories)
-                return next((decoder for decoder in found if decoder is not None), None)
+                return factory.decoder_for(channel.message_encoding, schema)
         except (*_FAULTS, *_SCHEMA_FAULTS) as error:
             what = "Schema definition cannot be read"
             raise RejectedInputError("unknown_schema", what, where=where, got=repr(error)[:200]) from error

@@ -24,6 +24,7 @@ from worldline_core.data.mcap.resampling import (
     in_order,
     in_order_with_values,
     instants,
+    median_step_ns,
     nearest,
     resampled,
     resampled_poses,
@@ -37,7 +38,6 @@ _KINDS: dict[str, tuple[Kind, ...]] = {
     "calibrations": ("calibration",),
     "readings": ("joints", "numbers"),
     "tool poses": ("pose",),
-    "transforms": ("transforms",),
 }
 _READING_MARGIN_NS = 10**9
 """Messages logged up to this long before and after an episode are read too: their own time may be within it."""
@@ -45,6 +45,8 @@ _TOGETHER_NS = 1_000_000
 """Topics that begin within a millisecond begin together: no image is left out for that."""
 _FIXED_TOLERANCE = 1e-6
 """A camera is fixed if no entry of its pose moves by more [m, or entries of R]."""
+_Signal = tuple[np.ndarray, np.ndarray]
+"""Measurements of a topic in order of time: times (n,) [ns] and values (n, d)."""
 
 
 @dataclass(frozen=True)
@@ -65,15 +67,6 @@ class Segment:
     fault: RejectedInputError | None = None
 
 
-@dataclass(frozen=True)
-class _Signal:
-    """Measurements of a topic in order of time, (n, d) at (n,)."""
-
-    topic: str
-    times_ns: np.ndarray
-    values: np.ndarray
-
-
 class _Recording:
     """Topics of one episode, before resampling; every fault is a RejectedInputError."""
 
@@ -85,7 +78,6 @@ class _Recording:
             None if start is None else max(start - _READING_MARGIN_NS, 0),
             None if stop is None else stop + _READING_MARGIN_NS,
         )
-        self.measured = [arm.state for arm in config.arms]
         self.absent: dict[str, RejectedInputError] = {}
         self.streams = self._read_streams()
         config = self.config
@@ -93,49 +85,53 @@ class _Recording:
         self.start_ns, self.stop_ns = (None if t is None else t - clocks.header_to_log_ns for t in (start, stop))
         self.signals = {readings: self._signal(readings) for readings in config.readings}
         self.tools: dict[str, _Signal] = {}
-        self.tool_frames: dict[str, str] = {}
-        """By arm: the frame of its recorded poses or, without them, the tool itself."""
+        """Poses (n, 7) by topic."""
+        self.tool_frames: list[str] = []
+        """Of each arm: the frame of its recorded poses or, without them, the tool itself."""
         for arm in config.arms:
             if arm.tool_frame is not None:
-                self.tool_frames[arm.name] = arm.tool_frame.lstrip("/")
+                self.tool_frames.append(arm.tool_frame.lstrip("/"))
             elif arm.tool_pose is not None:
-                self.tools[arm.name], self.tool_frames[arm.name] = self._tool(arm.tool_pose)
+                self.tools[arm.tool_pose], frame = self._tool(arm.tool_pose)
+                self.tool_frames.append(frame)
         self.images = {
             view: in_order(clocks.times_ns(self.streams[each.image]), self.at(each.image))
             for view, each in config.views.items()
         }
+        """Times (n,) [ns] of each view's images, and the index of each in the order of the file."""
         read = {view: self._calibration(each.calibration) for view, each in config.views.items() if each.calibration}
         reasons = {view: uncalibrated(each, rectified=config.views[view].rectified) for view, each in read.items()}
         self.uncalibrated = {view: reason for view, reason in reasons.items() if reason is not None}
         self.calibrations = {view: each for view, each in read.items() if view not in self.uncalibrated}
         self.camera_frames = {
-            view: (config.views[view].frame or read[view].frame or self.streams[config.views[view].image].frame)
-            .lstrip("/")
-            for view in self.calibrations
-        }  # fmt: skip
-        self.tree = self._transforms([*self.camera_frames.values(), *self.tool_frames.values()])
+            view: (config.views[view].frame or each.frame or self.streams[config.views[view].image].frame).lstrip("/")
+            for view, each in self.calibrations.items()
+        }
+        self.tree = self._transforms([*self.camera_frames.values(), *self.tool_frames])
 
     def at(self, topic: str) -> str:
         return f"{self.file.path}, topic {topic}"
 
     def _read_streams(self) -> dict[str, Stream]:
         """Every topic that the episode needs; a missing transform is reported where a pose needs it."""
+
+        def is_silent(topics: Collection[str]) -> RejectedInputError:
+            what, expected = "A topic has no messages during the episode", ", ".join(sorted(topics))
+            return RejectedInputError("missing_topic", what, where=self.file.path, expected=expected)
+
         topics = self.config.topics
-        wanted = {topic for role in _KINDS if role != "transforms" for topic in topics[role]}
-        self._leave_out_views(wanted - set(self.file.topics), self.file.lacks_topics)
+        self._leave_out_views(
+            {t for role in _KINDS for t in topics[role]} - set(self.file.topics), self.file.lacks_topics
+        )
         topics = self.config.topics
         roles: dict[str, tuple[Kind, ...]] = {
-            topic: kinds for role, kinds in _KINDS.items() if role != "transforms" for topic in sorted(topics[role])
+            topic: kinds for role, kinds in _KINDS.items() for topic in sorted(topics[role])
         }
         needed = set(roles) - topics["calibrations"]
-        roles |= {topic: _KINDS["transforms"] for topic in self.config.transforms if topic in self.file.topics}
+        roles |= {topic: ("transforms",) for topic in self.config.transforms if topic in self.file.topics}
         streams = self.file.streams(roles, *self.around_ns)
-        self._leave_out_views(needed - set(streams), self._is_silent)
+        self._leave_out_views(needed - set(streams), is_silent)
         return streams
-
-    def _is_silent(self, topics: Collection[str]) -> RejectedInputError:
-        what = "A topic has no messages during the episode"
-        return RejectedInputError("missing_topic", what, where=self.file.path, expected=", ".join(sorted(topics)))
 
     def _leave_out_views(self, missing: set[str], fault: Callable[[Collection[str]], RejectedInputError]) -> None:
         """Go on without the views whose images are missing. Raises: the fault of all, where anything else is missing."""
@@ -171,23 +167,18 @@ class _Recording:
                 expected=", ".join(readings.names or map(str, readings.columns or ())),
                 got=", ".join(sorted({name for v in stream.values for name in getattr(v, "names", ())})) or "an array",
             )
-        return self._ordered(stream, np.array(rows, np.float64), taken)
-
-    def _ordered(self, stream: Stream, values: np.ndarray, taken: list[int] | None = None) -> _Signal:
-        """Values (n, d) of the taken messages (default: all) in order of time."""
-        times = self.clocks.times_ns(stream)
-        times = times if taken is None else times[taken]
-        return _Signal(stream.topic, *in_order_with_values(times, values, self.at(stream.topic)))
+        times = self.clocks.times_ns(stream)[taken]
+        return in_order_with_values(times, np.array(rows, np.float64), self.at(stream.topic))
 
     def _tool(self, topic: str) -> tuple[_Signal, str]:
         """Poses (n, 7) of a topic, and the frame that they are given in."""
-        stream = self.streams[topic]
-        values = checked_poses([pose.values for pose in stream.values], "invalid_tool_pose", self.at(topic))
+        stream, where = self.streams[topic], self.at(topic)
+        values = checked_poses([pose.values for pose in stream.values], "invalid_tool_pose", where)
         frames = sorted({pose.parent for pose in stream.values})
         if len(frames) != 1:
             what = "Tool poses change their frame"
-            raise RejectedInputError("invalid_tool_pose", what, where=self.at(topic), got=", ".join(frames))
-        return self._ordered(stream, values), frames[0]
+            raise RejectedInputError("invalid_tool_pose", what, where=where, got=", ".join(frames))
+        return in_order_with_values(self.clocks.times_ns(stream), values, where), frames[0]
 
     def _calibration(self, topic: str) -> Calibration:
         """The calibration around the episode, or in the whole file where it was sent only once."""
@@ -233,28 +224,23 @@ class _Recording:
             tree.complete(read_static(config.transforms, start))
         return tree
 
-    def moving_times(self) -> list[np.ndarray]:
-        """Times of the moving transforms that cameras and tools hang on."""
-        frames = [*self.camera_frames.values(), *self.tool_frames.values()]
-        return [times for frame in frames for times in self.tree.moving_times(self.config.base_frame, frame)]
-
-    def all_signals(self) -> list[_Signal]:
-        return [*self.signals.values(), *self.tools.values()]
-
     def grid(self) -> np.ndarray:
         """(t,) instants [ns]: from the first image of the primary view after all topics have begun, until the first ends."""
         config = self.config
         # Gaps between images are judged in `chosen_images`, by the distance of instants from the nearest image.
-        topics = [(config.views[view].image, each.times_ns, float("inf")) for view, each in self.images.items()]
-        topics += [(signal.topic, signal.times_ns, config.max_gap_s) for signal in self.all_signals()]
+        topics = [(config.views[view].image, times, float("inf")) for view, (times, _) in self.images.items()]
+        topics += [(readings.topic, times, config.max_gap_s) for readings, (times, _) in self.signals.items()]
+        topics += [(topic, times, config.max_gap_s) for topic, (times, _) in self.tools.items()]
         start = min(int(times[0]) for _, times, _ in topics) if self.start_ns is None else self.start_ns
         stop = max(int(times[-1]) for _, times, _ in topics) if self.stop_ns is None else self.stop_ns
         for topic, times, max_gap_s in topics:
-            check_gaps(times, start, stop, max_gap_s=max_gap_s, max_trim_s=config.max_trim_s, where=self.at(topic))
-        everything = [*(times for _, times, _ in topics), *self.moving_times()]
+            check_gaps(times, start, stop, max_gap_s=max_gap_s, where=self.at(topic))
+        everything = [times for _, times, _ in topics]
+        for frame in (*self.camera_frames.values(), *self.tool_frames):
+            everything += self.tree.moving_times(config.base_frame, frame)
         first = max(start, *(int(times[0]) for times in everything))
         last = min(stop, *(int(times[-1]) for times in everything))
-        primary = self.images[config.timing_view].times_ns
+        primary = self.images[config.timing_view][0]
         begin = int(np.searchsorted(primary, first - _TOGETHER_NS))
         grid = instants(int(primary[begin]), last, config.fps) if begin < len(primary) else np.zeros(0, np.int64)
         if len(grid) < 2:
@@ -265,66 +251,57 @@ class _Recording:
 
     def chosen_images(self, view: str, grid: np.ndarray) -> np.ndarray:
         """(t,) the nearest image of each instant."""
-        config, arrivals = self.config, self.images[view]
+        config, (times, _) = self.config, self.images[view]
         where = self.at(config.views[view].image)
-        if arrivals.median_step_ns * config.fps > 1.25e9:
-            measured = 1e9 / arrivals.median_step_ns
+        if (step_ns := median_step_ns(times)) * config.fps > 1.25e9:
             raise RejectedInputError(
                 "wrong_fps",
                 "Camera is slower than the wanted rate",
                 where=where,
                 expected=f"{config.fps} fps",
-                got=f"{measured:.2f} fps",
+                got=f"{1e9 / step_ns:.2f} fps",
                 next_step="lower the source's fps",
-                evidence={"wanted_fps": config.fps, "measured_fps": measured},
+                evidence={"measured_fps": 1e9 / step_ns},
             )
-        chosen = nearest(arrivals.times_ns, grid)
-        distance = np.abs(arrivals.times_ns[chosen] - grid) * config.fps / 1e9
+        chosen = nearest(times, grid)
+        distance = np.abs(times[chosen] - grid) * config.fps / 1e9
         if distance.max() > config.max_image_distance_frames:
-            worst = int(np.argmax(distance))
-            at_s = float((grid[worst] - grid[0]) / 1e9)
+            at_s = float((grid[int(np.argmax(distance))] - grid[0]) / 1e9)
             raise RejectedInputError(
                 "time_gap",
                 "Images are missing",
                 where=where,
                 expected=f"an image within {config.max_image_distance_frames} frames of every instant",
                 got=f"{distance.max():.2f} frames at {at_s:.3f} s",
-                evidence={"view": view, "gap_s": float(2 * distance.max() / config.fps), "at_s": at_s},
+                evidence={"gap_s": float(2 * distance.max() / config.fps)},
             )
         return chosen
 
     def track(self, view: str, chosen: np.ndarray, camera: CameraTrack | None) -> ImageTrack:
         """The chosen images, none of which is a video frame that depends on a lost message."""
-        stream, arrivals = self.streams[self.config.views[view].image], self.images[view]
-        keys = np.array(stream.key_frames, bool)[arrivals.order] if stream.key_frames else None
-        log_ns = np.array(stream.log_ns, np.int64)[arrivals.order]
-        if keys is not None:
-            spoiled = frames_after_loss(arrivals.times_ns, arrivals.median_step_ns, keys, log_ns)[chosen]
+        stream, (times, order) = self.streams[self.config.views[view].image], self.images[view]
+        track = ImageTrack(self.file, stream, order, chosen, self.around_ns, camera)
+        if stream.kind == "video":
+            spoiled = frames_after_loss(times, median_step_ns(times), track.key_frames, track.log_ns)[chosen]
             if spoiled.any():
-                first = int(np.argmax(spoiled))
+                first, count = int(np.argmax(spoiled)), int(spoiled.sum())
                 raise RejectedInputError(
                     "truncated_video",
                     "Video frames depend on a message that is missing",
                     where=f"{self.at(stream.topic)}, frame {first}",
-                    got=f"{int(spoiled.sum())} of {len(chosen)} frames after a gap, before the next key frame",
+                    got=f"{count} of {len(chosen)} frames after a gap, before the next key frame",
                     next_step="cut the recording at the gap",
-                    evidence={"first_frame": first, "frames": int(spoiled.sum())},
+                    evidence={"first_frame": first, "frames": count},
                 )
-        return ImageTrack(
-            self.file, stream.topic, stream.kind, self.around_ns, arrivals.order, chosen, keys, log_ns, camera
-        )
+        return track
 
-    def _resampled(self, readings: TopicReadings, grid: np.ndarray) -> np.ndarray:
-        signal = self.signals[readings]
-        return resampled(signal.times_ns, signal.values, grid, hold=readings.resample == "hold")
-
-    def _check_values(self, arm: ArmReadings, grid: np.ndarray) -> None:
+    def _check_values(self, arm: ArmReadings, grid: np.ndarray, share: float) -> None:
         """Readings around the episode, in radians and as openings, are finite, of one publisher, and can be interpolated."""
         for readings in (arm.joints, arm.gripper):
-            signal, where = self.signals[readings], self.at(readings.topic)
-            first, last = np.searchsorted(signal.times_ns, grid[[0, -1]]).tolist()
+            (times, values), where = self.signals[readings], self.at(readings.topic)
+            first, last = np.searchsorted(times, grid[[0, -1]]).tolist()
             used = slice(max(first - 1, 0), last + 1)
-            times, values = signal.times_ns[used], signal.values[used]
+            times, values = times[used], values[used]
             finite: np.ndarray = np.all(np.isfinite(values), axis=1)
             if not finite.all():
                 at_s = float((times[np.argmin(finite)] - grid[0]) / 1e9)
@@ -334,23 +311,30 @@ class _Recording:
                     where=where,
                     expected="finite numbers between the episode's beginning and end",
                     got=f"{int((~finite).sum())} of {len(finite)} messages, the first at {at_s:.3f} s",
-                    evidence={"messages": int((~finite).sum()), "at_s": at_s},
+                    evidence={"at_s": at_s},
                 )
             if readings is arm.gripper:  # which may be switched: it has no speed
                 check_alternation(times, arm.gripper.range.opening(values)[0], where)
                 continue
             values = np.deg2rad(values) if arm.joints.unit == "deg" else values
-            check_alternation(times, values, where, share=0.01 if arm in self.measured else 0.05)
+            check_alternation(times, values, where, share=share)
             if readings.resample == "linear":
                 check_interpolation(times, values, where)
 
-    def arm_vectors(self, arms: Iterable[ArmReadings], grid: np.ndarray) -> tuple[np.ndarray, int]:
-        """(t, J) joints [rad] and opening of each arm, and how many openings lay outside of 0..1."""
+    def arm_vectors(self, arms: Iterable[ArmReadings], grid: np.ndarray, share: float) -> tuple[np.ndarray, int]:
+        """(t, J) joints [rad] and opening of each arm, and how many openings lay outside of 0..1.
+
+        Args:
+            share: of all messages, those that may jump to and fro (`check_alternation`).
+        """
         columns: list[np.ndarray] = [np.zeros((len(grid), 0))]
         outside = 0
         for arm in arms:
-            self._check_values(arm, grid)
-            joints, fingers = self._resampled(arm.joints, grid), self._resampled(arm.gripper, grid)
+            self._check_values(arm, grid, share)
+            joints, fingers = (
+                resampled(*self.signals[readings], grid, hold=readings.resample == "hold")
+                for readings in (arm.joints, arm.gripper)
+            )
             opening, beyond = arm.gripper.range.opening(fingers.mean(axis=1))
             columns += [np.deg2rad(joints) if arm.joints.unit == "deg" else joints, opening[:, None]]
             outside += beyond
@@ -360,11 +344,10 @@ class _Recording:
         """(t, A, 4, 4) T_base_tool where it is recorded, else None."""
         base = self.config.base_frame
         poses: list[np.ndarray] = []
-        for arm, frame in self.tool_frames.items():
+        for arm, frame in zip(self.config.arms, self.tool_frames, strict=False):
             pose = self.tree.poses(base, frame, grid) if frame != base else np.eye(4)
-            if arm in self.tools:
-                tool = self.tools[arm]
-                pose = pose @ resampled_poses(tool.times_ns, tool.values, grid)
+            if arm.tool_pose is not None:
+                pose = pose @ resampled_poses(*self.tools[arm.tool_pose], grid)
             poses.append(np.broadcast_to(pose, (len(grid), 4, 4)))
         return np.stack(poses, axis=1) if poses else None
 
@@ -374,7 +357,7 @@ def read_topics_episode(
 ) -> LoadedEpisode:
     """The episode; its images stay in the file until they are asked for. Raises: RejectedInputError."""
     recording = _Recording(config, file, segment)
-    config = recording.config
+    config, unknown = recording.config, recording.uncalibrated
     grid = recording.grid()
     chosen = {view: recording.chosen_images(view, grid) for view in config.views}
     cameras = RecordedCameras()
@@ -385,11 +368,10 @@ def read_topics_episode(
         where = f"{recording.at(topics.calibration or '')}, frame {frame}"
         calibration = recording.calibrations[view]
         add_camera(cameras, view, calibration, poses[:1] if fixed else poses, where=where, rectified=topics.rectified)
-    unknown = recording.uncalibrated
-    state, outside = recording.arm_vectors([arm.state for arm in config.arms], grid)
+    state, outside = recording.arm_vectors([arm.state for arm in config.arms], grid, share=0.01)
     action, commands = state, [arm.command for arm in config.arms if arm.command is not None]
     if commands:
-        action, beyond = recording.arm_vectors(commands, grid)
+        action, beyond = recording.arm_vectors(commands, grid, share=0.05)
         outside += beyond
     state_names: list[str] = []
     for arm in config.arms:
@@ -398,14 +380,11 @@ def read_topics_episode(
         state_names += [f"{arm.name}/{name}" for name in (*given, "gripper")]
     tools = recording.tool_poses(grid)
     episode = Episode(
+        **config.declared(scene),
         episode_id=episode_id,
-        source=config.label,
         embodiment=config.embodiment,
-        scene=scene,
-        task_family=config.task_family,
         instruction=(segment.instruction if segment.instruction is not None else config.instruction).strip(),
         outcome=segment.outcome or config.outcome,
-        split=config.split,
         fps=config.fps,
         state=state.astype(np.float32),
         action=action.astype(np.float32),

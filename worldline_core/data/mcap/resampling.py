@@ -28,6 +28,8 @@ MAX_INTERPOLATION_ERROR = 0.1
 _SAME_VALUE = 1e-3
 """Messages of one time that differ by less [rad, m] say the same: a simulation sends several per tick of its clock."""
 _FEWEST_FOR_ALTERNATION = 8
+MAX_TRIM_S = 1.0
+"""How much later a topic may begin, or earlier end, than the others; see `check_gaps`."""
 MAX_DISORDER_S = 1.0
 """A message that comes later than this behind a younger one was stamped by a clock that was set back."""
 
@@ -46,7 +48,6 @@ class Clocks:
         self.config, self.header_to_log_ns = config, 0
         if config.time == "log":
             return
-        least_ms: dict[str, float] = {}
         # A simulated clock is 0 once, a driver that sets none writes 0 always.
         unset = {topic: count for topic, stream in streams.items() if (count := _without_time(stream)) > 1}
         if unset:
@@ -57,14 +58,12 @@ class Clocks:
                 got=", ".join(f"0 in {count} of {len(streams[topic].log_ns)}" for topic, count in unset.items()),
                 next_step="set time: log",
             )
+        least_ms: dict[str, float] = {}
         for stream in streams.values():
-            if not stream.has_header or stream.kind == "calibration":
-                continue
-            delay = np.array(stream.log_ns, np.int64) - np.array(stream.stamps_ns, np.int64)
-            least_ms[stream.topic] = float(delay.min() - config.offset_ns(stream.topic)) / 1e6
-        if not least_ms:
-            return
-        skew_ms = max(least_ms.values()) - min(least_ms.values())
+            if stream.has_header and stream.kind != "calibration":
+                delay = np.array(stream.log_ns, np.int64) - np.array(stream.stamps_ns, np.int64)
+                least_ms[stream.topic] = float(delay.min() - config.offset_ns(stream.topic)) / 1e6
+        skew_ms = max(least_ms.values(), default=0.0) - min(least_ms.values(), default=0.0)
         if skew_ms > config.max_clock_skew_ms:
             raise RejectedInputError(
                 "clock_skew",
@@ -73,11 +72,10 @@ class Clocks:
                 expected=f"least delays within {config.max_clock_skew_ms} ms of each other",
                 got=", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items())),
                 next_step="declare time_offsets_ms, or set time: log",
-                evidence={"skew_ms": skew_ms, "least_delay_ms": least_ms},
+                evidence={"skew_ms": skew_ms},
             )
-        joints = [arm.state.joints.topic for arm in config.arms[:1]]
-        delays = [least_ms[topic] for topic in joints if topic in least_ms]
-        self.header_to_log_ns = round((delays[0] if delays else min(least_ms.values())) * 1e6)
+        joints = config.arms[0].state.joints.topic if config.arms else ""
+        self.header_to_log_ns = round(least_ms.get(joints, min(least_ms.values(), default=0.0)) * 1e6)
 
     def times_ns(self, stream: Stream) -> np.ndarray:
         """(n,) times of a topic's messages [ns] on the configured clock."""
@@ -91,27 +89,19 @@ def _without_time(stream: Stream) -> int:
     if stream.kind == "transforms":
         children = Counter(each.child for transforms in stream.values for each in transforms if not each.stamp_ns)
         return max(children.values(), default=0)
-    unset = stream.stamps_ns.count(0)
-    return 0 if stream.kind == "calibration" else unset
+    return 0 if stream.kind == "calibration" else stream.stamps_ns.count(0)
 
 
-@dataclass(frozen=True)
-class Arrivals:
-    """Messages of a topic in order of time.
+def median_step_ns(times_ns: np.ndarray) -> float:
+    """Between ascending times (n,); 0 for a single one."""
+    return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
 
-    Attributes:
-        times_ns: (n,) strictly ascending; of messages with the same time the first is kept.
-        order: (n,) index of each message in the order of the file.
-        median_step_ns: 0 for a single message.
+
+def in_order(times_ns: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Strictly ascending times (n,) of those given in the order of the file, and the index of each; the first of one time is kept.
+
+    Raises: RejectedInputError (clock_jump) for a time more than MAX_DISORDER_S out of order.
     """
-
-    times_ns: np.ndarray
-    order: np.ndarray
-    median_step_ns: float
-
-
-def in_order(times_ns: np.ndarray, where: str) -> Arrivals:
-    """Sorts times (n > 0,) given in the order of the file; more than MAX_DISORDER_S out of order is a clock_jump."""
     back_s = (np.maximum.accumulate(times_ns) - times_ns) / 1e9
     if back_s.max() > MAX_DISORDER_S:
         first = int(np.argmax(back_s > MAX_DISORDER_S))
@@ -124,9 +114,7 @@ def in_order(times_ns: np.ndarray, where: str) -> Arrivals:
             next_step="set time: log, if the recorder's clock is sound, or cut the recording at the jump",
             evidence={"message": first, "jump_s": float(back_s.max())},
         )
-    times, order = np.unique(times_ns, return_index=True)
-    steps = np.diff(times)
-    return Arrivals(times, order, float(np.median(steps)) if len(steps) else 0.0)
+    return np.unique(times_ns, return_index=True)
 
 
 @np.errstate(invalid="ignore", over="ignore")  # values that are not finite are refused later
@@ -135,29 +123,21 @@ def in_order_with_values(times_ns: np.ndarray, values: np.ndarray, where: str) -
 
     Raises: RejectedInputError: clock_jump; conflicting_messages for one time with different values.
     """
-    arrivals = in_order(times_ns, where)
-    kept = values[arrivals.order][np.searchsorted(arrivals.times_ns, times_ns)]
+    times, order = in_order(times_ns, where)
+    kept = values[order][np.searchsorted(times, times_ns)]
     empty = np.isnan(kept) & np.isnan(values)
     differs = ~((np.abs(kept - values) <= _SAME_VALUE) | (kept == values) | empty).all(axis=1)
     if differs.any():
-        raise _conflict(
-            "Messages of one time have different values",
-            where=f"{where}, message {int(np.argmax(differs))}",
-            got=f"{int(differs.sum())} messages, by up to {np.nanmax(np.abs(kept - values)):.3f}",
-            evidence={"messages": int(differs.sum())},
-        )
-    return arrivals.times_ns, values[arrivals.order]
+        got = f"{int(differs.sum())} messages, by up to {np.nanmax(np.abs(kept - values)):.3f}"
+        where = f"{where}, message {int(np.argmax(differs))}"
+        raise _conflict("Messages of one time have different values", where, got)
+    return times, values[order]
 
 
-def _conflict(what: str, *, where: str, got: str, evidence: Mapping[str, float]) -> RejectedInputError:
+def _conflict(what: str, where: str, got: str) -> RejectedInputError:
+    next_step = "record the topic with one publisher, or declare another topic (a command that steps: resample: hold)"
     return RejectedInputError(
-        "conflicting_messages",
-        what,
-        where=where,
-        expected="one publisher",
-        got=got,
-        next_step="record the topic with one publisher, or declare another topic (a command that steps: resample: hold)",
-        evidence=evidence,
+        "conflicting_messages", what, where=where, expected="one publisher", got=got, next_step=next_step
     )
 
 
@@ -184,15 +164,10 @@ def check_alternation(times_ns: np.ndarray, values: np.ndarray, where: str, *, s
     at_once = (taken_back(1) & (np.abs(jumps) > 0.01)).any(axis=1)
     fast = np.abs(jumps) > max(0.05, 100 * float(np.median(np.diff(times_ns)) / 1e9) ** 2)
     soon = (np.logical_or.reduce([taken_back(after) for after in range(1, 5)]) & fast).any(axis=1)
-    alternates = at_once.sum() >= (count - 2) / 2 or (share is not None and soon.sum() >= max(3, share * count))
-    if alternates:
-        found = int(max(at_once.sum(), soon.sum()))
-        raise _conflict(
-            "Values of a topic jump to and fro, as those of two publishers",
-            where=where,
-            got=f"{found} of {count} messages, by up to {np.abs(jumps[at_once | soon]).max():.3f}",
-            evidence={"messages": found},
-        )
+    if at_once.sum() >= (count - 2) / 2 or (share is not None and soon.sum() >= max(3, share * count)):
+        found, largest = max(at_once.sum(), soon.sum()), np.abs(jumps[at_once | soon]).max()
+        what = "Values of a topic jump to and fro, as those of two publishers"
+        raise _conflict(what, where, f"{found} of {count} messages, by up to {largest:.3f}")
 
 
 @np.errstate(over="ignore")
@@ -207,16 +182,13 @@ def check_interpolation(times_ns: np.ndarray, values: np.ndarray, where: str) ->
     errors = (steps**2 / 8 * np.maximum(bends[1:], bends[:-1])).max(axis=1)
     worst = int(np.argmax(errors))
     if errors[worst] > MAX_INTERPOLATION_ERROR:
-        raise _conflict(
-            "Values of a topic cannot be interpolated",
-            where=f"{where}, {(times_ns[worst] - times_ns[0]) / 1e9:.3f} s after its first message",
-            got=f"an error of about {errors[worst]:.3f}, allowed {MAX_INTERPOLATION_ERROR}",
-            evidence={"error": float(errors[worst]), "limit": MAX_INTERPOLATION_ERROR},
-        )
+        where = f"{where}, {(times_ns[worst] - times_ns[0]) / 1e9:.3f} s after its first message"
+        got = f"an error of about {errors[worst]:.3f}, allowed {MAX_INTERPOLATION_ERROR}"
+        raise _conflict("Values of a topic cannot be interpolated", where, got)
 
 
 def check_gaps(
-    times_ns: np.ndarray, start_ns: int, stop_ns: int, *, max_gap_s: float, max_trim_s: float, where: str
+    times_ns: np.ndarray, start_ns: int, stop_ns: int, *, max_gap_s: float, where: str, max_trim_s: float = MAX_TRIM_S
 ) -> None:
     """Raises: RejectedInputError (time_gap) when messages (n > 0, ascending) are missing for too long between start and stop:
     `max_gap_s` between two of them, `max_trim_s` before the first and after the last."""
@@ -237,7 +209,7 @@ def check_gaps(
                 where=where,
                 expected=f"at most {allowed:.3f} s",
                 got=f"{seconds:.3f} s from {(at_ns - start_ns) / 1e9:.3f} s on",
-                evidence={"gap_s": float(seconds), "allowed_s": float(allowed), "at_s": (at_ns - start_ns) / 1e9},
+                evidence={"gap_s": float(seconds)},
             )
 
 
@@ -249,11 +221,9 @@ def instants(start_ns: int, stop_ns: int, fps: float) -> np.ndarray:
 
 def nearest(times_ns: np.ndarray, grid_ns: np.ndarray) -> np.ndarray:
     """(t,) index of the measurement nearest to each instant; of two equally near ones the earlier."""
-    if len(times_ns) == 1:
-        return np.zeros(len(grid_ns), dtype=np.int64)
-    right = np.clip(np.searchsorted(times_ns, grid_ns), 1, len(times_ns) - 1)
-    earlier = grid_ns - times_ns[right - 1] <= times_ns[right] - grid_ns
-    return np.where(earlier, right - 1, right)
+    right = np.searchsorted(times_ns, grid_ns).clip(0, len(times_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(grid_ns - times_ns[left] <= times_ns[right] - grid_ns, left, right)
 
 
 def resampled(times_ns: np.ndarray, values: np.ndarray, grid_ns: np.ndarray, *, hold: bool = False) -> np.ndarray:

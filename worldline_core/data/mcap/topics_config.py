@@ -26,7 +26,7 @@ class TopicReadings(StrictModel):
 
     @model_validator(mode="after")
     def _one_choice(self) -> TopicReadings:
-        chosen = self.names if self.names is not None else self.columns
+        chosen = self.names or self.columns
         if (self.names is None) == (self.columns is None) or not chosen:
             raise ValueError(f"{self.topic}: give either names or columns, at least one")
         if len(set(chosen)) != len(chosen) or any(column < 0 for column in self.columns or ()):
@@ -35,7 +35,7 @@ class TopicReadings(StrictModel):
 
     @property
     def width(self) -> int:
-        return len(self.names if self.names is not None else self.columns or ())
+        return len(self.names or self.columns or ())
 
 
 class JointTopic(TopicReadings):
@@ -99,7 +99,6 @@ class TimeRange(StrictModel):
     name: str = Field(min_length=1)
     start_s: float = Field(ge=0)
     stop_s: float = Field(gt=0)
-    file: str = Field(default="*", description="shell pattern of the files, counted from the source's folder")
     instruction: str | None = None
 
     @model_validator(mode="after")
@@ -157,9 +156,6 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
         default=1.5, gt=0, description="of an image from its instant; 1.5 lets two images in a row be lost"
     )
     max_gap_s: float = Field(default=0.2, gt=0, description="largest interval between joint readings or transforms")
-    max_trim_s: float = Field(
-        default=1.0, ge=0, description="how much later a topic may begin, or earlier end, than the others"
-    )
     max_clock_skew_ms: float = Field(
         default=200.0, gt=0, description="between the least delays (log time minus header time) of topics"
     )
@@ -173,10 +169,9 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
             )
         if names and names not in (["left"], ["right"], ["left", "right"]):
             raise ValueError(f"arms are {names}; expected left before right, each once")
-        commanded = [arm.command is not None for arm in self.arms]
-        if len(set(commanded)) > 1:
+        if len({arm.command is None for arm in self.arms}) > 1:
             raise ValueError("either all arms have commands or none")
-        if commanded and not commanded[0] and self.without_commands == "refuse":
+        if names and self.arms[0].command is None and self.without_commands == "refuse":
             raise ValueError("no arm has commands: give their topics, or say without_commands: repeat_state")
         if len({arm.tool_frame is None and arm.tool_pose is None for arm in self.arms}) > 1:
             raise ValueError("either all arms have tool poses or none")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from operator import itemgetter
 from pathlib import PurePosixPath
 from typing import Literal
@@ -175,7 +174,7 @@ class McapTopicsSource:
         if segment.fault is not None:
             raise segment.fault
         file = recording.open(self._root)
-        return read_topics_episode(self._config, file, segment, episode_id, self._config.scene or stem)
+        return read_topics_episode(self._config, file, segment, episode_id, stem)
 
 
 def _segments(rule: WholeFiles | TimeRanges | Markers, recording: _Recording, root: AnyPath) -> Iterator[Segment]:
@@ -183,11 +182,10 @@ def _segments(rule: WholeFiles | TimeRanges | Markers, recording: _Recording, ro
     if isinstance(rule, WholeFiles):
         yield Segment()
     elif isinstance(rule, TimeRanges):
+        first = recording.open(root).first_log_ns
         for part in rule.ranges:
-            if fnmatchcase(recording.name, part.file):
-                first = recording.open(root).first_log_ns
-                start, stop = (first + round(seconds * 1e9) for seconds in (part.start_s, part.stop_s))
-                yield Segment(part.name, start, stop, part.instruction)
+            start, stop = (first + round(seconds * 1e9) for seconds in (part.start_s, part.stop_s))
+            yield Segment(part.name, start, stop, part.instruction)
     else:
         yield from _between_markers(rule, recording.open(root))
 
