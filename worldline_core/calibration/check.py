@@ -79,9 +79,8 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
         raise ConfigError("The file configures no source", where=path, expected="a section `curate` with `sources`")
     config = load_config(CurateConfig, path=path, overrides=overrides, section="curate")
     descriptions = (values.get("render_actions") or {}).get("description_paths") or {}
-    return episodes_of_sources(config.sources, config.reader), {
-        str(name): str(file) for name, file in descriptions.items()
-    }
+    files = {str(name): str(file) for name, file in descriptions.items()}
+    return episodes_of_sources(config.sources, config.reader), files
 
 
 def episodes_of_sources(sources: Iterable[SourceConfig], limits: ReaderLimits) -> list[ListedEpisode]:
@@ -104,20 +103,15 @@ def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
     episodes = EpisodeSet.open(folder)
 
     def load(position: int) -> LoadedEpisode:
-        return LoadedEpisode(
-            episodes.episode(position),
-            tuple(episodes.rows[position].views),
-            clips={view: episodes.clip(position, view) for view in episodes.rows[position].views},
-        )
+        views = tuple(episodes.rows[position].views)
+        clips = {view: episodes.clip(position, view) for view in views}
+        return LoadedEpisode(episodes.episode(position), views, clips=clips)
 
     return [ListedEpisode(row.episode_id, row.source, partial(load, i)) for i, row in enumerate(episodes.rows)]
 
 
 def check_calibration(
-    listed: Sequence[ListedEpisode],
-    output: Path,
-    *,
-    descriptions: Mapping[str, str] | None = None,
+    listed: Sequence[ListedEpisode], output: Path, *, descriptions: Mapping[str, str] | None = None
 ) -> CalibrationCheck:
     """Diagnoses episodes one after another and writes the result; one that cannot be read or judged is listed with its reason.
 
@@ -155,10 +149,11 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName) 
         arms, note = _kinematics_of(episode, kinematics)
         notes = (note,) if note else ()
         diagnosis = diagnose(episode, frames, arms)
-    except RejectedInputError as error:
-        return EpisodeCheck(item.episode_id, item.source, None, error.reason, _one_line(error))
     except DataError as error:
-        return EpisodeCheck(item.episode_id, item.source, None, "unreadable", _one_line(error))
+        reason = error.reason if isinstance(error, RejectedInputError) else "unreadable"
+        details = (("expected", error.expected), ("got", error.got))
+        said = "; ".join([error.what, *(f"{name} {value}" for name, value in details if value is not None)])
+        return EpisodeCheck(item.episode_id, item.source, None, reason, said)
     picture: str | None = f"pictures/{safe_stem(diagnosis.episode_id)}.jpg"
     try:
         write_bytes_atomic(output / picture, jpeg_bytes(diagnosis_picture(diagnosis, episode, frames, arms)))
@@ -193,11 +188,6 @@ def episode_images(loaded: LoadedEpisode, view: str) -> MadeFrames:
         check_length("Video", where, states=expected, unit="frames", found=found)
 
     return MadeFrames(counted, (expected,), np.uint8)
-
-
-def _one_line(error: DataError) -> str:
-    details = (("expected", error.expected), ("got", error.got))
-    return "; ".join([error.what, *(f"{name} {value}" for name, value in details if value is not None)])
 
 
 def _sum_up(listed: Sequence[ListedEpisode], checked: Sequence[EpisodeCheck]) -> Iterator[SourceDiagnosis]:

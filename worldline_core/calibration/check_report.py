@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import textwrap
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -119,17 +119,12 @@ def verdict_text(found: Conclusion) -> str:
     if found.verdict == "off":
         said = f"off: {', '.join(map(str, found.off))}"
     elif found.verdict == "consistent" and found.camera_errors:
-        said += f" within {', '.join(f'{bound} ({view})' for view, bound in _bounds(found))}"
+        # How far the robot may be from its place in the picture; of a wrist camera, by how much it may be turned.
+        shown = [(e.view, e.kinds[-1] if e.shown is not None else e.kinds[0]) for e in found.camera_errors]
+        said += f" within {', '.join(f'{kind.bound:.1f} {kind.unit} ({view})' for view, kind in shown)}"
     elif found.verdict == "consistent":
         said += " by its poses, but no picture says within what"
     return f"{said}; not judged: {', '.join(found.not_judged)}" if found.not_judged else said
-
-
-def _bounds(found: Conclusion) -> Iterator[tuple[str, str]]:
-    """By view, how far the robot may be from its place in the picture; of a wrist camera, by how much it may be turned."""
-    for error in found.camera_errors:
-        shown = error.kinds[-1] if error.shown is not None else error.kinds[0]
-        yield error.view, f"{shown.bound:.1f} {shown.unit}"
 
 
 def table_text(check: CalibrationCheck) -> str:
@@ -145,7 +140,14 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
     parts = [f"{count} {words(name)}" for name, count in check.counted.items()]
     lines = [f"{len(check.episodes)} episodes: {', '.join(parts)}"]
     for found in check.sources:
-        lines += ["", source_headline(found), f"  single episodes say: {votes_text(found)}"]
+        said = verdict_text(found)
+        if found.verdict == "mixed":
+            said += ": its episodes were not written the same way, no line is right for all of them"
+        elif found.verdict == "explained":
+            said += f" by {found.best.mistake if found.best.other is None else found.best.text}"
+        lines += ["", f"source {found.source}, {found.num_episodes} episodes together: {said}"]
+        votes = sorted(found.votes.items(), key=lambda item: (-item[1], item[0]))
+        lines.append(f"  single episodes say: {', '.join(f'{words(n)} {count}' for n, count in votes) or 'nothing'}")
         for error in found.camera_errors:
             bounds = [f"{each.kind} {each.bound:.1f} {each.unit}" for each in error.kinds]
             lines.append(f"  {error.view} within: {', '.join(bounds)}")
@@ -180,22 +182,6 @@ def _single_episodes(check: CalibrationCheck) -> list[str]:
     return [*header, *lines] if lines else []
 
 
-def source_headline(found: SourceDiagnosis) -> str:
-    """The conclusion over a source in one line."""
-    said = verdict_text(found)
-    if found.verdict == "mixed":
-        said += ": its episodes were not written the same way, no line is right for all of them"
-    elif found.verdict == "explained":
-        said += f" by {found.best.mistake if found.best.other is None else found.best.text}"
-    return f"source {found.source}, {found.num_episodes} episodes together: {said}"
-
-
-def votes_text(found: SourceDiagnosis) -> str:
-    """Verdicts and mistakes of the single episodes, the most frequent first."""
-    ordered = sorted(found.votes.items(), key=lambda item: (-item[1], item[0]))
-    return ", ".join(f"{words(name)} {count}" for name, count in ordered) or "nothing"
-
-
 def as_json(check: CalibrationCheck) -> dict[str, Any]:
     """Everything in plain values; numbers that are not finite become null."""
     episodes = []
@@ -207,8 +193,7 @@ def as_json(check: CalibrationCheck) -> dict[str, Any]:
     names = ("source", "num_episodes", "votes", "config_lines")
     sources = [{name: getattr(found, name) for name in names} | _conclusion_json(found) for found in check.sources]
     content = {"consistent": check.consistent, "episodes": episodes, "sources": sources}
-    numbers = TypeAdapter(Any, config=ConfigDict(ser_json_inf_nan="null"))
-    return json.loads(numbers.dump_json(content, fallback=lambda value: np.asarray(value).tolist()))
+    return json.loads(TypeAdapter(Any, config=ConfigDict(ser_json_inf_nan="null")).dump_json(content))
 
 
 def _conclusion_json(found: Conclusion) -> dict[str, Any]:

@@ -86,7 +86,7 @@ class Explanation:
     def text(self) -> str:
         """The departures with their values: "camera_axes: opengl, views: [head]"."""
         lines = [line.removeprefix(".") for line in self.conventions.config_lines("")]
-        return ", ".join(lines + ([": ".join(self.other)] if self.other is not None else [])) or "as recorded"
+        return ", ".join(lines if self.other is None else [*lines, ": ".join(self.other)]) or "as recorded"
 
     @property
     def lag_at_edge(self) -> bool:
@@ -97,11 +97,12 @@ class Explanation:
     @property
     def key(self) -> frozenset[tuple[str, str]]:
         """Identity of the reading over episodes, with any tool offset that each of them estimates."""
-        items = {(name, str(getattr(self.conventions, name))) for name in self.conventions.departures}
+        values = {name: str(getattr(self.conventions, name)) for name in self.conventions.departures}
+        if "tool_offset_z_m" in values:
+            values["tool_offset_z_m"] = ""
         if self.conventions.image_lag_frames and self.conventions.views is not None:
-            items.add(("views", str(self.conventions.views)))
-        items = {("tool_offset_z_m", "") if name == "tool_offset_z_m" else (name, value) for name, value in items}
-        return frozenset(items if self.other is None else items | {self.other})
+            values["views"] = str(self.conventions.views)
+        return frozenset([*values.items(), *([] if self.other is None else [self.other])])
 
 
 NOTHING_TRIED = Explanation(RecordedConventions(), 0.0, {})
@@ -139,10 +140,11 @@ class Conclusion:
     def with_camera_errors[C: Conclusion](self: C, errors: tuple[CameraError, ...], *, together: bool = False) -> C:
         """With the cameras' errors; consistent becomes `off` where one is significant (`together`: over a source), and
         `mixed` where the episodes of a source contradict each other."""
-        off = significant(errors, together=together)
-        verdict = "off" if off and self.verdict == "consistent" else self.verdict
-        if self.verdict == "consistent" and any(e.contradicting > tolerated_episodes(e.episodes) for e in errors):
+        off, verdict = significant(errors, together=together), self.verdict
+        if verdict == "consistent" and any(e.contradicting > tolerated_episodes(e.episodes) for e in errors):
             verdict = "mixed"
+        elif verdict == "consistent" and off:
+            verdict = "off"
         return replace(self, verdict=verdict, camera_errors=errors, off=off)
 
 
@@ -223,8 +225,7 @@ def decide(as_recorded: Explanation, ranked: Sequence[Explanation]) -> tuple[Ver
             and not set(other.departures) & set(best.departures)
             and (len(best.departures) > 1 or not bad_terms(other, as_recorded))
         ]
-        near = [other for other in ranked if _of_fewer_views(other, best)]
-        in_doubt = [other.text for other in near if best.score - other.score < VIEWS_COST]
+        in_doubt = [o.text for o in ranked if _of_fewer_views(o, best) and best.score - o.score < VIEWS_COST]
         rivals += in_doubt
         if not rivals:
             return ("unexplained", as_recorded, []) if best.lag_at_edge else ("explained", best, [])
@@ -265,7 +266,7 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
     verdict: VerdictName = "mixed"
     best = as_recorded
     if sound and not rivals and not sound[0].tried[0].lag_at_edge:
-        verdict, best = "explained", sound[0].summed(as_recorded.score)
+        verdict, best = "explained", _summed(sound[0].tried, as_recorded.score + sound[0].gain)
     elif sound or votes["unexplained"] > count / 2:
         verdict = "unexplained"
     elif count - votes["consistent"] - votes["off"] <= tolerated_episodes(count):
@@ -289,9 +290,7 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
 
 def _judged_in_none(diagnoses: Sequence[Diagnosis]) -> dict[str, str]:
     """The views that no episode's pictures judge, and why."""
-    views = dict.fromkeys(view for diagnosis in diagnoses for view in diagnosis.not_judged)
-    reasons = {view: [d.not_judged.get(view) for d in diagnoses] for view in views}
-    return {view: why[0] for view, why in reasons.items() if why[0] is not None and None not in why}
+    return {view: why for view, why in diagnoses[0].not_judged.items() if all(view in d.not_judged for d in diagnoses)}
 
 
 _Key = frozenset[tuple[str, str]]
@@ -302,7 +301,8 @@ class _SourceReading:
     """One reading over all episodes of a source.
 
     `gain` is its score above that of the recordings as written, `healthy` the number of episodes that are healthy under it,
-    `contradicting` of those that fit as written, or under another reading, but not under this one.
+    `contradicting` of those that fit as written, or under another reading, but not under this one. It `wins` if it is clearly
+    better than the recordings as written, and most are healthy under it.
     """
 
     def __init__(self, key: _Key, listed: list[Diagnosis], by_key: list[_ByKey]) -> None:
@@ -310,7 +310,7 @@ class _SourceReading:
         self.tried = [found[key] for found in by_key if key in found]
         tolerated = MIN_MARGIN + COMPLEXITY * len(key)
         self.scores: list[float] = []
-        self.gains: list[float] = []
+        gains: list[float] = []
         self.healthy = self.contradicting = 0
         for diagnosis, found in zip(listed, by_key, strict=True):
             as_recorded = diagnosis.as_recorded
@@ -318,24 +318,16 @@ class _SourceReading:
             bad = bool(bad_terms(own, as_recorded))
             self.scores.append(own.score)
             gain = own.score - as_recorded.score - unjudged_gain(own, as_recorded)
-            self.gains.append(float(np.clip(gain, -MAX_GAIN, MAX_GAIN)))
+            gains.append(float(np.clip(gain, -MAX_GAIN, MAX_GAIN)))
             self.healthy += not bad
             fits = diagnosis.verdict in ("consistent", "off")
             worse = fits and own.score < as_recorded.score - tolerated
             unseen = fits and self.names & ESTIMATED and key not in found
             bad_here = bad and (fits or diagnosis.verdict == "explained")
             self.contradicting += bool(worse or unseen or bad_here)
-
-    @property
-    def gain(self) -> float:
-        return sum(self.gains)
-
-    @property
-    def wins(self) -> bool:
-        """True for a reading that is clearly better than the recordings as written, and under which most are healthy."""
-        count = len(self.gains)
-        enough = self.gain >= MIN_MARGIN + 0.5 * count and self.healthy > count / 2
-        return enough and (count < FEWEST_SHOWING or self.gain - max(self.gains) >= MIN_MARGIN)
+        self.gain, count = sum(gains), len(gains)
+        alone = count >= FEWEST_SHOWING and self.gain - max(gains) < MIN_MARGIN  # one episode shows it, and no other
+        self.wins = self.gain >= MIN_MARGIN + 0.5 * count and self.healthy > count / 2 and not alone
 
     def regret(self, others: list[_SourceReading]) -> float:
         """Score of the best of several readings above this one, summed over the episodes."""
@@ -346,9 +338,6 @@ class _SourceReading:
         """True for another mistake that explains the episodes as well as the best one."""
         near = self.regret(others) - best.regret(others) < RIVAL_MARGIN * len(self.scores)
         return near and not self.names & best.names
-
-    def summed(self, score_as_written: float) -> Explanation:
-        return _summed(self.tried, score_as_written + self.gain)
 
 
 def _instead_of(key: _Key, found: _ByKey) -> Explanation:
@@ -368,7 +357,7 @@ def _nearest(readings: list[_SourceReading], count: int) -> tuple[str, ...]:
     """The readings that are healthy in most episodes, then those with the best scores; one for each mistake."""
     best: dict[str, str] = {}
     for reading in sorted((r for r in readings if r.gain > 0), key=lambda r: (-r.healthy, r.regret(readings))):
-        found = reading.summed(0.0)
+        found = _summed(reading.tried, reading.gain)
         best.setdefault(found.mistake, f"{found.text}: healthy in {reading.healthy} of {count} episodes")
     return tuple(list(best.values())[:NEAREST_SHOWN])
 
