@@ -7,6 +7,7 @@ An episode is observed, read as recorded and under one mistake at a time, and ev
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache
 
@@ -65,6 +66,10 @@ REMEDIES = {
     "wrist_extrinsics": "Each wrist camera has the other's extrinsics: exchange the two where the source is written",
     "wrist_videos": "Each wrist video is the other hand's: exchange the two where the source is written",
 }
+_FIXED_MISTAKES = tuple(RecordedConventions.model_validate({field: value}) for field, value in (
+    ("extrinsics", "base_to_camera"), ("camera_axes", "opengl"), ("extrinsics_unit", "mm"), ("pose_unit", "mm"),
+    ("quaternion", "wxyz"), ("euler", "moving_xyz"), ("angle_unit", "deg"), ("arms", "exchanged"), ("gripper", "inverted"),
+))  # fmt: skip
 _CAMERA_FIELDS = ("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size")
 _COMMON_SIZES = (
     (1080, 1920), (1200, 1920), (720, 1280), (800, 1280), (960, 1280), (768, 1024), (600, 960), (600, 800), (540, 960),
@@ -98,14 +103,11 @@ def diagnose(
         notes = (f"The recording has no {missing}: nothing can be compared",)
         return Diagnosis(verdict="too_little_evidence", notes=notes, episode_id=name)
     search = _Search(observation, recorded)
-    silent = not_judged(observation)
+    diagnosis = Diagnosis(verdict="consistent", episode_id=name, not_judged=not_judged(observation))
     if quick and (unsuspicious := search.unsuspicious()) is not None:
-        diagnosis = Diagnosis(
-            verdict="consistent", best=unsuspicious, ranked=(unsuspicious,), episode_id=name, not_judged=silent
-        )
+        diagnosis = replace(diagnosis, best=unsuspicious, ranked=(unsuspicious,))
         return diagnosis.with_camera_errors(estimate_camera_errors(observation, recorded))
-    as_recorded = search.as_recorded
-    notes = notes_on(observation, recorded)
+    as_recorded, notes = search.as_recorded, notes_on(observation, recorded)
     ranked = sorted([as_recorded, *search.singles()], key=lambda e: -e.score)
     if bad_terms(as_recorded):
         if search.is_suspicious(ranked[0]):
@@ -115,32 +117,25 @@ def diagnose(
             ranked = sorted([*ranked, *search.other_robots()], key=lambda e: -e.score)
     verdict, best, rivals = decide(as_recorded, ranked)
     if ranked[0].lag_at_edge and verdict == "unexplained":
-        notes = (*notes, f"{ranked[0].text}: at the edge of what is tried; the lag may be larger")
+        notes.append(f"{ranked[0].text}: at the edge of what is tried; the lag may be larger")
     if verdict == "unexplained":
-        notes = (*notes, *(f"{view}: its pictures stay the same while its arm moves" for view in search.frozen))
+        notes += [f"{view}: its pictures stay the same while its arm moves" for view in search.frozen]
     near = ranked[0] if verdict == "consistent" and ranked[0].score - as_recorded.score >= MIN_MARGIN else best
     if near is not best and unjudged_gain(near, as_recorded) > 0.0:
-        notes = (*notes, f"{near.text} would fit the poses better; without pictures this is not judged")
+        notes.append(f"{near.text} would fit the poses better; without pictures this is not judged")
     if rivals:
-        notes = (*notes, f"These explain it equally well, nothing recorded tells which: {'; '.join(rivals)}")
+        notes.append(f"These explain it equally well, nothing recorded tells which: {'; '.join(rivals)}")
     if best.other is not None:
-        notes = (*notes, REMEDIES[best.other[0]].format(best.other[1], episode.embodiment))
+        notes.append(REMEDIES[best.other[0]].format(best.other[1], episode.embodiment))
     if near.conventions.camera_lag_frames < 0 and recorded.action_tools is None:
-        notes = (*notes, "The camera poses lead the states; they may follow the commands: give the kinematics to see")
+        notes.append("The camera poses lead the states; they may follow the commands: give the kinematics to see")
     travel = np.linalg.norm(np.diff(recorded.tools[..., :3, 3], axis=0), axis=-1).sum(axis=0).max()
     if verdict == "consistent" and travel < MIN_TRAVEL_M and not observable_views(observation):
         verdict = "too_little_evidence"
-        notes = (*notes, "No tool moves and no picture changes: a mistake would leave no trace")
+        notes.append("No tool moves and no picture changes: a mistake would leave no trace")
     nearest = nearest_texts(ranked, as_recorded) if verdict == "unexplained" else ()
-    diagnosis = Diagnosis(
-        verdict=verdict,
-        best=best,
-        ranked=tuple(ranked),
-        notes=notes,
-        nearest=nearest,
-        episode_id=name,
-        not_judged=silent,
-    )
+    found = {"verdict": verdict, "best": best, "ranked": tuple(ranked), "notes": tuple(notes), "nearest": nearest}
+    diagnosis = replace(diagnosis, **found)
     reading = search.read(best.conventions) if best.other is None else None
     return diagnosis if reading is None else diagnosis.with_camera_errors(estimate_camera_errors(observation, reading))
 
@@ -184,10 +179,9 @@ class _Search:
         found = self.explain(self.recorded, {**self.recorded_poses, **images})
         if min(self.recorded_poses.values(), default=0.0) < SUSPICION or bad_terms(found):
             return None
-        inverted = self.read(RecordedConventions(gripper="inverted"))
-        if inverted is not None:
-            as_written, other = (gripper_terms(observation, reading) for reading in (self.recorded, inverted))
-            if sum(other.values()) > sum(as_written.values()):
+        if (inverted := self.read(RecordedConventions(gripper="inverted"))) is not None:
+            written, other = (sum(gripper_terms(observation, each).values()) for each in (self.recorded, inverted))
+            if other > written:
                 return None
         for lag in image_lags(observation):
             other = image_terms(observation, self.recorded.with_image_lag(lag), wrist_flow=False)
@@ -204,9 +198,8 @@ class _Search:
         quick = image_terms(exchanged, self.recorded, wrist_flow=False)
         if sum(quick.values()) < sum(images.values()) - EXCHANGED_DOUBT:
             return False
-        both = (image_terms(o, self.recorded) for o in (exchanged, self.observation))
-        gain, written = (sum(terms.values()) for terms in both)
-        return gain > written
+        other, own = (sum(image_terms(each, self.recorded).values()) for each in (exchanged, self.observation))
+        return other > own
 
     def read(self, conventions: RecordedConventions) -> Reading | None:
         """The episode under these conventions; None where they do not apply."""
@@ -246,12 +239,9 @@ class _Search:
         episode = self.observation.episode
         if len(views) != 2 or not all(view in episode.cameras for view in views):
             return
-        one, two = (episode.cameras[view] for view in views)
-        cameras = {
-            views[0]: replace(one, T_base_camera=two.T_base_camera),
-            views[1]: replace(two, T_base_camera=one.T_base_camera),
-        }
-        exchanged = replace(episode, cameras=dict(episode.cameras) | cameras)
+        poses = {one: episode.cameras[two].T_base_camera for one, two in (views, views[::-1])}
+        cameras = {view: replace(episode.cameras[view], T_base_camera=each) for view, each in poses.items()}
+        exchanged = replace(episode, cameras=episode.cameras | cameras)
         observations = {"wrist_extrinsics": replace(self.observation, episode=exchanged)}
         if (videos := self.observation.with_exchanged_wrists()) is not None:
             observations["wrist_videos"] = videos
@@ -276,8 +266,7 @@ class _Search:
             if name == kinematics.embodiment.name:
                 continue
             episode = replace(observation.episode, embodiment=name)
-            arms = arms_of(episode, robot)
-            other = replace(observation, episode=episode, arms=arms, kinematics=robot)
+            other = replace(observation, episode=episode, arms=arms_of(episode, robot), kinematics=robot)
             for found in self.as_written(other, ("embodiment", name)):
                 unknown = sum(v for term, v in self.as_recorded.evidence.items() if term not in found.evidence)
                 yield replace(found, score=found.score + unknown)
@@ -307,7 +296,7 @@ class _Search:
         """Two mistakes at once: one of the best single ones, with another or with the numbers estimated beside it."""
         first: dict[str, Explanation] = {}
         for explanation in ranked:
-            if explanation.mistake != "none" and explanation.other is None:
+            if explanation.departures and explanation.other is None:
                 first.setdefault(explanation.mistake, explanation)
         ones = list(first.values())[:PAIRED_MISTAKES]
         found: dict[RecordedConventions, Explanation] = {}
@@ -318,8 +307,7 @@ class _Search:
             others = [two.conventions for two in ones[number + 1 :]]
             for conventions in (*others, *self.numbers_beside(undone)):
                 both = _together(one.conventions, conventions)
-                reading = None if both is None or both in found else self.read(both)
-                if both is not None and reading is not None:
+                if both is not None and both not in found and (reading := self.read(both)) is not None:
                     found[both] = self.explain(reading, self.terms(reading))
         return list(found.values())
 
@@ -338,7 +326,7 @@ class _Search:
         if late := _best_lag(scores):
             yield RecordedConventions(image_lag_frames=late)
         if offset := tool_offset(self.observation, undone):
-            yield RecordedConventions(tool_offset_z_m=round(offset, 4))
+            yield RecordedConventions(tool_offset_z_m=offset)
 
 
 def _of_view(evidence: Mapping[str, float], view: str) -> float:
@@ -364,40 +352,26 @@ def _layout(embodiment: Embodiment) -> tuple[tuple[str, int], ...]:
 @lru_cache(maxsize=4)
 def robots_like(layout: tuple[tuple[str, int], ...]) -> tuple[ArmKinematics, ...]:
     """The available robots with these arms (view of the wrist camera, number of joints)."""
-    found = []
+    found: list[ArmKinematics] = []
     for name in embodiment_names():
-        try:
+        with suppress(ConfigError, UnavailableError):  # a package without its description, or none at all
             embodiment = load_embodiment(name)
             if _layout(embodiment) == layout:
                 found.append(ArmKinematics(embodiment))
-        except (ConfigError, UnavailableError):  # a package without its description, or none at all
-            continue
     return tuple(found)
 
 
 def conventions_to_try(observation: Observation, recorded: Reading) -> list[RecordedConventions]:
     """One mistake each, without image lags (see `image_lags`), most of them with a fixed value."""
-    fixed = [
-        RecordedConventions(extrinsics="base_to_camera"),
-        RecordedConventions(camera_axes="opengl"),
-        RecordedConventions(extrinsics_unit="mm"),
-        RecordedConventions(pose_unit="mm"),
-        RecordedConventions(quaternion="wxyz"),
-        RecordedConventions(euler="moving_xyz"),
-        RecordedConventions(angle_unit="deg"),
-        RecordedConventions(arms="exchanged"),
-        RecordedConventions(gripper="inverted"),
-    ]
     episode, kinematics = observation.episode, observation.kinematics
-    found = [c for c in fixed if applicable(episode, c.departures[0])]
+    found = [c for c in _FIXED_MISTAKES if applicable(episode, c.departures[0])]
     if kinematics is not None and episode.state_kind == "joints":
         unequal = len({len(arm.joints) for arm in kinematics.embodiment.arms}) > 1
         found = [c for c in found if not (unequal and c.arms == "exchanged")]
     found += [RecordedConventions(intrinsics_size=size) for size in intrinsics_sizes(episode.cameras)]
     found += [RecordedConventions(camera_lag_frames=lag) for lag in camera_lags(observation, recorded)]
-    offset = tool_offset(observation, recorded)
-    if offset is not None:
-        found.append(RecordedConventions(tool_offset_z_m=round(offset, 4)))
+    if (offset := tool_offset(observation, recorded)) is not None:
+        found.append(RecordedConventions(tool_offset_z_m=offset))
     return found
 
 
@@ -409,12 +383,12 @@ def image_lags(observation: Observation) -> list[int]:
 
 def camera_lags(observation: Observation, recorded: Reading) -> list[int]:
     """The lags at which moving wrist cameras are most rigid against states and commands, and their neighbours."""
-    lags: list[int] = []
+    lags: dict[int, None] = {}
     for tools in (recorded.tools, recorded.action_tools):
         if tools is not None and (scores := _camera_lag_scores(observation, recorded, tools)):
             best = _best_lag(scores)
-            lags += [lag for lag in (best, best - 1, best + 1) if lag in scores]
-    return [lag for lag in dict.fromkeys(lags) if lag != 0]
+            lags |= dict.fromkeys(lag for lag in (best, best - 1, best + 1) if lag in scores and lag != 0)
+    return list(lags)
 
 
 def _best_lag(scores: Mapping[int, float]) -> int:
@@ -444,10 +418,9 @@ def intrinsics_sizes(cameras: Mapping[str, CameraTrack]) -> list[tuple[int, int]
     """Image sizes (height, width) that would centre a camera's principal point, where it is elsewhere."""
     sizes: list[tuple[int, int]] = []
     for camera in cameras.values():
-        K = camera.K
-        height, width = 2 * K[1, 2] + 1, 2 * K[0, 2] + 1
+        height, width = 2 * camera.K[1, 2] + 1, 2 * camera.K[0, 2] + 1
         same = abs(np.log(max(height, 1.0) / camera.height)) + abs(np.log(max(width, 1.0) / camera.width))
-        if not np.isfinite(K).all() or min(height, width) < 8 or same < SAME_INTRINSICS_SIZE:
+        if not np.isfinite(camera.K).all() or min(height, width) < 8 or same < SAME_INTRINSICS_SIZE:
             continue
         common = [s for s in _COMMON_SIZES if max(abs(s[0] / height - 1), abs(s[1] / width - 1)) < INTRINSICS_SNAP]
         size = min(common, key=lambda s: abs(s[0] / height - 1) + abs(s[1] / width - 1), default=None)
@@ -462,9 +435,9 @@ def tool_offset(observation: Observation, recorded: Reading) -> float | None:
 
     From the joints' kinematics where the recording has both, else from wrist cameras with a stated mount.
     """
-    offsets: list[float] = []
     if observation.episode.T_base_ee is None:
         return None
+    offsets: list[float] = []
     if recorded.kinematic_tools is not None:
         apart = rigid_inverse(recorded.tools) @ recorded.kinematic_tools
         offsets = [float(np.median(apart[:, i, 2, 3])) for i in range(apart.shape[1])]
@@ -478,7 +451,7 @@ def tool_offset(observation: Observation, recorded: Reading) -> float | None:
     if not offsets:
         return None
     offset = float(np.median(offsets))
-    return offset if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None
+    return round(offset, 4) if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None
 
 
 def not_judged(observation: Observation) -> dict[str, str]:
@@ -497,9 +470,9 @@ def not_judged(observation: Observation) -> dict[str, str]:
     return found
 
 
-def notes_on(observation: Observation, recorded: Reading) -> tuple[str, ...]:
+def notes_on(observation: Observation, recorded: Reading) -> list[str]:
     """Limits of the evidence, and other facts for a person."""
-    notes = []
+    notes: list[str] = []
     for view, i in observation.wrists.items():
         camera, commands = recorded.cameras.get(view), recorded.action_tools
         if camera is None or commands is None:
@@ -512,8 +485,8 @@ def notes_on(observation: Observation, recorded: Reading) -> tuple[str, ...]:
                 f"not the states ({1e3 * states_m:.1f} mm)"
             )
     if recorded.gripper is None:
-        notes.append("gripper: the state names no gripper columns, polarity is not judged")
-    for i, arm in enumerate(observation.arms if recorded.gripper is not None else ()):
+        return [*notes, "gripper: the state names no gripper columns, polarity is not judged"]
+    for i, arm in enumerate(observation.arms):
         if finger_flow(observation, recorded, i) is None and stopped_share(recorded, i) is None:
             notes.append(f"gripper {arm.name}: does not move enough to be seen, polarity is not judged")
-    return tuple(notes)
+    return notes
