@@ -104,16 +104,13 @@ class KindOfError:
     @property
     def half_interval(self) -> float:
         """Half of the 95 % interval of the size; of a vector, of its end in any direction."""
-        return self._deviations_95 * float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+        deviations = {1: 1.96, 2: 2.45, 3: 2.80}[len(self.estimate)]
+        return deviations * float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
 
     @property
     def bound(self) -> float:
         """Upper bound (95 %) of an error that can have gone unseen."""
         return self.size + self.half_interval
-
-    @property
-    def _deviations_95(self) -> float:
-        return {1: 1.96, 2: 2.45, 3: 2.80}[len(self.estimate)]
 
 
 def kinds_of_error(estimate: np.ndarray, covariance: np.ndarray, shown: np.ndarray | None) -> tuple[KindOfError, ...]:
@@ -183,18 +180,16 @@ class CameraError:
             alike = [each.kind for each in self.kinds if each.kind in KINDS and each.size > each.half_interval]
         if "translation" in alike:  # a turn does nearly the same to a robot at one distance
             alike.append("rotation")
-        focal = next(each for each in self.kinds if each.kind == "focal length")
         # Where a turn and a shift look alike, the focal length that goes with them is known no better.
+        focal = self.kinds[list(KINDS).index("focal length")]
         if best <= LEFT_OVER and len(alike) > 1 and focal.half_interval > FOCAL_KNOWN:
             alike.append(focal.kind)
         return tuple(name for name in left if name in alike)
 
     def __str__(self) -> str:
         named = [str(each) for each in self.kinds if each.kind in self.named]
-        seen = [
-            f"{each.size:.1f} ± {each.half_interval:.1f} {each.unit}" for each in self.kinds if each.kind not in KINDS
-        ]
-        return f"{self.view} {' or '.join(named) or 'in several ways'}{''.join(f' ({each})' for each in seen)}"
+        seen = [f" ({str(each).removeprefix(f'{each.kind} ')})" for each in self.kinds if each.kind not in KINDS]
+        return f"{self.view} {' or '.join(named) or 'in several ways'}{''.join(seen)}"
 
 
 @dataclass(frozen=True)
@@ -228,8 +223,7 @@ class StillView:
         certainty: np.ndarray | None = None,
     ) -> None:
         """points: (n + 1, p, 3), radii: (p,) [m]; motion of the n steps, and how far its flow is trusted (n, r, c), 0 to 1."""
-        self.camera, self.points, self.radii = camera, points, radii
-        self.certainty = certainty
+        self.camera, self.points, self.radii, self.certainty = camera, points, radii, certainty
         change = np.log1p(np.maximum(motion.change - NOISE_CHANGE, 0.0))
         self.measured = np.concatenate([motion.flow, change[..., None]], axis=-1).astype(np.float32)
         self._by_blur: dict[float, np.ndarray] = {}
@@ -604,11 +598,9 @@ def estimate_camera_errors(observation: Observation, reading: Reading) -> tuple[
         gray, camera = observation.gray[view][images.start : images.stop + 1 : every], reading.cameras[view]
         if len(gray) <= MIN_IMAGE_PAIRS:
             continue
-        if every == 1:
-            motion = observation.motion(view)
-            motion = Motion(motion.flow[images], motion.change[images], motion.texture[images])
-        else:
-            motion = measured_motion(gray)
+        motion = observation.motion(view)
+        motion = Motion(motion.flow[images], motion.change[images], motion.texture[images])
+        motion = motion if every == 1 else measured_motion(gray)
         points = reading.points[frames]
         if view not in observation.wrists:
             found.append(_estimate(view, StillView(camera, points, reading.radii, motion), shared, every))

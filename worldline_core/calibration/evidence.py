@@ -10,7 +10,6 @@ episodes of the shipped recordings, so decisions rest on differences between rea
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from worldline_core.calibration.observation import (
     CLEAR_CHANGE,
     LONGEST_STEP_PX,
     Observation,
-    ObservedArm,
     Reading,
     cell_centres,
     predict_motion,
@@ -27,14 +25,6 @@ from worldline_core.calibration.observation import (
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
 from worldline_core.geometry.transforms import hand_eye_residual, lengths, rigid_inverse, rotation_angle_deg
-
-
-class Typical(NamedTuple):
-    """A correlation that healthy recordings reach, and the number of independent samples behind it."""
-
-    value: float
-    samples: float
-
 
 # Poses; standard deviations of healthy recordings, unless they are limits.
 WORST_TERM, WORST_HAND_EYE_TERM, WORST_FACING_TERM = -40.0, -60.0, -15.0
@@ -53,10 +43,12 @@ FACING_DEG, FACING_SPREAD_DEG = 45.0, 10.0
 # Pictures.
 MIN_IMAGE_PAIRS = 8
 """Fewer pictures are no evidence."""
-ARM_FLOW, ARM_CHANGE = Typical(0.92, 20), Typical(0.74, 20)
-TOOL_FLOW, TOOL_CHANGE = Typical(0.96, 14), Typical(0.5, 14)
+Typical = tuple[float, float]
+"""A correlation that healthy recordings reach, and the number of independent samples behind it."""
+ARM_FLOW, ARM_CHANGE = (0.92, 20.0), (0.74, 20.0)
+TOOL_FLOW, TOOL_CHANGE = (0.96, 14.0), (0.5, 14.0)
 """The same where only tool poses are recorded."""
-WRIST_FLOW, WRIST_ENERGY = Typical(0.55, 12), Typical(0.8, 8)
+WRIST_FLOW, WRIST_ENERGY = (0.55, 12.0), (0.8, 8.0)
 FINGERS, FINGER_LINKS = (0.75, 0.4), (0.5, 0.3)
 """Correlation that healthy recordings reach, and its standard deviation."""
 FLOW_TURN_DEG, WORST_TURN_TERM = 8.0, -12.0
@@ -100,13 +92,11 @@ def pose_terms(observation: Observation, reading: Reading) -> dict[str, float]:
         terms[f"intrinsics {view}"] = _intrinsics(camera)
         terms[f"camera place {view}"] = _place(camera.T_base_camera)
         if view in observation.wrists:
-            i = observation.wrists[view]
-            terms |= _wrist(reading, camera, i, observation.arms[i])
+            terms |= _wrist(observation, reading, camera)
         else:
             terms[f"in view {view}"] = -30.0 * max(0.0, 0.6 - in_view_share(reading, camera))
-            up = float(
-                np.median(camera.T_base_camera[:, 2, 1])
-            )  # of the image's down: pictures are taken the right way up
+            # Pictures are taken the right way up: the image's down does not point upwards.
+            up = float(np.median(camera.T_base_camera[:, 2, 1]))
             terms[f"upright {view}"] = -6.0 * float(np.clip((up - 0.2) / 0.3, 0.0, 1.0))
     return terms
 
@@ -127,18 +117,18 @@ def _quadratic(*ratios: float) -> float:
     return max(WORST_TERM, -0.5 * float(sum(ratio**2 for ratio in ratios)))
 
 
-def _wrist(reading: Reading, camera: CameraTrack, i: int, arm: ObservedArm) -> dict[str, float]:
-    view = camera.view
+def _wrist(observation: Observation, reading: Reading, camera: CameraTrack) -> dict[str, float]:
+    view, i = camera.view, observation.wrists[camera.view]
+    stated = observation.arms[i].T_tool_mount
     poses = camera.poses(np.arange(len(reading.tools)))
     mount, metres, degrees = rms_hand_eye(reading.tools[:, i], poses)
-    residual_term = hand_eye_log_likelihood(metres, degrees)
+    terms = {f"hand-eye {view}": hand_eye_log_likelihood(metres, degrees)}
     if reading.action_tools is not None:
-        _, by_action_m, by_action_deg = rms_hand_eye(reading.action_tools[:, i], poses)
-        followed = hand_eye_log_likelihood(by_action_m, by_action_deg) - FOLLOWS_COMMANDS_COST
-        residual_term = max(residual_term, followed)
-    terms = {f"hand-eye {view}": residual_term}
-    if arm.T_tool_mount is not None:
-        offset, turned = mount_offset(mount, arm.T_tool_mount)
+        _, *by_action = rms_hand_eye(reading.action_tools[:, i], poses)
+        followed = hand_eye_log_likelihood(*by_action) - FOLLOWS_COMMANDS_COST
+        terms[f"hand-eye {view}"] = max(terms[f"hand-eye {view}"], followed)
+    if stated is not None:
+        offset, turned = mount_offset(mount, stated)
         terms[f"mount {view}"] = _quadratic(offset / MOUNT_M, turned / MOUNT_DEG)
     # Wherever it is mounted, a wrist camera is near its tool and looks at it.
     tool = rigid_inverse(mount)[:3, 3]
@@ -191,12 +181,11 @@ def in_view_share(reading: Reading, camera: CameraTrack) -> float:
 
 def _joint_range(observation: Observation, reading: Reading) -> float:
     """Low for joints beyond the robot's limits, or beyond two turns where no limits are known."""
-    state = reading.episode.state.astype(np.float64)
-    if observation.kinematics is not None:
-        outside = observation.kinematics.embodiment.outside_limits(state, tolerance_rad=0.1)
-    else:
-        outside = np.abs(state) > 4 * np.pi
-    return WORST_TERM * float(np.clip(outside.any(axis=1).mean(), 0.0, 1.0))
+    state, kinematics = reading.episode.state.astype(np.float64), observation.kinematics
+    outside = np.abs(state) > 4 * np.pi
+    if kinematics is not None:
+        outside = kinematics.embodiment.outside_limits(state, tolerance_rad=0.1)
+    return WORST_TERM * float(outside.any(axis=1).mean())
 
 
 def _kinematics(by_joints: np.ndarray, recorded: np.ndarray) -> float:
@@ -225,7 +214,8 @@ def image_terms(observation: Observation, reading: Reading, *, wrist_flow: bool 
             terms[f"turn {view}"] = weight * turn_log_likelihood(turn_deg)
             terms[f"flow {view}"] = weight * correlation_log_likelihood(flow, typical[0])
             terms[f"change {view}"] = weight * correlation_log_likelihood(change, typical[1])
-        energy = energy_correlation(observation, reading, view)
+        speed, changes = speed_and_change(observation, reading, view)
+        energy = correlation(speed, changes.mean(axis=(1, 2))) if len(speed) >= 8 else 0.0
         terms[f"energy {view}"] = correlation_log_likelihood(energy, WRIST_ENERGY)
     return terms
 
@@ -247,23 +237,29 @@ def frozen_views(observation: Observation, reading: Reading) -> list[str]:
     for view in observation.episode.cameras:
         if len(observation.gray.get(view, ())) <= MIN_IMAGE_PAIRS:
             continue
-        states, images = reading.steps(observation.num_images, view)
-        same = observation.motion(view).change[images].max(axis=(1, 2)) < FROZEN_CHANGE
-        own = observation.wrists.get(view)
-        speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
+        speed, change = speed_and_change(observation, reading, view)
+        same = change.max(axis=(1, 2)) < FROZEN_CHANGE
         travel = longest = 0.0
         for still, step in zip(same, speed, strict=True):
             travel = travel + step if still else 0.0
             longest = max(longest, travel)
-        if longest > (FROZEN_TRAVEL_M if own is None else FROZEN_WRIST_TRAVEL_M):
+        if longest > (FROZEN_WRIST_TRAVEL_M if view in observation.wrists else FROZEN_TRAVEL_M):
             found.append(view)
     return found
 
 
+def speed_and_change(observation: Observation, reading: Reading, view: str) -> tuple[np.ndarray, np.ndarray]:
+    """Of the steps of a view: speed (s,) of what moves it (its own arm, or the fastest), and change of its cells (s, r, c)."""
+    states, images = reading.steps(observation.num_images, view)
+    own = observation.wrists.get(view)
+    speed = reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own]
+    return speed[states], observation.motion(view).change[images]
+
+
 def correlation_log_likelihood(correlation: float, typical: Typical) -> float:
     """Log-likelihood of a Gaussian residual with this correlation, relative to a typical recording; flat below 0."""
-    r = float(np.clip(correlation, 0.0, 0.995))
-    return typical.samples / 2 * float(np.log(1 - typical.value**2) - np.log(1 - r**2))
+    r, (value, samples) = float(np.clip(correlation, 0.0, 0.995)), typical
+    return samples / 2 * float(np.log(1 - value**2) - np.log(1 - r**2))
 
 
 def turn_log_likelihood(turn_deg: float) -> float:
@@ -340,15 +336,6 @@ def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) 
     return cosine(np.concatenate(measured), np.concatenate(expected))
 
 
-def energy_correlation(observation: Observation, reading: Reading, view: str) -> float:
-    """Correlation over time of the speed of what moves a view (its own arm, or the fastest) with its mean change."""
-    states, images = reading.steps(observation.num_images, view)
-    own = observation.wrists.get(view)
-    speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
-    change = observation.motion(view).change[images].mean(axis=(1, 2))
-    return correlation(speed, change) if len(speed) >= 8 else 0.0
-
-
 def gripper_terms(observation: Observation, reading: Reading) -> dict[str, float]:
     """Log-likelihood terms of the grippers by name; none where none moves."""
     terms: dict[str, float] = {}
@@ -404,8 +391,7 @@ def _moves(observation: Observation, reading: Reading, arm: int) -> bool:
 
 def finger_flow(observation: Observation, reading: Reading, arm: int) -> float | None:
     """Correlation (-1..1) of the flow away from the projected tool point, near it, with the growth of the opening."""
-    view = observation.arms[arm].wrist_view
-    kinematics = observation.kinematics
+    view, kinematics = observation.arms[arm].wrist_view, observation.kinematics
     if kinematics is not None and len(kinematics.embodiment.arms[arm].gripper.finger_joints) == 1:
         return None  # one jaw moves, so flow is not away from the middle
     if reading.gripper is None or not _moves(observation, reading, arm):

@@ -139,9 +139,9 @@ def _small(image: np.ndarray) -> np.ndarray:
         raise DataError(
             "Images have a wrong shape", expected="uint8 (H, W, 3) or (H, W)", got=f"{image.dtype} {image.shape}"
         )
-    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     if image.ndim == 2 and image.shape[1] == GRAY_WIDTH:
         return image
+    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height = max(2, round(image.shape[0] * GRAY_WIDTH / image.shape[1]))
     return cv2.resize(gray, (GRAY_WIDTH, height), interpolation=cv2.INTER_AREA)
 
