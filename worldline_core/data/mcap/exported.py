@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -29,7 +30,7 @@ from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.plain_files import expect_layout, parse_json
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.mcap.file import ImageTrack, McapFile, Stream
-from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, Transform
+from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind
 from worldline_core.data.mcap.resampling import add_camera
 from worldline_core.data.video.frames import Frames, MadeFrames, in_step
 from worldline_core.errors import DataError
@@ -329,12 +330,10 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
     joints = {name: _all_of(streams, f"/joint_{name}s", num_frames, file) for name in ("state", "command")}
     images = {view: _all_of(streams, f"/{view}/image", video_frames, file) for view in views}
     masks = {view: _track(file, streams[topic]) for view in views if (topic := f"/{view}/robot_mask") in streams}
-    poses: dict[str, list[Transform]] = {}
-    messages = [
-        message for topic in ("/tf", STATIC_TRANSFORMS) if topic in streams for message in streams[topic].values
-    ]
-    for transform in (transform for message in messages for transform in message):
-        poses.setdefault(transform.child, []).append(transform)
+    poses: dict[str, list[tuple[float, ...]]] = {}
+    for stream in (streams[topic] for topic in ("/tf", STATIC_TRANSFORMS) if topic in streams):
+        for transform in chain.from_iterable(stream.values):
+            poses.setdefault(transform.child, []).append(transform.values)
 
     cameras = RecordedCameras()
     for view in moving:
@@ -385,8 +384,8 @@ def _track(file: McapFile, stream: Stream, camera: CameraTrack | None = None) ->
     return ImageTrack(file, stream, every, every, camera=camera)
 
 
-def _poses(found: Mapping[str, list[Transform]], child: str, count: int, file: McapFile) -> np.ndarray:
-    where, values = f"{file.path}, frame {child}", np.array([each.values for each in found.get(child, [])], np.float64)
+def _poses(found: Mapping[str, list[tuple[float, ...]]], child: str, count: int, file: McapFile) -> np.ndarray:
+    where, values = f"{file.path}, frame {child}", np.array(found.get(child, []), np.float64)
     if len(values) != count:
         what = "Transforms are missing"
         raise RejectedInputError("missing_calibration", what, where=where, expected=count, got=len(values))

@@ -52,8 +52,6 @@ _DAMAGE = (
 )  # fmt: skip
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_BYTES = 9 + 20
-# Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
-_SMALLEST_BYTES = 2 * len(_MAGIC) + _FOOTER_BYTES
 _PNG = b"\x89PNG"
 _MAX_PARAMETER_SETS = 64
 # ROS and Foxglove name -> bytes per pixel, and OpenCV's conversion to RGB.
@@ -239,10 +237,7 @@ class McapFile:
         """A reader of the open file, by its index where the summary has one."""
         if indexed is None:
             indexed = self._summary is not None and bool(self._summary.chunk_indexes and self._summary.channels)
-        path = regular_file(self.path, "MCAP file")
-        with _reading(self.path), path.open("rb") as stream:
-            if path.stat().st_size < _SMALLEST_BYTES:
-                raise EOFError(f"{path.stat().st_size} bytes")
+        with _reading(self.path), regular_file(self.path, "MCAP file").open("rb") as stream:
             kind = SeekingReader if indexed else NonSeekingReader
             yield kind(stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
 
