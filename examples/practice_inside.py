@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from worldline_core import WorldLine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment.environment import WorldLineVectorEnv
 from worldline_core.environment.mujoco_world import MujocoEnv
@@ -72,10 +73,11 @@ Try = Callable[[Sequence[tuple[str, np.ndarray]]], list[float]]
 """Scores of attempts, each a start and the commands that are given there."""
 
 
-def inside(recordings: Path, embodiment: str, model: Path | None, batch: int) -> Try:
-    """The judge's soft score of predicted videos."""
+def inside(recordings: Path, embodiment: str, model: Path | None, members: Sequence[Path], batch: int) -> Try:
+    """The judge's soft score of predicted videos, with further models, in one step each, the lowest of all."""
+    others = [WorldLine.from_pretrained(folder, steps=1) for folder in members]
     env = WorldLineVectorEnv(
-        batch, model=model, recordings=recordings, embodiment=embodiment, episode_frames=FRAMES, success=None,
+        batch, model=model, members=others, recordings=recordings, embodiment=embodiment, episode_frames=FRAMES, success=None,
         reward="soft", autoreset=False,
     )  # fmt: skip
 
@@ -138,6 +140,9 @@ def main() -> None:
     parser.add_argument("--policy", default="biased")
     parser.add_argument("--embodiment", default="ur5e_silver")
     parser.add_argument("--model", type=Path, help="a causal or Stage II checkpoint; by default the shipped causal one")
+    parser.add_argument(
+        "--members", type=Path, nargs="*", default=[], help="further models: the lowest soft score counts"
+    )
     parser.add_argument("--starts", type=int, default=6, help="starts of the search; the others are held out")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--population", type=int, default=16)
@@ -154,7 +159,8 @@ def main() -> None:
         return float(np.mean(outside([(start, controller.shifted(start, shift)) for start in held_out])))
 
     found = {"task": options.task, "seed": options.seed, "held_out": len(held_out), "before": success(np.zeros(3))}
-    worlds = {"inside": inside(options.recordings, options.embodiment, options.model, options.batch), "mujoco": outside}
+    simulator = inside(options.recordings, options.embodiment, options.model, options.members, options.batch)
+    worlds = {"inside": simulator, "mujoco": outside}
     for world, attempt in worlds.items():
         print(world, flush=True)
         means = cross_entropy(

@@ -233,6 +233,32 @@ def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLin
 
 
 @pytest.mark.slow
+def test_a_further_model_bounds_what_one_model_promises(world: WorldLine, shipped: Path) -> None:
+    """Two models side by side are the two alone: the lower score, their difference, and a success that both see."""
+    options: dict[str, Any] = {"episode_frames": 32, "embodiment": ROBOT, "reward": "soft", "splits": ("test", "ood_test")}
+    stage2 = WorldLine.from_pretrained(shipped / "models" / "stage2", steps=1)
+    given = {"model": world, "members": [stage2]}
+    alone = [WorldLineVectorEnv(5, model=model, **options) for model in (world, stage2)]
+    doubting = WorldLineVectorEnv(5, **given, largest_disagreement=0.05, **options)
+    bounded = WorldLineVectorEnv(5, **given, **options)
+    environments = [*alone, doubting, bounded]
+    found: list[Any] = [environment.reset(seed=0)[1] for environment in environments]
+    before, rewards = found[3]["score"], np.zeros((2, 5))
+    for command in commands(bounded.starts, list(range(5)), 32):
+        steps = [environment.step(command) for environment in environments]
+        rewards += [steps[2][1], steps[3][1]]
+        found = [step[4] for step in steps]
+        doubted = found[2].get("doubted", np.zeros(5, bool))
+        assert not steps[2][1][doubted & (rewards[0] != rewards[1])].any()
+    scores = np.array([one["score"] for one in found[:2]])
+    np.testing.assert_allclose(found[3]["score"], scores.min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found[3]["disagreement"], np.ptp(scores, axis=0), atol=1e-6)
+    np.testing.assert_allclose(rewards[1], found[3]["score"] - before, atol=1e-6)
+    assert found[3]["is_success"].tolist() == (found[0]["is_success"] & found[1]["is_success"]).tolist()
+    assert not found[3]["doubted"].any()
+
+
+@pytest.mark.slow
 def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> None:
     """Replayed in the environment, recorded episodes end as they did: all of five but one at least."""
     environment = WorldLineVectorEnv(5, model=world, episode_frames=32, embodiment=ROBOT, splits=("test", "ood_test"))

@@ -12,10 +12,14 @@ a recording that is named, with what happened before it: the robot's motion, and
 ``episode_frames`` steps, where a judge looks at the whole video: ``is_success``, and a reward of 1. What the judge cannot see is no
 success. The soft reward comes with every new picture instead: what it adds to the likelihood that the task is done, so that an
 episode's sum is the likelihood at its end less that at its beginning.
+
+An optimised policy finds what one model gets wrong. Further models (``members``) are given the same commands: a success must be one
+in every video, and the soft score is the lowest of all, a lower bound that no single model's error raises.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,7 +40,7 @@ from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.rollout.observation import project_controls
 from worldline_core.rollout.recorded_starts import RecordedStart, RecordedStarts
-from worldline_core.rollout.simulation import Frames, Simulation
+from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Simulation
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.shipped import shipped_folder
 
@@ -95,7 +99,13 @@ class CommandedSimulation:
 
 @dataclass
 class RunningEpisode:
-    """One running episode: its video up to the last whole block, the newest picture, the robot's state, and the last reward."""
+    """One running episode: its video up to the last whole block, the newest picture, the robot's state, and the last reward.
+
+    Attributes:
+        score: the soft score; with further models the lowest of all.
+        disagreement: the highest soft score less the lowest, 0..1; NaN without further models.
+        doubted: the models disagreed too much, so the episode earns nothing more.
+    """
 
     start: RecordedStart
     video: Trajectory
@@ -105,17 +115,30 @@ class RunningEpisode:
     reward: float = 0.0
     score: float = 0.0
     facts: dict[str, float] = field(default_factory=dict)
+    disagreement: float = math.nan
+    doubted: bool = False
 
     def info(self) -> dict[str, Any]:
         """Gymnasium's info."""
-        known = {"is_success": self.success, "episode_id": self.start.episode_id, "task": self.start.instruction}
-        return known | ({"score": self.score, "task_state": dict(self.facts)} if self.facts else {})
+        known: dict[str, Any] = {"is_success": self.success, "episode_id": self.start.episode_id}
+        known["task"] = self.start.instruction
+        if self.facts:
+            known |= {"score": self.score, "task_state": dict(self.facts)}
+        if not math.isnan(self.disagreement):
+            known |= {"disagreement": self.disagreement, "doubted": self.doubted}
+        return known
 
-    def look(self, segmenter: Segmenter, video: Trajectory) -> None:
-        """Measure how far the task is in the video so far; the reward is the change."""
+    def look(self, segmenter: Segmenter, video: Trajectory, others: Sequence[float] = ()) -> None:
+        """Measure how far the task is in the video so far; the reward is the change.
+
+        Args:
+            others: soft scores of the other models' videos.
+        """
         before = self.score
-        self.score, self.facts = soft_score(segmenter, video)
-        self.reward = self.score - before
+        own, self.facts = soft_score(segmenter, video)
+        self.score = min(own, *others) if others else own
+        self.disagreement = max(own, *others) - self.score if others else math.nan
+        self.reward = 0.0 if self.doubted else self.score - before
 
 
 def longer(video: Trajectory, clip: Mapping[str, np.ndarray], points: np.ndarray | None) -> Trajectory:
@@ -131,6 +154,10 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
     Args:
         model: a Stage II or causal checkpoint, or a ``WorldLine``; by default the shipped causal one.
+        members: further ones, whose videos are judged as well: a success is one in all, the soft score is the lowest. Observations
+            are of ``model``.
+        largest_disagreement: of soft scores (``disagreement`` in the infos); an episode with more is ``doubted``: it earns nothing
+            more. A batch ends early where all of its episodes are doubted, so a single environment at once.
         recordings: an EpisodeSet, whose first frames are the starts; by default the shipped one.
         embodiment, splits: of the recordings that are used; ``embodiment`` may be left out where all are of one robot.
         views: that are simulated, one of the sets that the model was trained on; by default the largest.
@@ -147,7 +174,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         options: further arguments of ``WorldLine.from_pretrained``.
 
     Raises:
-        ConfigError: ``observe_every`` does not divide the block, or a number is not positive.
+        ConfigError: ``observe_every`` does not divide the block, a number is not positive, members predict at another rate, or
+            there is nothing that could disagree.
         DataError: no recording fits, or there is no such start or frame.
     """
 
@@ -156,6 +184,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         num_envs: int = 1,
         *,
         model: Path | str | WorldLine | None = None,
+        members: Sequence[Path | str | WorldLine] = (),
+        largest_disagreement: float | None = None,
         recordings: Path | str | None = None,
         embodiment: str | None = None,
         splits: Sequence[str] = ("test",),
@@ -181,6 +211,11 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                 got=f"num_envs {num_envs}, episode_frames {episode_frames}, success {success}, reward {reward}",
                 expected="at least one environment and frame; success: measured, a function, or None; reward: success or soft",
             )  # fmt: skip
+        if largest_disagreement is not None and not (members and reward == "soft" and 0 <= largest_disagreement <= 1):
+            raise ConfigError(
+                "No disagreement can be measured", where="largest_disagreement", got=largest_disagreement,
+                expected="members, the soft reward, and a number from 0 to 1",
+            )  # fmt: skip
         shipped = shipped_folder()
         self.world = (
             model
@@ -204,6 +239,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             "render_modes": ["rgb_array"], "render_fps": round(self.world.contract.fps),
             "autoreset_mode": AutoresetMode.NEXT_STEP if autoreset else AutoresetMode.DISABLED,
         }  # fmt: skip
+        self._largest_disagreement = 1.0 if largest_disagreement is None else largest_disagreement
         self._random = [np.random.default_rng() for _ in range(num_envs)]
         self._episodes: list[RunningEpisode] = []
         self._running = self._begun([0], self._chosen([0], each_start(None, self._usual_start, 1)))
@@ -214,6 +250,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                 "observe_every does not divide a block of the model",
                 expected=f"observe_every a divisor of {self.frames_per_step}", got=f"observe_every {self.observe_every}",
             )  # fmt: skip
+        self._members = [self._member(other, recordings, splits, options) for other in members]
         self.spaces = RobotSpaces(
             self.kinematics.embodiment, self.views, self.world.image_size, flat=flat_observation,
             normalised=normalised_actions,
@@ -241,14 +278,14 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         Raises: DataError: the commands have another shape or are not finite, or the episodes have ended or not begun.
         """
         commands = self.spaces.commands(actions, self.num_envs)
-        over = self._running.age == self.episode_frames
+        over = self._over
         if not self._episodes or (over and not self._autoreset):
             raise DataError("An episode has ended or not begun", next_step="call reset first")
         if over:
             self._begin([None] * self.num_envs, each_start(None, self._usual_start, self.num_envs))
         else:
             self._advance(commands)
-        last = self._running.age == self.episode_frames
+        last = self._over
         success = np.array([episode.success for episode in self._episodes])
         rewards = np.array([episode.reward for episode in self._episodes])
         return self._observation(), rewards, success, last & ~success, self._infos()
@@ -275,6 +312,32 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         """An attribute of every environment."""
         return self.call(name)
 
+    @property
+    def _over(self) -> bool:
+        doubted = [episode.doubted for episode in self._episodes]
+        return self._running.age == self.episode_frames or (bool(doubted) and all(doubted))
+
+    def _member(
+        self,
+        model: Path | str | WorldLine,
+        recordings: Path | str | None,
+        splits: Sequence[str],
+        options: dict[str, Any],
+    ) -> WorldLineVectorEnv:
+        """The same episodes in another model, which judges at least as often."""
+        world = model if isinstance(model, WorldLine) else WorldLine.from_pretrained(model, **options)
+        if world.contract.fps != self.world.contract.fps:
+            raise ConfigError(
+                "A member predicts at another rate", where="members", expected=f"{self.world.contract.fps:g} frames per second",
+                got=f"{world.contract.fps:g}",
+            )  # fmt: skip
+        return WorldLineVectorEnv(
+            self.num_envs, model=world, recordings=recordings, embodiment=self.starts.embodiment, splits=splits,
+            views=self.views, episode_frames=self.episode_frames, success=self._succeeds,
+            observe_every=math.gcd(self.observe_every, world.unit(USUAL_CLIP_FRAMES)),
+            reward="success" if self._segmenter is None else "soft", limits=self._limits,
+        )  # fmt: skip
+
     def _chosen(self, seeds: Sequence[int], asked: Sequence[tuple[str | None, int]]) -> list[RecordedStart]:
         """The start of each episode: the one that is asked for, or that of its seed."""
         numbered = (self.starts.rows[seed % len(self.starts)].episode_id for seed in seeds)
@@ -297,6 +360,9 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                 self._random[slot] = np.random.default_rng(seed)
         seeds = [int(self._random[slot].integers(2**31) if seed is None else seed) for slot, seed in enumerate(given)]
         starts = self._chosen(seeds, asked)
+        named = [(start.episode_id, frame) for start, (_, frame) in zip(starts, asked, strict=True)]
+        for member in self._members:
+            member._begin(seeds, named)
         self._running = self._begun(seeds, starts)
         simulation = self._running.simulation
         self._episodes = [
@@ -307,9 +373,12 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             for slot, (start, picture) in enumerate(zip(starts, simulation.pictures, strict=True))
         ]  # fmt: skip
         if self._segmenter is not None:
-            for episode in self._episodes:
-                episode.look(self._segmenter, episode.video)
+            for slot, episode in enumerate(self._episodes):
+                episode.look(self._segmenter, episode.video, self._other_scores(slot))
                 episode.reward = 0.0
+
+    def _other_scores(self, slot: int) -> list[float]:
+        return [member._episodes[slot].score for member in self._members]
 
     def _video_so_far(self, start: RecordedStart, picture: dict[str, np.ndarray], points: np.ndarray) -> Trajectory:
         """The picture, as the model sees it, and where a judge will look at it, what was recorded before."""
@@ -324,6 +393,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
     def _advance(self, commands: np.ndarray) -> None:
         """Take one command for each episode; predict and judge when it is time."""
+        for member in self._members:
+            member._advance(commands)
         running = self._running
         for episode, state in zip(self._episodes, running.take(commands)[1], strict=True):
             episode.state, episode.reward = state, 0.0
@@ -340,10 +411,11 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                 found = self._succeeds(video)
                 if not isinstance(found, bool | np.bool_ | None):
                     raise DataError("Not a judgement", where="success", expected="True, False or None", got=found)
-                episode.success = bool(found)
+                episode.success = bool(found) and all(member._episodes[slot].success for member in self._members)
             episode.reward = float(episode.success)
             if self._segmenter is not None:
-                episode.look(self._segmenter, video)
+                episode.look(self._segmenter, video, self._other_scores(slot))
+                episode.doubted |= episode.disagreement > self._largest_disagreement
 
     def _observed(self, slot: int) -> dict[str, Any]:
         episode = self._episodes[slot]
