@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import compress
+from itertools import compress, product
 from typing import Any, Self
 
 import numpy as np
@@ -103,8 +103,7 @@ class _Kind:
 
 
 class ClipSampler:
-    """Draws batches of clips of one length, stride and set of views. Every process draws the same large batch and takes its
-    own part.
+    """Draws batches of clips of one length, stride and set of views. Every process draws the same and takes its own part.
 
     Args:
         rows: the episodes to draw from, of those in ``splits``.
@@ -137,26 +136,25 @@ class ClipSampler:
         self._view_weights = dict(sorted((config.view_weights or {JOINT: 1.0}).items()))
         candidates = [row for row in rows if row.split in splits]
         slots = {row.episode_id: tuple(view for view in views if view in row.views) for row in candidates}
+        row_weights = {row.episode_id: config.source_weights.get(row.source, 1.0) for row in candidates}
         self._kinds: list[_Kind] = []
         kind_weights: list[float] = []
-        for length in config.lengths:
-            for stride in config.strides:
-                fitting = [row for row in candidates if longest_clip(row.num_frames, 0, stride) >= length]
-                total = sum(config.source_weights.get(row.source, 1.0) for row in fitting)
-                for shared in sorted({slots[row.episode_id] for row in fitting}, reverse=True):
-                    alike = [row for row in fitting if slots[row.episode_id] == shared]
-                    weights = [config.source_weights.get(row.source, 1.0) for row in alike]
-                    if sum(weights) > 0:
-                        self._kinds.append(_Kind(length, stride, shared, alike, np.cumsum(_normalised(weights))))
-                        kind_weights.append(sum(weights) / total)
+        for length, stride in product(config.lengths, config.strides):
+            fitting = [row for row in candidates if longest_clip(row.num_frames, 0, stride) >= length]
+            total = sum(row_weights[row.episode_id] for row in fitting)
+            for shared in sorted({slots[row.episode_id] for row in fitting}, reverse=True):
+                alike = [row for row in fitting if slots[row.episode_id] == shared]
+                weights = [row_weights[row.episode_id] for row in alike]
+                if sum(weights) > 0:
+                    self._kinds.append(_Kind(length, stride, shared, alike, np.cumsum(_normalised(weights))))
+                    kind_weights.append(sum(weights) / total)
         if not self._kinds:
             longest = max((row.num_frames for row in candidates), default=0)
             raise DataError(
-                "No episode is long enough for any clip length.",
-                where=f"clips of the splits {list(splits)}",
+                "No episode is long enough for any clip length.", where=f"clips of the splits {list(splits)}",
                 expected=f"clips of {config.lengths} frames at strides {config.strides}",
                 got=f"{len(candidates)} episodes, the longest with {longest} frames",
-            )
+            )  # fmt: skip
         self._kind_weights = _normalised(kind_weights)
         self.longest = max(kind.length for kind in self._kinds)
         """Frames of the longest clips that are drawn."""
@@ -166,41 +164,12 @@ class ClipSampler:
         index, part = self.plan.drawn(index)
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         kind = self._kinds[int(random.choice(len(self._kinds), p=self._kind_weights))]
-        sets, name = self._sets(kind), JOINT
+        choices, chosen = self._choices(kind.views), 0
         if set(self._view_weights) != {JOINT}:
-            name = list(self._view_weights)[int(random.choice(len(self._view_weights), p=self._shares(sets)))]
+            chosen = int(random.choice(len(choices), p=[share for _, share, _ in choices]))
+        name, _, sets = choices[chosen]
         size = self.batch_size * (1 if name in (JOINT, SUBSET) else self.single_view_factor)
-        views = sets[name][0] if len(sets[name]) == 1 else sets[name][int(random.integers(len(sets[name])))]
-        return ClipBatch(self._draw(random, kind, size, part), views, primary=name == PRIMARY)
-
-    def _sets(self, kind: _Kind) -> dict[str, list[tuple[str, ...]]]:
-        """Sets of views, equally likely, that steps on clips of a kind may show, by the name in the view weights."""
-        if not kind.views:
-            return {PRIMARY: [(self.views[0],)]}
-        single = {view: [(view,)] for view in kind.views}
-        return {PRIMARY: [(self.views[0],)], JOINT: [kind.views], SUBSET: view_subsets(kind.views), **single}
-
-    def _shares(self, sets: Mapping[str, object]) -> np.ndarray:
-        """Share of the steps by each of the view weights, where ``sets`` of views can be shown."""
-        return _normalised([weight * (name in sets) for name, weight in self._view_weights.items()])
-
-    def view_sets(self, slots: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
-        """Sets of the model's ``slots`` that `LEAST_SHARE` of the steps or more fill together."""
-        shares: Counter[tuple[str, ...]] = Counter()
-        for kind, share in zip(self._kinds, self._kind_weights, strict=True):
-            sets = self._sets(kind)
-            for name, weight in zip(self._view_weights, self._shares(sets), strict=True):
-                for views in sets.get(name, ()):
-                    shares[tuple(view for view in slots if view in views)] += share * weight / len(sets[name])
-        return tuple(sorted(views for views, share in shares.items() if share >= LEAST_SHARE))
-
-    def trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
-        """View sets and strides of the clips; None: all ``slots`` together, at stride 1."""
-        strides = tuple(sorted({kind.stride for kind in self._kinds}))
-        found = TrainedClips(view_sets=self.view_sets(slots), strides=strides)
-        return None if found == TrainedClips(view_sets=(slots,), strides=(1,)) else found
-
-    def _draw(self, random: np.random.Generator, kind: _Kind, size: int, part: int) -> tuple[Clip, ...]:
+        views = sets[0] if len(sets) == 1 else sets[int(random.integers(len(sets)))]
         count, own = size * self.plan.together, slice(part * size, (part + 1) * size)
         draws = random.random((count, 2))[own]
         vectors = random.random((count, len(self.views)))[own] < self.vector_share
@@ -211,7 +180,30 @@ class ClipSampler:
             starts = (row.num_frames - 1 - (kind.length - 1) * kind.stride) // self.start_step + 1
             start, shown = int(where * starts) * self.start_step, tuple(compress(self.views, by_vector))
             clips.append(Clip(row.episode_id, start, kind.length, kind.stride, shown))
-        return tuple(clips)
+        return ClipBatch(tuple(clips), views, primary=name == PRIMARY)
+
+    def _choices(self, views: tuple[str, ...]) -> list[tuple[str, float, list[tuple[str, ...]]]]:
+        """Name and share of the steps of each view weight, for clips with these of the slots, and the equally likely sets it shows."""
+        sets = {PRIMARY: [(self.views[0],)], **{view: [(view,)] for view in views}}
+        if views:
+            sets |= {JOINT: [views], SUBSET: view_subsets(views)}
+        shares = _normalised([weight * (name in sets) for name, weight in self._view_weights.items()])
+        return [(name, share, sets.get(name, [])) for name, share in zip(self._view_weights, shares, strict=True)]
+
+    def view_sets(self, slots: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
+        """Sets of the model's ``slots`` that `LEAST_SHARE` of the steps or more fill together."""
+        shares: Counter[tuple[str, ...]] = Counter()
+        for kind, share in zip(self._kinds, self._kind_weights, strict=True):
+            for _, weight, sets in self._choices(kind.views):
+                for views in sets:
+                    shares[tuple(view for view in slots if view in views)] += share * weight / len(sets)
+        return tuple(sorted(views for views, share in shares.items() if share >= LEAST_SHARE))
+
+    def trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
+        """View sets and strides of the clips; None: all ``slots`` together, at stride 1."""
+        strides = tuple(sorted({kind.stride for kind in self._kinds}))
+        found = TrainedClips(view_sets=self.view_sets(slots), strides=strides)
+        return None if found == TrainedClips(view_sets=(slots,), strides=(1,)) else found
 
 
 def _normalised(weights: Sequence[float]) -> np.ndarray:
