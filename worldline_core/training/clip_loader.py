@@ -1,13 +1,12 @@
-"""Batches of clips, from the number of a micro-step to tensors.
-
-A `torch.utils.data.DataLoader` reads clips, ahead of training where there are workers; `ClipLoader` turns what was read into
-latents and adds action maps and text ids.
+"""Batches of clips, from the number of a micro-step to tensors: a `torch.utils.data.DataLoader` reads clips ahead of training, and
+`ClipLoader` turns what was read into latents and adds action maps and text ids.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from functools import cache
 from itertools import count
 
 import cv2
@@ -15,10 +14,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from worldline_core.actions.action_maps import ControlDrawing, control_frames
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, drawn_size
+from worldline_core.actions.episode_tracks import ActionTracks, collate_tracks, drawn_size
 from worldline_core.errors import TrainingError, WorldLineError
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
@@ -29,29 +28,12 @@ START_METHOD = "spawn"
 """Start method of loader processes: forked ones would share the threads and CUDA state of this one."""
 
 
-@dataclass(frozen=True)
-class ClipDataset(Dataset[Tensor | WorldLineError]):
-    """Batches of clips as a source reads them. An error is an item like any other: it reaches the training process as it is."""
-
-    source: ClipSource
-
-    def __getitem__(self, batch: ClipBatch) -> Tensor | WorldLineError:
-        try:
-            return self.source.read_batch(batch)
-        except WorldLineError as error:
-            return error
-
-
 def read_ahead(
     source: ClipSource, batches: Iterable[ClipBatch], workers: int, *, pinned: bool = False
 ) -> Iterator[Tensor | WorldLineError]:
-    """Read batches in order, ahead of time, in ``workers`` processes.
-
-    Args:
-        pinned: in page-locked memory, which a GPU reads at full speed.
-    """
+    """Read batches in order, ahead of time, in ``workers`` processes; ``pinned``: into memory that a GPU reads at full speed."""
     loader = DataLoader(
-        ClipDataset(source),
+        source,
         batch_size=None,
         sampler=batches,
         num_workers=workers,
@@ -102,8 +84,7 @@ class ClipLoader:
         views: the model's slots.
         tracks: controls; the maps get the width that the tracks were made for.
         text: turns instructions into ids; its prompts may name a clip's duration and size.
-        frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
-            rate.
+        frame_rates: of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own rate.
         action_frames: control frames that a latent frame takes.
         native_size: of the control vectors of a model that takes these.
         maps: the model takes maps.
@@ -123,7 +104,7 @@ class ClipLoader:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        self._tracks: dict[str, EpisodeTracks] = {}
+        self._tracks = None if self.tracks is None else cache(self.tracks.tracks)
         self._resident: ResidentTracks | None = None
         if self.source.resident and self.tracks:
             rows = [row for row in self.source.rows if row.episode_id in self.tracks]
@@ -142,55 +123,44 @@ class ClipLoader:
         if self.source.resident or not workers:
             return lambda index: self.load(sampler.clips(index))
         pinned = torch.device(self.device).type == "cuda"
-        ahead: tuple[int, Iterator[Tensor | WorldLineError]] | None = None
+        ahead: dict[int, Iterator[Tensor | WorldLineError]] = {}  # by the micro-step whose clips come next
 
         def load(index: int) -> Batch:
-            nonlocal ahead
-            if ahead is None or ahead[0] != index:
-                ahead = (index, read_ahead(self.source, map(sampler.clips, count(index)), workers, pinned=pinned))
-            items, ahead = ahead[1], None  # after an error nothing holds the loader processes
+            if index not in ahead:
+                ahead.clear()
+                ahead[index] = read_ahead(self.source, map(sampler.clips, count(index)), workers, pinned=pinned)
             batch = sampler.clips(index)
             try:
-                read = next(items)
+                read = next(ahead[index])
             except RuntimeError as error:
-                raise TrainingError(
-                    "A loader process has ended.",
-                    where=f"micro-step {index}: {'; '.join(map(str, batch.clips))}",
-                    expected="clips",
-                    got=error,
-                    next_step="see its traceback above; if memory ran out, lower input.workers or the batch",
-                ) from error
+                read = TrainingError(
+                    "A loader process has ended.", where=f"micro-step {index}: {'; '.join(map(str, batch.clips))}",
+                    got=error, next_step="see its traceback above; if memory ran out, lower input.workers or the batch",
+                )  # fmt: skip
             if isinstance(read, WorldLineError):
-                del items
+                ahead.clear()  # nothing holds the loader processes any more
                 raise read
-            ahead = (index + 1, items)
-            return self._finish(batch, read)
+            ahead[index + 1] = ahead.pop(index)
+            return self.load(batch, read)
 
         return load
 
-    def load(self, batch: ClipBatch) -> Batch:
-        """Read the clips of one batch in this process, and finish it.
-
-        Raises:
-            ArtifactError: the source or the tracks lack an episode.
-            DataError: a clip is damaged.
-        """
-        return self._finish(batch, self.source.read_batch(batch))
-
-    def _finish(self, batch: ClipBatch, read: Tensor) -> Batch:
+    def load(self, batch: ClipBatch, read: Tensor | None = None) -> Batch:
+        """One batch, whose clips are read now unless they were. Raises: DataError: a clip is damaged; ArtifactError: it is lacking."""
+        read = self.source.read_batch(batch) if read is None else read
         frames = read if read.dtype == torch.uint8 else None
         return self.conditioned(batch, self.source.latents(read, self.device), frames)
 
     def conditioned(self, batch: ClipBatch, latents: Tensor, frames: Tensor | None = None) -> Batch:
         """Latents of a batch's clips, with the conditions that this loader adds. Raises: ArtifactError: the tracks lack an episode."""
         clips, views = batch.clips, batch.views
-        ids = mask = weights = None
+        ids = mask = fps = weights = None
         if self.text is not None:
             facts = [self.clip_facts(clip) for clip in clips]
             ids, mask = self.text([self.source.row(clip.episode_id).instruction for clip in clips], facts)
             ids, mask = (on_device(values, self.device) for values in (ids, mask))
-        rates = [self._rate(clip) for clip in clips] if self.frame_rates else None
-        fps = None if rates is None else on_device(np.array(rates, np.float32), self.device)
+        if self.frame_rates:
+            fps = on_device(np.array([self._rate(clip) for clip in clips], np.float32), self.device)
         if self.object_weights is not None:
             weights = self.object_weights(clips, self.source.recorded_views(batch))
         return Batch(clips, views, latents, self.action_maps(clips, views), ids, mask, frames, fps, weights)
@@ -205,15 +175,12 @@ class ClipLoader:
     def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v a t h w"] | None:
         """Controls that each latent frame takes (docs/method.md section 2): in each view the map at latent resolution, or the
         vector; None without action tracks."""
-        if self.tracks is None:
+        if self.tracks is None or self._tracks is None:
             return None
         if self._resident is not None:
             samples, size = self._resident.batch(clips, self.action_frames, views), self._resident.image_size
         else:
-            for clip in clips:
-                if clip.episode_id not in self._tracks:
-                    self._tracks[clip.episode_id] = self.tracks.tracks(clip.episode_id)
-            episodes = [self._tracks[clip.episode_id] for clip in clips]
+            episodes = [self._tracks(clip.episode_id) for clip in clips]
             frames = frame_numbers(clips, control_frames(clips[0].num_frames, self.action_frames)).tolist()
             samples = collate_tracks(episodes, views, self.native_size, frames).to(self.device)
             size = drawn_size(episodes)

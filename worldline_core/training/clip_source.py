@@ -1,7 +1,4 @@
-"""Sources of clips: cached latents on disk or on the training device, or frames of an EpisodeSet.
-
-`ClipSource.read` touches files and runs in any process; `ClipSource.latents` turns what it returned into what the model sees.
-"""
+"""Sources of clips: cached latents on disk or on the training device, or frames of an EpisodeSet."""
 
 from __future__ import annotations
 
@@ -22,15 +19,15 @@ from einops import rearrange
 from jaxtyping import Float, Shaped, UInt8
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
+from torch.utils.data import Dataset
 
 from worldline_core.actions.action_maps import latent_frame_indices
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import FrameDecoder
 from worldline_core.data.video.frames import VideoFrames
-from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
 from worldline_core.model.tokenizers import (
     VideoTokenizer,
     load_tokenizer,
@@ -50,8 +47,8 @@ Layout = Literal["groups", "clips"]
 INDEX, DESCRIPTION = "index.parquet", "store.json"
 
 
-class ClipSource(ABC):
-    """Episodes whose clips can be read.
+class ClipSource(Dataset[Tensor | WorldLineError], ABC):
+    """Episodes whose clips can be read, in any process (an item of this dataset is a batch), and made into latents where a model is.
 
     Attributes:
         root: folder, for error messages.
@@ -74,18 +71,12 @@ class ClipSource(ABC):
         self._by_id = {row.episode_id: row for row in self.rows}
 
     def row(self, episode_id: str) -> ClipRow:
-        """The row of an episode.
-
-        Raises:
-            ArtifactError: the source does not hold it.
-        """
+        """The row of an episode. Raises: ArtifactError: the source does not hold it."""
         if episode_id not in self._by_id:
             raise ArtifactError(
-                f"The {type(self).__name__} does not hold this episode (or not all the views that are trained on).",
-                where=self.root,
-                got=episode_id,
-                next_step="encode the latents of the same EpisodeSet that is trained on",
-            )
+                "Clips of this episode are not held", where=self.root, expected=f"one of {len(self.rows)} episodes",
+                got=episode_id, next_step="encode the latents of the EpisodeSet that is trained on",
+            )  # fmt: skip
         return self._by_id[episode_id]
 
     def require_length(self, frames: int, where: str) -> None:
@@ -98,6 +89,13 @@ class ClipSource(ABC):
 
     resident = False
     """True where clips are kept on the training device."""
+
+    def __getitem__(self, batch: ClipBatch) -> Tensor | WorldLineError:
+        """What `read_batch` gives; an error is an item like any other, and reaches the training process as it is."""
+        try:
+            return self.read_batch(batch)
+        except WorldLineError as error:
+            return error
 
     @abstractmethod
     def read(self, clip: Clip, views: tuple[str, ...]) -> Shaped[Tensor, "v ..."]:
@@ -116,30 +114,26 @@ class ClipSource(ABC):
         """All clips of a batch; raises as `read`."""
         return torch.stack(list(map(self.read, batch.clips, self.recorded_views(batch))))
 
-    @abstractmethod
     def latents(self, read: Shaped[Tensor, "b v ..."], device: str) -> Float[Tensor, "b v c t h w"]:
         """Latents (float32) of clips that were read, on ``device``."""
+        return read.to(device)
 
 
 def latent_key(episode_id: str, kind: Literal["single", "groups", "clips"], *numbers: int) -> str:
-    """Name of a tensor of latents.
-
-    Single-frame latents of all start frames (``single``); ``groups`` whose first video frame is, for a stride, a phase modulo
-    4 x stride; the longest of ``clips`` of a stride that begin at a start.
-    """
+    """Name of a tensor of `LatentStore`: "single", "groups" of a stride and phase (of the first frame, modulo 4 x stride), or the
+    longest of the "clips" of a stride and start."""
     return "/".join([episode_id, kind, *map(str, numbers)])
 
 
 class LatentStore(ClipSource):
     """A Latents artifact: safetensors shards, read by memory mapping, beside an index of the episodes.
 
-    A causal tokenizer treats the first frame of a clip specially, so a clip's latents depend on where it starts. Two
-    layouts keep every clip exact:
+    A causal tokenizer treats the first frame of a clip specially, so a clip's latents depend on where it starts. Two layouts
+    keep every clip exact:
 
-    - ``groups`` (tokenizers whose later latent frames depend on their own four frames only): a single-frame latent for
-      every start frame, and for every stride and phase the latents of the groups of four frames that follow;
-    - ``clips`` (tokenizers with a longer memory): for every stride and start frame the latents of the whole remaining
-      clip, or of ``clip_frames`` frames.
+    - ``groups`` (later latent frames depend on their own four frames alone): a single-frame latent of every start, and for
+      every stride and phase the latents of the groups of four frames that follow;
+    - ``clips`` (a longer memory): for every stride and start the whole remaining clip, or ``clip_frames`` frames of it.
     """
 
     def __init__(self, root: Path, description: dict[str, Any], rows: Sequence[ClipRow]) -> None:
@@ -151,27 +145,19 @@ class LatentStore(ClipSource):
         self.latent_shape = tuple(description["latent_shape"])
         self.image_size = tuple(description["image_size"])
         self.clip_frames = description["clip_frames"]
-        self._shard_of = {row.episode_id: row.shard for row in rows}
         self._shards: dict[str, Any] = {}
 
     @classmethod
     def open(cls, root: Path) -> LatentStore:
-        """Open a finished Latents folder.
-
-        Raises:
-            ArtifactError: if the folder is not a Latents artifact.
-        """
+        """Open a finished Latents folder. Raises: ArtifactError: it is none."""
         try:
             rows = [ClipRow(**{**row, "views": tuple(row["views"])}) for row in read_rows(root / INDEX)]
             return cls(root, read_json(root / DESCRIPTION), rows)
         except (TypeError, KeyError) as error:
             raise ArtifactError(
-                "This folder is not a Latents artifact.",
-                where=root,
-                expected=f"{DESCRIPTION} and {INDEX} of encode_latents",
-                got=f"{type(error).__name__}: {error}",
-                next_step="run the encode_latents step first",
-            ) from error
+                "This folder is not a Latents artifact.", where=root, expected=f"{DESCRIPTION} and {INDEX} of encode_latents",
+                got=repr(error), next_step="run the encode_latents step first",
+            ) from error  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
         # Open shards stay in the process that opened them.
@@ -185,12 +171,9 @@ class LatentStore(ClipSource):
     def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
         """Latents of one clip (float32), views in the given order."""
         selected = self._stored_views(clip, views)
-        with self._shard(self._shard_of[clip.episode_id]) as shard:
+        with self._shard(self.row(clip.episode_id).shard) as shard:
             frames = [shard.get_slice(name)[:, :, first:stop] for name, first, stop in self._parts(clip)]
         return torch.cat(frames, dim=2)[selected].float()
-
-    def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
-        return read.to(device)
 
     def _parts(self, clip: Clip) -> list[tuple[str, int, int]]:
         """Tensors that a clip's latent frames are in, in order: (name, first latent frame, stop)."""
@@ -229,10 +212,7 @@ class LatentStore(ClipSource):
             yield self._shards[path.name]
         except (OSError, SafetensorError) as error:
             raise ArtifactError(
-                "A latent shard is damaged or cannot be opened.",
-                where=path,
-                got=error,
-                next_step="encode the latents again",
+                "A latent shard cannot be read.", where=path, got=error, next_step="encode the latents again"
             ) from error
 
 
@@ -249,42 +229,38 @@ class ResidentLatents(LatentStore):
         self._first: dict[str, tuple[int, int]] = {}
         """Of each tensor the place of its first frame, and how many it has."""
         place = 0
-        for file in with_progress(sorted({*self._shard_of.values()}), "reading latents", "shard"):
+        for file in with_progress(sorted({row.shard for row in self.rows}), "reading latents", "shard"):
             with self._shard(file) as shard:
                 for name in shard.keys():  # noqa: SIM118
                     latents = shard.get_tensor(name).to(device)
-                    frames = rearrange(latents, "v c t h w -> (t v) c h w")
+                    frames = rearrange(latents, "v c t h w -> (v t) c h w")
                     self._first[name] = place, latents.shape[2]
                     self._frames[place : place + len(frames)] = frames
                     place += len(frames)
         self._shards.clear()
 
-    def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:
-        return self.read_batch(ClipBatch((clip,), views))[0]
-
     def read_batch(self, batch: ClipBatch) -> Float[Tensor, "b v c t h w"]:
         selected = np.array(list(map(self._stored_views, batch.clips, self.recorded_views(batch))))
         parts = [self._parts(clip) for clip in batch.clips]
         lengths = [stop - first for _, first, stop in parts[0]]
-        within = np.concatenate([np.arange(length) for length in lengths])
-        count = np.array([len(self.row(clip.episode_id).views) for clip in batch.clips])[:, None]
-        begin = np.array([[self._place(*part) for part in own] for own in parts])
-        first, skipped = (np.repeat(values, lengths, axis=1) for values in (begin[..., 0], begin[..., 1]))
-        places = (first + (skipped + within) * count)[:, None] + selected[..., None]
+        found = np.array([[self._place(*part) for part in own] for own in parts])
+        place, count = rearrange(found, "b parts two -> two b 1 parts")
+        first = place + count * selected[..., None]
+        places = first.repeat(lengths, axis=-1) + np.concatenate([np.arange(length) for length in lengths])
         channels, *grid = self.latent_shape
         images = rearrange(on_device(places, self._frames.device) * channels, "b v t -> b v 1 t")
         images = images + rearrange(torch.arange(channels, device=images.device), "c -> c 1")
         return self._frames.flatten(0, 1).index_select(0, images.flatten()).float().view(*images.shape, *grid)
 
     def _place(self, name: str, first: int, stop: int) -> tuple[int, int]:
-        """Place of a tensor's first frame, and the number of the wanted one."""
+        """Place of the wanted frame in a tensor's first view, and how many frames a view has."""
         place, frames = self._first.get(name, (0, 0))
         if stop > frames:
             raise ArtifactError(
                 "The latents lack frames of this clip.", where=self.root, expected=f"{name}, {stop} latent frames", got=frames,
                 next_step="encode the latents again",
             )  # fmt: skip
-        return place, first
+        return place + first, frames
 
 
 class FrameSource(ClipSource):
@@ -292,29 +268,16 @@ class FrameSource(ClipSource):
 
     Raises:
         CheckpointError: the folder holds no tokenizer.
-        ConfigError: the tokenizer cannot code images of this size.
     """
 
-    def __init__(
-        self, episodes: EpisodeSet, tokenizer_folder: Path, config: FrameInput, *, device: str = "cpu"
-    ) -> None:
+    def __init__(self, episodes: EpisodeSet, tokenizer: Path, config: FrameInput, device: str = "cpu") -> None:
         super().__init__([ClipRow.from_episode(row, row.views) for row in episodes.rows])
-        self._tokenizer: VideoTokenizer | None = load_tokenizer(tokenizer_folder, device)
+        self._tokenizer: VideoTokenizer | None = load_tokenizer(tokenizer, device)
         space = self._tokenizer.spatial_compression
-        height, width = config.image_size
-        if height % space or width % space:
-            raise ConfigError(
-                "The tokenizer cannot code images of this size.",
-                where="input.image_size",
-                expected=f"multiples of {space}",
-                got=f"{height}x{width}",
-            )
-        self.root = episodes.root
-        self.episodes = episodes
-        self.image_size = config.image_size
-        self.start_step = config.start_step
+        height, width = self.image_size = config.image_size
+        self.root, self.episodes, self.start_step = episodes.root, episodes, config.start_step
         self.latent_shape = (self._tokenizer.latent_channels, height // space, width // space)
-        fingerprint = tokenizer_fingerprint(self._tokenizer, tokenizer_folder)
+        fingerprint = tokenizer_fingerprint(self._tokenizer, tokenizer)
         self.description = {"tokenizer": fingerprint, "decoder": FrameDecoder.name}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -330,7 +293,7 @@ class FrameSource(ClipSource):
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> UInt8[Tensor, "v n h w 3"]:
         """The clip's frames at the training size, RGB."""
-        position = self.episodes.position(self.row(clip.episode_id).episode_id)
+        position = self.episodes.position(clip.episode_id)
         frames = np.empty((len(views), clip.num_frames, *self.image_size, 3), np.uint8)
         for pictures, view in zip(frames, views, strict=True):
             try:
@@ -339,12 +302,9 @@ class FrameSource(ClipSource):
                     resize_frame(picture, self.image_size, out=target)
             except DataError as error:
                 raise DataError(
-                    f"A clip cannot be read: {error.what}",
-                    where=f"{clip}, view {view}, in {error.where}",
-                    expected=error.expected,
-                    got=error.got,
-                    next_step="repair or drop the episode",
-                ) from error
+                    f"A clip cannot be read: {error.what}", where=f"{clip}, view {view}, in {error.where}",
+                    expected=error.expected, got=error.got, next_step="repair or drop the episode",
+                ) from error  # fmt: skip
         return torch.from_numpy(frames)
 
     @torch.no_grad()
@@ -372,11 +332,7 @@ class LoadedView:
 def load_views(
     episodes: EpisodeSet, positions: Sequence[int], image_size: tuple[int, int], minimum: int
 ) -> list[LoadedView]:
-    """All views of the episodes at ``positions`` that have ``minimum`` frames or more, in memory.
-
-    Raises:
-        DataError: there is none.
-    """
+    """All views, in memory, of those episodes with ``minimum`` frames or more. Raises: DataError: there is none."""
     views: list[LoadedView] = []
     for position in with_progress(positions, "reading episodes", "episode"):
         row = episodes.rows[position]
@@ -407,65 +363,50 @@ def training_rows(
         DataError: if none is left.
     """
     held = {row.episode_id: row for row in source.rows}
-
-    def shown(episode_id: str) -> tuple[str, ...]:
-        kept = held[episode_id].views
-        if stage == 1 or tracks is None or vectors:
-            return kept
-        return tuple(view for view in kept if view in tracks.calibrated_views(episode_id))
-
-    def left_out(row: EpisodeRow) -> str:
-        """The reason why an episode is not trained on; empty where it is."""
-        fit = row.stage2_ok or (vectors and row.stage2_reason == "missing_calibration")
-        if outcomes is not None and row.outcome not in outcomes:
-            return f"outcome {row.outcome}"
-        if not (row.stage1_ok if stage == 1 else fit):
-            return (stage == 2 and row.stage2_reason) or f"not fit for Stage {stage}"
-        if row.episode_id not in held:
-            return f"split {row.split}: not among the clips"
-        if stage == 2 and tracks is not None and row.episode_id not in tracks:
-            return "no controls"
-        wanted = {row.primary_view} if stage == 1 else {*views}
-        return "" if wanted & {*shown(row.episode_id)} else "none of the views"
-
-    reasons = {row.episode_id: left_out(row) for row in episodes.rows}
-    rows = [replace(row, views=shown(row.episode_id)) for row in source.rows if reasons.get(row.episode_id) == ""]
-    counts = Counter(filter(None, reasons.values()))
+    rows, left_out = list[ClipRow](), Counter[str]()
+    for episode in episodes.rows:
+        row, controlled = held.get(episode.episode_id), tracks is None or episode.episode_id in tracks
+        shown = () if row is None else row.views
+        if tracks is not None and controlled and not vectors:
+            calibrated = tracks.calibrated_views(episode.episode_id)
+            shown = tuple(view for view in shown if view in calibrated)
+        by_vector = vectors and episode.stage2_reason == "missing_calibration"
+        wanted = {episode.primary_view} if stage == 1 else {*views}
+        if outcomes is not None and episode.outcome not in outcomes:
+            left_out[f"outcome {episode.outcome}"] += 1
+        elif not (episode.stage1_ok if stage == 1 else episode.stage2_ok or by_vector):
+            left_out[(stage == 2 and episode.stage2_reason) or f"not fit for Stage {stage}"] += 1
+        elif row is None:
+            left_out[f"split {episode.split}: not among the clips"] += 1
+        elif not controlled:
+            left_out["no controls"] += 1
+        elif wanted.isdisjoint(shown):
+            left_out["none of the views"] += 1
+        else:
+            rows.append(replace(row, views=shown))
+            left_out["views without a camera (train_stage2.native_size), of"] += shown != row.views
+    reasons = ", ".join(f"{reason} {count}" for reason, count in left_out.most_common() if count)
     if not rows:
         raise DataError(
-            "No episode is left to train on.",
-            where=f"stage {stage}, one of the views {', '.join(views) or 'that are task-facing'}",
+            "No episode is left to train on.", where=f"stage {stage}, one of the views {', '.join(views) or 'that are task-facing'}",
             expected="episodes that are in the EpisodeSet, the source of clips and (Stage II) the action tracks",
-            got=", ".join(f"{reason} {count}" for reason, count in counts.most_common()) or "an empty EpisodeSet",
-            next_step="docs/filters.md says what each reason asks for; other episodes are in the quarantine tables of curate,"
-            " filter and render_actions",
-        )
-    if counts["no controls"]:
-        logger.warning("%d episodes have no controls and are left out.", counts["no controls"])
-    if fewer := sum(row.views != held[row.episode_id].views for row in rows):
-        logger.warning(
-            "Of %d episodes the views without a camera are left out: the model takes action maps alone "
-            "(train_stage2.native_size).", fewer,
+            got=reasons or "an empty EpisodeSet",
+            next_step="docs/filters.md says what each reason asks for; other episodes are in the quarantine tables of earlier steps",
         )  # fmt: skip
+    if reasons:
+        logger.info("Stage %d: clips of %d of %d episodes; left out: %s.", stage, len(rows), len(episodes), reasons)
     return rows
 
 
 def open_source(reading: ClipInput, inputs: Mapping[str, Path], episodes: EpisodeSet, device: str) -> ClipSource:
-    """The configured source: cached ``latents``, or frames that ``tokenizer`` encodes during training.
-
-    Raises:
-        ConfigError: the input that the clips come from is not given.
-    """
+    """The configured source of ``latents``, or of frames that ``tokenizer`` encodes. Raises: ConfigError: it is not given."""
     needed = "tokenizer" if isinstance(reading, FrameInput) else "latents"
     if needed not in inputs:
         raise ConfigError(
-            f"Clips from {reading.kind} need the input {needed}.",
-            where="input.kind",
-            expected=f"an input named {needed}",
-            got=", ".join(sorted(inputs)),
+            f"Clips from {reading.kind} need the input {needed}.", where="input.kind", got=", ".join(sorted(inputs)),
             next_step=f"give --input {needed}=FOLDER, or choose the other kind of input",
-        )
-    if not isinstance(reading, FrameInput):
-        store = LatentStore.open(Path(inputs["latents"]))
-        return ResidentLatents(store, device) if reading.resident else store
-    return FrameSource(episodes, Path(inputs["tokenizer"]), reading, device=device)
+        )  # fmt: skip
+    if isinstance(reading, FrameInput):
+        return FrameSource(episodes, Path(inputs["tokenizer"]), reading, device)
+    store = LatentStore.open(Path(inputs["latents"]))
+    return ResidentLatents(store, device) if reading.resident else store
