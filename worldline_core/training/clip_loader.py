@@ -111,10 +111,8 @@ class ClipLoader:
             self._resident = ResidentTracks(self.tracks, rows, self.views, self.device, self.native_size)
 
     def batches(self, sampler: ClipSampler, workers: int = 0) -> Callable[[int], Batch]:
-        """Returns a function from the number of a micro-step to its batch, which ``workers`` processes read ahead.
-
-        Asked for in order, batches are there already; any other order starts reading anew. The function raises DataError
-        and ArtifactError for clips that cannot be read, and TrainingError where a loader process has ended.
+        """Returns a function from the number of a micro-step to its batch. It raises as `load`, and TrainingError where one of the
+        ``workers``, processes that read ahead, has ended. Another order than the numbers' own starts reading anew.
 
         Raises:
             ConfigError: the source has no clips of this length.

@@ -193,13 +193,11 @@ class LatentStore(ClipSource):
         most = self.clip_frames or row.num_frames
         fits = clip.start >= 0 and clip.num_frames <= min(longest_clip(row.num_frames, clip.start, clip.stride), most)
         if clip.stride not in self.strides or not fits or clip.start % self.start_step or not {*views} <= {*row.views}:
+            held = f"strides {self.strides}, a start divisible by {self.start_step}, at most {most} of {row.num_frames} frames"
             raise ArtifactError(
-                "The latents do not hold this clip.",
-                where=self.root,
-                expected=f"strides {self.strides}, a start divisible by {self.start_step}, at most {most} of "
-                f"{row.num_frames} frames, views {row.views}",
-                got=f"{clip}, views {views}",
-            )
+                "The latents do not hold this clip.", where=self.root, expected=f"{held}, views {row.views}",
+                got=f"{clip}, views {views}", next_step="encode the latents with these settings, or ask for other clips",
+            )  # fmt: skip
         return [row.views.index(view) for view in views]
 
     @contextmanager
@@ -257,8 +255,8 @@ class ResidentLatents(LatentStore):
         place, frames = self._first.get(name, (0, 0))
         if stop > frames:
             raise ArtifactError(
-                "The latents lack frames of this clip.", where=self.root, expected=f"{name}, {stop} latent frames", got=frames,
-                next_step="encode the latents again",
+                "The latents lack frames of this clip.", where=f"{self.root}, {name}", expected=f"{stop} latent frames",
+                got=frames, next_step="encode the latents again",
             )  # fmt: skip
         return place + first, frames
 
