@@ -266,6 +266,7 @@ class FrameSource(ClipSource):
 
     Raises:
         CheckpointError: the folder holds no tokenizer.
+        ConfigError: it does not take pictures of this size.
     """
 
     def __init__(self, episodes: EpisodeSet, tokenizer: Path, config: FrameInput, device: str = "cpu") -> None:
@@ -273,6 +274,11 @@ class FrameSource(ClipSource):
         self._tokenizer: VideoTokenizer | None = load_tokenizer(tokenizer, device)
         space = self._tokenizer.spatial_compression
         height, width = self.image_size = config.image_size
+        if height % space or width % space:
+            raise ConfigError(
+                "The tokenizer cannot code images of this size", where="input.image_size", expected=f"multiples of {space}",
+                got=f"{height}x{width}",
+            )  # fmt: skip
         self.root, self.episodes, self.start_step = episodes.root, episodes, config.start_step
         self.latent_shape = (self._tokenizer.latent_channels, height // space, width // space)
         fingerprint = tokenizer_fingerprint(self._tokenizer, tokenizer)
