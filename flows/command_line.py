@@ -380,7 +380,7 @@ def _embodiment_check(arguments: argparse.Namespace) -> None:
 def _serve(arguments: argparse.Namespace) -> None:
     """Load the model and serve until interrupted."""
     from worldline_core.config import apply_overrides, load_config, validate
-    from worldline_core.errors import UnavailableError, installing
+    from worldline_core.errors import needing
     from worldline_core.serving.serve_config import ServeConfig
 
     overrides = tuple(arguments.overrides)
@@ -388,14 +388,10 @@ def _serve(arguments: argparse.Namespace) -> None:
         config = load_config(ServeConfig, path=arguments.config, overrides=overrides)
     else:
         config = validate(ServeConfig, apply_overrides({}, overrides), where="--set")
-    try:
+    with needing("serve", "The server"):
         import msgpack  # noqa: F401
 
         from worldline_core.serving.app import listening_socket, make_server, server_token
-    except ImportError as error:
-        raise UnavailableError(
-            "The server needs packages that are not here", got=str(error), next_step=installing("serve")
-        ) from error
     from worldline_core.rollout.worldline import WorldLine
     from worldline_core.shipped import project_path
 

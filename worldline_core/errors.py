@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from worldline_core.untrusted_text import shown
 
 
@@ -38,13 +41,13 @@ class WorldLineError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword-only fields are lost by the default reduction, and errors cross process boundaries.
-        return _rebuild, (type(self), self.what, self.where, self.expected, self.got, self.next_step)
+        return _restored, (type(self), self.args, vars(self))
 
 
-def _rebuild(
-    kind: type[WorldLineError], what: str, where: object, expected: object, got: object, next_step: str | None
-) -> WorldLineError:
-    return kind(what, where=where, expected=expected, got=got, next_step=next_step)
+def _restored(kind: type[WorldLineError], args: tuple[object, ...], fields: dict[str, object]) -> WorldLineError:
+    error = kind.__new__(kind, *args)
+    vars(error).update(fields)
+    return error
 
 
 class ConfigError(WorldLineError):
@@ -86,3 +89,14 @@ class UnavailableError(WorldLineError):
 def installing(extra: str) -> str:
     """Next step of a message: the command that installs an extra of this package."""
     return f"pip install 'worldline[{extra}]' (in a checkout: uv sync --extra {extra})"
+
+
+@contextmanager
+def needing(extra: str, library: str) -> Iterator[None]:
+    """Around the imports of an optional library. Raises: UnavailableError where it is not installed."""
+    try:
+        yield
+    except ImportError as error:
+        raise UnavailableError(
+            f"{library} is not installed", expected=f"the extra `{extra}`", got=str(error), next_step=installing(extra)
+        ) from error

@@ -18,7 +18,7 @@ import httpx
 
 from tasks.execution.process_pool import process_runner
 from tasks.execution.temporary_server import private_server, set_up_temporary_server
-from worldline_core.errors import UnavailableError, WorldLineError, installing
+from worldline_core.errors import WorldLineError, needing
 from worldline_core.scale.mapping import (
     Outcome,
     RunnerConfig,
@@ -142,11 +142,9 @@ def _outcome(shard: Shard[Any], future: Any) -> Exception | None:
 
 
 def _dask_runner(workers: int, address: str | None) -> Any:
-    try:
+    with needing("dask", "A library of the runner dask"):
         from dask import config as dask_config
         from prefect_dask.task_runners import DaskTaskRunner
-    except ImportError as error:
-        raise _missing("dask", error) from error
     # Doing a shard again after its worker died is this module's business.
     dask_config.set({"distributed.scheduler.allowed-failures": 0})
     if address is not None:
@@ -160,25 +158,13 @@ def _ray_runner(workers: int, address: str | None) -> Any:
         # Read when Ray is imported. Started by `uv run`, it would have every worker build an environment of its own from
         # a copy of the working directory; workers of this machine have this one.
         os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
-    try:
+    with needing("ray", "A library of the runner ray"):
         from prefect_ray import RayTaskRunner
-    except ImportError as error:
-        raise _missing("ray", error) from error
     if address is not None:
         return RayTaskRunner(address=address)
     # Ray's workers are nice to all others, up to getting nothing on a busy machine; here they are the work.
     os.environ.setdefault("RAY_worker_niceness", "0")
     return RayTaskRunner(init_kwargs={"num_cpus": workers, "include_dashboard": False})
-
-
-def _missing(extra: str, error: ImportError) -> UnavailableError:
-    return UnavailableError(
-        f"The runner {extra} needs libraries that are not installed",
-        where="runner.kind",
-        expected=f"the extra `{extra}`",
-        got=str(error),
-        next_step=f"{installing(extra)}, or runner.kind=processes",
-    )
 
 
 @contextmanager

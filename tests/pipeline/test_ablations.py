@@ -140,7 +140,7 @@ def test_the_paper_s_numbers_are_those_of_its_table(project_root: Path) -> None:
 def evaluation(folder: Path, values: dict[str, float]) -> Path:
     scores = [Score("stage2", name, "arm", "test", "head", 42, "robot_iou", value) for name, value in values.items()]
     write_scores(folder, scores)
-    summary = summarise(scores, comparisons=None, resamples=200, seed=0)
+    summary = summarise(scores, resamples=200, seed=0)
     unavailable = {"lpips": "no folder configured"}
     write_json_atomic(folder / "summary.json", summary | {"methods": ["stage2"], "unavailable": unavailable})
     return folder

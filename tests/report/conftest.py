@@ -129,7 +129,7 @@ def write_video_scores(folder: Path) -> None:
         scores.append(Score("true", name, embodiment, split, "head", 0, "robot_iou_exact", 0.93, *more))
     write_scores(folder, scores)
     write_by_frame(folder / "by_frame.parquet", by_frame)
-    options = {"comparisons": None, "resamples": 200, "seed": 0, "by_view": True}
+    options = {"resamples": 200, "seed": 0, "by_view": True}
     accuracy = summarise([s for s in scores if s.method == "true"], **options)["metrics"]
     segmenter = {
         "name": "learned", "suffix": "", "description": "small U-Net trained on exact masks of training recordings",

@@ -176,7 +176,7 @@ class World:
         ]
         folder.mkdir(parents=True)
         write_scores(folder, scores)
-        found = summarise(scores, comparisons=(), resamples=100, seed=0, by_view=True)
+        found = summarise(scores, resamples=100, seed=0, by_view=True)
         (folder / "summary.json").write_text(json.dumps(found))
         return {"evaluate_video": folder}
 

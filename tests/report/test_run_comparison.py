@@ -35,7 +35,7 @@ def evaluation(folder: Path, better_by: float, method: str = "model", first: int
             scores.append(Score(method, f"e{number}", robot, "test", "head", 1, metric, value, outcome=outcome))
     folder.mkdir(parents=True)
     write_scores(folder, scores)
-    summary = summarise(scores, comparisons=(), resamples=100, seed=0, by_view=True)
+    summary = summarise(scores, resamples=100, seed=0, by_view=True)
     (folder / "summary.json").write_text(json.dumps(summary))
     return folder
 

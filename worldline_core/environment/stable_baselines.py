@@ -13,13 +13,12 @@ import gymnasium
 import numpy as np
 
 from worldline_core.environment.environment import WorldLineVectorEnv
-from worldline_core.errors import UnavailableError, installing
+from worldline_core.errors import needing
 
-try:
+with needing("rl", "Stable-Baselines3"):
     from stable_baselines3.common.vec_env import VecEnv
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
-except ModuleNotFoundError as error:
-    raise UnavailableError("Stable-Baselines3 is not installed", got=str(error), next_step=installing("rl")) from error
+
 
 Indices = int | Iterable[int] | None
 

@@ -122,9 +122,6 @@ class VideoEvaluationConfig(StrictModel):
     )
     sam3_weights: Path | None = Field(default=None, description="local folder of SAM 3 weights")
     lpips_weights: Path | None = Field(default=None, description="local folder of LPIPS weights; none: not available")
-    comparisons: tuple[tuple[str, str], ...] | None = Field(
-        default=None, description="pairs of methods whose differences are reported; none: every pair"
-    )
     metrics: tuple[str, ...] = Field(default=(), description="further metrics: " + ", ".join(ON_REQUEST))
     changed_controls: dict[str, dict[Literal["shuffled", "mirrored", "delayed"], str]] = Field(
         default={}, description="by method, the methods that are the same model under changed controls"

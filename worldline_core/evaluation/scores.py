@@ -123,23 +123,19 @@ def method_differences(
     by_method: Mapping[str, Mapping[str, float]],
     metric: str,
     *,
-    comparisons: Sequence[tuple[str, str]] | None = None,
     resamples: int,
     seed: int,
 ) -> list[dict[str, Any]]:
-    """Rows {"first", "second", "metric", mean, low, high, count} of paired differences of a metric.
+    """Rows {"first", "second", "metric", mean, low, high, count} of first - second of a metric, for every pair of methods.
 
     Args:
         by_method: the metric of each trajectory, by method.
-        comparisons: pairs (first, second), reported as first - second; None takes every pair of methods.
     """
-    pairs = combinations(sorted(by_method), 2) if comparisons is None else comparisons
     rows: list[dict[str, Any]] = []
-    for first, second in pairs:
-        if first in by_method and second in by_method:
-            found = paired_difference(by_method[first], by_method[second], resamples=resamples, seed=seed)
-            if found is not None:
-                rows.append({"first": first, "second": second, "metric": metric, **asdict(found)})
+    for first, second in combinations(sorted(by_method), 2):
+        found = paired_difference(by_method[first], by_method[second], resamples=resamples, seed=seed)
+        if found is not None:
+            rows.append({"first": first, "second": second, "metric": metric, **asdict(found)})
     return rows
 
 
@@ -195,21 +191,13 @@ def kept_part(path: Path, make: Callable[[], Any]) -> Any:
     return json.loads(path.read_text())
 
 
-def summarise(
-    scores: Sequence[Score],
-    *,
-    comparisons: Sequence[tuple[str, str]] | None,
-    resamples: int,
-    seed: int,
-    by_view: bool = False,
-) -> dict[str, Any]:
+def summarise(scores: Sequence[Score], *, resamples: int, seed: int, by_view: bool = False) -> dict[str, Any]:
     """Means with 95 % intervals over trajectories, and paired differences between methods.
 
     A mean is over the views that a method predicted (``metric@view`` says of how many trajectories each one was); a
     difference is over the views that both methods predicted of a trajectory.
 
     Args:
-        comparisons: pairs (first, second), reported as first - second; None takes every pair of methods.
         by_view: also give every metric per view, as ``metric@view``.
 
     Returns:
@@ -233,11 +221,9 @@ def summarise(
             weights = [len(items) for items in by_episode.values()]
             interval = bootstrap_mean(list(map(_mean, by_episode.values())), weights=weights, **options)
             metrics[group][method][metric] = asdict(interval)
-        for pair in combinations(sorted(by_method), 2) if comparisons is None else comparisons:
-            if set(pair) <= set(by_method):
-                means = _in_common_views(*(by_method[method] for method in pair))
-                named = dict(zip(pair, means, strict=True))
-                differences[group] += method_differences(named, metric, comparisons=[pair], **options)
+        for pair in combinations(sorted(by_method), 2):
+            means = _in_common_views(*(by_method[method] for method in pair))
+            differences[group] += method_differences(dict(zip(pair, means, strict=True)), metric, **options)
     differences = {group: rows for group, rows in differences.items() if rows}
     return {"metrics": metrics, "differences": differences}
 

@@ -7,14 +7,13 @@ that decides no pose were taken out (they are often not there).
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import math
 import xml.etree.ElementTree as ET
 from typing import Any
 
 import numpy as np
 
-from worldline_core.errors import ConfigError, UnavailableError, installing
+from worldline_core.errors import ConfigError, needing
 from worldline_core.geometry.embodiment import (
     Embodiment,
     embodiment_names,
@@ -67,12 +66,8 @@ def check_embodiment(embodiment: Embodiment, samples: int = 1000) -> dict[str, A
     """
     if samples < 1:
         raise ConfigError("A check needs random joint positions", expected="--samples of at least 1", got=samples)
-    if importlib.util.find_spec("mujoco") is None:
-        raise UnavailableError(
-            "The check compares with MuJoCo, which is not installed", expected="the extra `sim`",
-            next_step=installing("sim"),
-        )  # fmt: skip
-    mujoco = importlib.import_module("mujoco")
+    with needing("sim", "MuJoCo"):
+        mujoco = importlib.import_module("mujoco")
     from worldline_core.geometry.kinematics import ArmKinematics  # torch, which the list does without
 
     kinematics = ArmKinematics(embodiment)

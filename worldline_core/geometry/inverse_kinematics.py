@@ -58,12 +58,9 @@ class InverseKinematics:
         }
         self._joints = [[found[name] for name in arm.joints] for arm in embodiment.arms]
 
-    def jacobians(self, state: Float[np.ndarray, " j"]) -> list[Float[np.ndarray, "6 d"]]:
-        """By arm: metres (first three rows) and radians of its tool in the base frame per rad or m of each of its joints."""
-        return self._at(state)[1]
-
-    def _at(self, state: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Tool poses (a, 4, 4) and the Jacobians of a state."""
+    def jacobians(self, state: Float[np.ndarray, " j"]) -> tuple[np.ndarray, list[Float[np.ndarray, "6 d"]]]:
+        """Tool poses (a, 4, 4) and the Jacobians of a state, by arm: metres (first three rows) and radians of its tool in the
+        base frame per rad or m of each of its joints."""
         links = {name: pose[0].numpy() for name, pose in self.kinematics.link_poses(state[None]).items()}
         jacobians, tools = [], []
         for arm, joints in zip(self.kinematics.embodiment.arms, self._joints, strict=True):
@@ -102,7 +99,7 @@ class InverseKinematics:
         best = state.copy()
         least, errors = np.full(arms, np.inf), np.zeros((arms, 2))
         for _ in range(iterations + 1):
-            tools, jacobians = self._at(state)
+            tools, jacobians = self.jacobians(state)
             shift = wanted[:, :3, 3] - tools[:, :3, 3]
             turn = Rotation.from_matrix(wanted[:, :3, :3] @ tools[:, :3, :3].swapaxes(1, 2)).as_rotvec()
             size = np.stack([np.linalg.norm(shift, axis=1), np.linalg.norm(turn, axis=1)], axis=1)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from worldline_core.errors import ConfigError, DataError, UnavailableError, installing
+from worldline_core.errors import ConfigError, DataError, UnavailableError, needing
 from worldline_core.http_exchange import within
 from worldline_core.untrusted_text import without_secret
 
@@ -42,12 +42,8 @@ MAX_VALUES = 1 << 20
 
 
 def _msgpack() -> ModuleType:
-    try:
+    with needing("serve", "msgpack"):
         import msgpack
-    except ImportError as error:
-        raise UnavailableError(
-            "Messages of policies and of the server need msgpack", next_step=installing("serve")
-        ) from error
     return msgpack
 
 

@@ -182,10 +182,12 @@ def _balance_plan(robot: Robot, layout: Layout, random: np.random.Generator, kno
     return {layout.arm: _raise(layout, layout.arm, random, xy, yaw, 0.035, random.uniform(0.13, 0.16))}
 
 
-def _balance_judge(ended: Ended, layout: Layout) -> Judged:
-    height, lean = ended.place("bar_0")[:, 2] - BAR_HALF[2], ended.lean("bar_0")
+def _level_judge(ended: Ended, layout: Layout) -> Judged:
+    """Of balance and level."""
+    name, half = ("bar_0", BAR_HALF) if layout.target.kind == "bar" else ("tray_0", TRAY_HALF)
+    height, lean = ended.place(name)[:, 2] - half[2], ended.lean(name)
     facts = {"height": float(height[-1]), "lean": lean}
-    if height.max() < 0.015 or height[-1] < 0.03:
+    if height[-1] < 0.03:
         return "missed" if height.max() < 0.03 else "slipped", facts
     return "" if height[-1] > 0.05 and lean < FALLEN else "tilted", facts
 
@@ -269,14 +271,6 @@ def _level_plan(robot: Robot, layout: Layout, random: np.random.Generator, knows
         xy = tray.xy + along * forward + side * RAIL_AWAY * left + random.normal(0, 0.003, 2)
         plans[arm] = _raise(layout, arm, random, xy, _half_turn(tray.yaw), 0.060, rise)
     return plans
-
-
-def _level_judge(ended: Ended, layout: Layout) -> Judged:
-    height, lean = ended.place("tray_0")[:, 2] - TRAY_HALF[2], ended.lean("tray_0")
-    facts = {"height": float(height[-1]), "lean": lean}
-    if height[-1] < 0.03:
-        return "missed" if height.max() < 0.03 else "slipped", facts
-    return "" if height[-1] > 0.05 and lean < FALLEN else "tilted", facts
 
 
 # detour: a pole stands on one side of the way to the pad; plans pass on either.
@@ -474,7 +468,7 @@ def _roll_judge(ended: Ended, layout: Layout) -> Judged:
 
 CONTACT_TASKS: dict[str, ContactTask] = {
     "grip": ContactTask(_grip_layout, _grip_plan, _grip_judge),
-    "balance": ContactTask(_balance_layout, _balance_plan, _balance_judge),
+    "balance": ContactTask(_balance_layout, _balance_plan, _level_judge),
     "topple": ContactTask(_topple_layout, _topple_plan, _topple_judge),
     "level": ContactTask(_level_layout, _level_plan, _level_judge),
     "both": ContactTask(_both_layout, _both_plan, _both_judge),

@@ -18,7 +18,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from worldline_core.config import StrictModel
-from worldline_core.errors import CheckpointError, UnavailableError, installing
+from worldline_core.errors import CheckpointError, needing
 from worldline_core.model.checkpoint import (
     CHECKPOINT_DTYPE,
     CheckpointInfo,
@@ -79,12 +79,8 @@ def add_adapters(model: WorldModel, config: LoRAConfig, seed: int) -> None:
 
 def load_peft() -> ModuleType:
     """The library, which takes seconds the first time. Raises: UnavailableError: it is not installed."""
-    try:
+    with needing("one-gpu", "peft"):
         import peft
-    except ImportError as error:
-        raise UnavailableError(
-            "peft is not installed", where="lora", got=str(error), next_step=installing("one-gpu")
-        ) from error
     return peft
 
 

@@ -13,7 +13,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from worldline_core.errors import ConfigError, UnavailableError, installing
+from worldline_core.errors import ConfigError, needing
 from worldline_core.training.processes import processes
 from worldline_core.training.training_config import TrainerConfig
 
@@ -60,15 +60,10 @@ def _torchao_classes() -> tuple[Any, Any]:
     Raises:
         UnavailableError: torchao is not installed.
     """
-    try:
+    with needing("one-gpu", "torchao"):
         from torchao.optim import AdamW8bit
         from torchao.optim.quant_utils import scale_tensor
         from torchao.optim.subclass_8bit import OptimState8bit
-    except ImportError as error:
-        raise UnavailableError(
-            "torchao is not installed", where="trainer.weights, trainer.optimizer.moments", got=str(error),
-            next_step=installing("one-gpu"),
-        ) from error  # fmt: skip
 
     class Moment(OptimState8bit):
         pass

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
@@ -85,10 +84,6 @@ class RejectedInputError(DataError):
         super().__init__(what, where=where, expected=expected, got=got, next_step=next_step)
         self.reason: str = reason
         self.evidence: dict[str, Any] = dict(evidence or {})
-
-    def __reduce__(self) -> tuple[object, ...]:
-        shown = {name: getattr(self, name) for name in ("where", "expected", "got", "next_step", "evidence")}
-        return partial(RejectedInputError, self.reason, self.what, **shown), ()
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from worldline_core.data.guards.rejection import (
     unreadable,
 )
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
-from worldline_core.errors import UnavailableError, installing
+from worldline_core.errors import needing
 
 _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
 # Images are read a block at a time: a compressed chunk is unpacked once, and little is in memory.
@@ -43,14 +43,8 @@ def require_h5py() -> Any:
 
     Raises: UnavailableError where it is not installed.
     """
-    try:
+    with needing("hdf5", "h5py"):
         return importlib.import_module("h5py")
-    except ImportError as error:
-        raise UnavailableError(
-            "Sources of HDF5 files need h5py, which is not installed",
-            expected="the extra `hdf5`",
-            next_step=installing("hdf5"),
-        ) from error
 
 
 @dataclass(frozen=True)

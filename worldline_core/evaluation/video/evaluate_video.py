@@ -156,7 +156,7 @@ def _write(
             ]
     write_scores(output, scores)
     write_by_frame(output / BY_FRAME_FILE, by_frame)
-    options = {"comparisons": config.comparisons, "resamples": config.resamples, "seed": config.seed, "by_view": True}
+    options = {"resamples": config.resamples, "seed": config.seed, "by_view": True}
     predicted = [score for score in scores if score.method != TRUE_METHOD]
     found, kept = {row.episode_id for _, row, _ in records}, {score.episode_id for score in predicted}
     if not kept:
