@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
+import sys
 
 import pytest
 
@@ -77,7 +77,7 @@ def test_other_limits_than_the_description_has_are_noted(tmp_path):
 def test_a_check_needs_mujoco_and_samples(monkeypatch):
     with pytest.raises(ConfigError, match="--samples of at least 1"):
         check_embodiment(load_embodiment("so101"), samples=0)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(UnavailableError, match=r"MuJoCo[\s\S]*--extra sim"):
         check_embodiment(load_embodiment("so101"), samples=2)
 

@@ -14,6 +14,7 @@ import pytest
 
 from tests.robustness.conftest import rejected  # pyright: ignore[reportMissingImports]
 from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
+from worldline_core.data.guards.rejection import RejectedInputError, check_columns
 from worldline_core.errors import ConfigError
 from worldline_core.store.remote import parse_location
 
@@ -37,6 +38,9 @@ def test_what_a_function_raises_is_raised_here_and_the_reader_is_kept() -> None:
         read_limited(LIMITS, os.stat, "/no-such-file")
     with pytest.raises(ConfigError, match="gopher2"):
         read_limited(LIMITS, parse_location, "gopher2://x/y")
+    with pytest.raises(RejectedInputError, match="columns") as caught:
+        read_limited(LIMITS, check_columns, 2000, "here")
+    assert (caught.value.reason, caught.value.evidence["declared"]) == ("too_large", 2000)
     assert read_limited(LIMITS, os.getpid) == before
 
 
