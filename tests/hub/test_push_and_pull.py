@@ -19,7 +19,7 @@ from tests.data.curating import record
 from tests.hub.conftest import Repository
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
+from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.publishing import pull, push
 from worldline_core.store.artifact_files import digest_folder, write_manifest
 
@@ -154,7 +154,7 @@ def test_odd_answers_end_in_one_message(hub: Any, folder: Path, tmp_path: Path, 
     for part, answer in ODD_ANSWERS:
         with subtests.test(part=part, answer=answer[:80]):
             hub.instead = lambda method, path, p=part, body=answer: body if re.search(p, path) else None
-            with pytest.raises(ArtifactError, match=r"did not finish the pull|No finished EpisodeSet|List of files is"):
+            with pytest.raises(ArtifactError, match=r"did not finish|No finished|List of files is|not those of"):
                 pull(PLACE, tmp_path / "back")
 
 
@@ -233,8 +233,9 @@ def test_visibility_rights_tokens_and_names(hub: Any, folder: Path, monkeypatch:
     with pytest.raises(ArtifactError, match="did not finish the pull"):
         pull("hf://datasets/lab/nothing", folder.with_name("x"))
     monkeypatch.delenv("HF_TOKEN")
-    with pytest.raises(UnavailableError, match="HF_TOKEN"):
-        push(folder, PLACE)
+    hub.tokens.clear()
+    push(folder, PLACE, public=True)
+    assert hub.tokens == set()  # none that another program stored
     for text in ("hf://lab/toy", "hf://datasets/toy", "hf://https://x/y", "hf://datasets/a/b/c"):
         with pytest.raises(ConfigError, match="Not a place on the hub"):
             pull(text, folder.with_name("x"))

@@ -145,9 +145,7 @@ def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, store: Ob
     digests = []
     for content in ("one", "one", "two"):
         (tmp_path / "raw" / "index.parquet").write_text(content)
-        url: Any = parse_location(store.upload(tmp_path / "raw", "key"))
-        url.fs.invalidate_cache()
-        digests.append(artifacts.input_digest(url))
+        digests.append(artifacts.input_digest(parse_location(store.upload(tmp_path / "raw", "key"))))
     assert digests[0] == digests[1] != digests[2]
     assert not [
         path for method, path in store.requests if method == "GET" and "/key/" in path
@@ -163,6 +161,14 @@ def test_a_set_is_pushed_and_pulled(tmp_path: Path, recordings: Path, store: Obj
     assert digest_folder(tmp_path / "back") == digest_folder(recordings)
     with pytest.raises(ArtifactError, match="Folder exists already"):
         pull(where, tmp_path / "back")
+
+
+def test_the_card_takes_the_place_of_a_page_that_is_gone(tmp_path: Path, recordings: Path) -> None:
+    (recordings / "README.md").write_text("of its own")
+    push(recordings, str(tmp_path / "there"))
+    (recordings / "README.md").unlink()
+    push(recordings, str(tmp_path / "there"))
+    assert (tmp_path / "there/README.md").read_text().startswith("---\n")
 
 
 @pytest.mark.slow
