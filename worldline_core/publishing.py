@@ -24,7 +24,7 @@ from worldline_core.config import StrictModel
 from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import for_evaluation_only
-from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
 from worldline_core.http_exchange import hub_access
 from worldline_core.report.data import write_card
 from worldline_core.store.artifact_files import (
@@ -76,7 +76,8 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
 
     Raises: DataError when the folder is no set, or its licences do not allow it; ArtifactError when the set is damaged or
         not self-contained, the location holds something else or has another visibility, or the store refuses;
-        ConfigError for an unknown location; UnreachableInputError when the store does not answer.
+        ConfigError for an unknown location; UnavailableError without a token; UnreachableInputError when the store does not
+        answer.
     """
     verify_artifact(folder)
     require_whole_set(folder)
@@ -279,6 +280,9 @@ class _Repository:
 
         Raises: ArtifactError when it exists with another visibility: private data must not become public.
         """
+        if not self._api.token:
+            step = "make a token with write access and export HF_TOKEN"
+            raise UnavailableError("Pushing to the hub needs a token", where=self._where, next_step=step)
         self._api.create_repo(**self._repo, private=not public, exist_ok=True)
         if bool(self._api.repo_info(**self._repo).private) == public:
             raise ArtifactError(

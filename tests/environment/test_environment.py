@@ -235,7 +235,12 @@ def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLin
 @pytest.mark.slow
 def test_a_further_model_bounds_what_one_model_promises(world: WorldLine, shipped: Path) -> None:
     """Two models side by side are the two alone: the lower score, their difference, and a success that both see."""
-    options: dict[str, Any] = {"episode_frames": 32, "embodiment": ROBOT, "reward": "soft", "splits": ("test", "ood_test")}
+    options: dict[str, Any] = {
+        "episode_frames": 32,
+        "embodiment": ROBOT,
+        "reward": "soft",
+        "splits": ("test", "ood_test"),
+    }
     stage2 = WorldLine.from_pretrained(shipped / "models" / "stage2", steps=1)
     given = {"model": world, "members": [stage2]}
     alone = [WorldLineVectorEnv(5, model=model, **options) for model in (world, stage2)]
