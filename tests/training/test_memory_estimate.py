@@ -18,13 +18,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import MixtureConfig, WanConfig
 from worldline_core.pipeline import memory_estimate, memory_trace
-from worldline_core.pipeline.memory_estimate import (
-    Estimate,
-    Sources,
-    Training,
-    Work,
-    trainings,
-)
+from worldline_core.pipeline.memory_estimate import Estimate, Sources, Training, Work, outlined, trainings
 from worldline_core.pipeline.memory_trace import Held
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import SizeSheet
@@ -58,13 +52,11 @@ objective = partial(FlowMatchingObjective, sigma=SigmaSampling(), weighting=Loss
 
 
 def training_of(config, frames=33, lora=None, **trainer):
-    def work(model):
-        batch, minimised = SOURCE.batch(config, 1, config.views, frames), objective(model)
-        return Work(lambda step: minimised.loss(batch, torch.Generator(), step)[0], (model,))
+    def work(config):
+        batch, model = SOURCE.batch(config, 1, config.views, frames), outlined(config, lora)
+        return Work(partial(objective(model).loss, batch, torch.Generator()), [model])
 
-    return Training(
-        "stage", TrainerConfig.model_validate({"steps": 2, "batch_size": 1, **trainer}), config, work, lora=lora
-    )
+    return Training("stage", TrainerConfig.model_validate({"steps": 2, "batch_size": 1, **trainer}), config, work)
 
 
 EIGHT_BITS = {"weights": "bf16", "optimizer": {"moments": "8bit"}, "average": "host"}
@@ -206,7 +198,8 @@ def test_a_training_that_cannot_fit_its_card_is_refused_before_it_begins(world, 
     config, inputs = Stage1Config.model_validate(values), {"episodes": world.episodes, "latents": world.latents}
     if resident:
         config = config.model_copy(update={"input": LatentInput(resident=True)})
-    (training,) = trainings(config, config.model, memory_estimate._sources(config, inputs))
+    latents = LatentStore.open(world.latents)
+    (training,) = trainings(config, config.model, Sources(None, None, latents.image_size, latents.latent_shape[1:]))
     kept = memory_estimate.resident_bytes(config, inputs, config.model)
     need = (training.estimate(1).total + kept) / memory_estimate.USABLE
     monkeypatch.setattr(memory_estimate, "device_memory", lambda _device: 1.001 * need)

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -34,7 +34,7 @@ from worldline_core.model.mixture import is_text_parameter
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import spatial_compression, tokenizer_outline
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import MixtureConfig, WanConfig, WorldModelConfig
+from worldline_core.model.world_model_config import WanConfig, WorldModelConfig
 from worldline_core.pipeline.memory_trace import Held, extrapolated, traced
 from worldline_core.training.adapters import add_adapters, share_frozen
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
@@ -44,14 +44,13 @@ from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.optimizers import BLOCK, in_eight_bits
 from worldline_core.training.processes import hold_weights
-from worldline_core.training.relational import ClipSimilarities, RelationalTerm, SimilarityMatrices, common_shape
+from worldline_core.training.relational import RelationalTerm, common_shape, similarity_matrices
 from worldline_core.training.resident import track_bytes
 from worldline_core.training.stage1 import is_trained
 from worldline_core.training.stage2 import stage2_model_config
 from worldline_core.training.trainer import autocast
 from worldline_core.training.training_config import (
     LoRAConfig,
-    RelationalConfig,
     ShardingConfig,
     Stage1Config,
     Stage2Config,
@@ -63,6 +62,7 @@ USABLE = 0.92
 """Share of a device's memory that a stage may fill; the rest is for the driver, communication and fragmentation."""
 
 AnyStage = Stage1Config | Stage2Config | DistillConfig
+Before = tuple[int, Callable[[], Held]]
 
 
 def gigabytes(size: float) -> str:
@@ -90,31 +90,28 @@ class Sources:
     def batch(self, model: WorldModelConfig, clips: int, views: Sequence[str], frames: int, text: int = 0) -> Batch:
         """An uninitialised batch of clips of so many recorded frames, with maps, or with ``text`` tokens for each clip."""
         size, count = (clips, len(views)), len(latent_frame_indices(frames))
-        drawn = self.grid if model.takes_maps else (1, 1)
-        embedded = (model.text_size,) if isinstance(model, WanConfig) else ()  # in place of ids
-        texts = torch.zeros(clips, text, *embedded, dtype=torch.float32 if embedded else torch.long)
-        return Batch(
-            (Clip("", 0, frames, 1),) * clips,
-            tuple(views),
-            torch.empty(*size, model.latent_channels, count, *self.grid),
-            None if text else torch.empty(*size, model.control_channels, count, *drawn),
-            texts if text else None,
-            torch.ones(clips, text, dtype=torch.bool) if text else None,
-        )
+        latents = torch.empty(*size, model.latent_channels, count, *self.grid)
+        batch = Batch((Clip("", 0, frames, 1),) * clips, tuple(views), latents)
+        if not text:
+            drawn = self.grid if model.takes_maps else (1, 1)
+            return replace(batch, action_maps=torch.empty(*size, model.control_channels, count, *drawn))
+        tokens, mask = torch.zeros(clips, text, dtype=torch.long), torch.ones(clips, text, dtype=torch.bool)
+        if isinstance(model, WanConfig):  # embeddings in place of ids
+            tokens = torch.zeros(clips, text, model.text_size)
+        return replace(batch, text_ids=tokens, text_mask=mask)
 
     def largest(
         self, model: WorldModelConfig, trainer: TrainerConfig, clips: ClipSampling, views: Sequence[str], text: int = 0
     ) -> Batch:
-        """The largest micro-batch, of the longest clips."""
-        views, count = self.shown(trainer, clips, views)
-        return self.batch(model, count, views, max(clips.lengths), text)
-
-    @staticmethod
-    def shown(trainer: TrainerConfig, clips: ClipSampling, views: Sequence[str]) -> tuple[Sequence[str], int]:
-        """All views where steps are joint, else one, and the number of clips in a micro-batch."""
+        """The largest micro-batch, of the longest clips: in all views where steps are joint, else in one."""
         joint = clips.view_weights is None or {JOINT, SUBSET} & clips.view_weights.keys()
         count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
-        return views, count * trainer.batch_size
+        return self.batch(model, count * trainer.batch_size, views, max(clips.lengths), text)
+
+    def encoding(self, batch: Batch, trainer: TrainerConfig) -> Before:
+        """What encodes a batch, one view of a clip after the other."""
+        encode = partial(self.looking, "tokenizer", batch.clips[0].num_frames, trainer.precision)
+        return len(batch.clips) * len(batch.views), encode
 
     @cache  # noqa: B019 - a few sources a process
     def looking(
@@ -157,39 +154,41 @@ class Estimate:
 
 
 class Work(NamedTuple):
-    """A device's repeated work: ``run``, by the step's number, returns the loss where something is trained.
+    """A device's repeated work.
 
     Attributes:
+        run: by the step's number; where something is trained, its loss comes first.
         models, scores: world models that are trained, the first alone averaged, and those that are not.
         whole: other models that are not trained, whole on every device.
+        before: what is done before ``run``, and how often: clips are encoded, a teacher looks at them.
     """
 
-    run: Callable[[int], Any]
-    models: Sequence[WorldModel] = ()
+    run: Callable[[int], Sequence[Any]]
+    models: Sequence[WorldModel]
     scores: Sequence[WorldModel] = ()
     whole: Mapping[str, nn.Module] = {}
+    before: Sequence[Before] = ()
 
 
-def adapted(config: WorldModelConfig, lora: LoRAConfig) -> WorldModel:
-    """A model with adapters, made within a FakeTensorMode; peft, which moves them from device to device, does so outside of it."""
-    with unset_fake_temporarily(), torch.device("meta"):
+def outlined(config: WorldModelConfig, lora: LoRAConfig | None) -> WorldModel:
+    """A model without values, with adapters where they are asked for; call it as `Training.outline`."""
+    if lora is None:
+        return build_world_model(config)
+    with unset_fake_temporarily(), torch.device("meta"):  # peft moves adapters from device to device
         model = build_world_model(config)
         add_adapters(model, lora, 0)
     return model._apply(lambda one: torch.empty(one.shape, dtype=one.dtype))
 
 
-def _new_bytes(model: nn.Module, seen: set[int]) -> float:
-    """Bytes of a model's weights whose storages no other model has named yet."""
-    found = {value.untyped_storage()._cdata: value.nbytes for value in model.parameters()}
-    new = {key: size for key, size in found.items() if key not in seen}
-    seen.update(new)
-    return sum(new.values())
+def _weight_bytes(models: Sequence[nn.Module]) -> int:
+    """Bytes of models' weights; those that share a storage count once."""
+    weights = [value for model in models for value in model.parameters()]
+    return sum({value.untyped_storage()._cdata: value.nbytes for value in weights}.values())
 
 
 def _moment_bytes(parameter: Tensor, trainer: TrainerConfig) -> float:
-    if trainer.optimizer.moments == "8bit" and in_eight_bits(parameter):
-        return 2 * (1 + 4 / BLOCK) * parameter.numel()
-    return 2 * 4 * parameter.numel()
+    eight_bits = trainer.optimizer.moments == "8bit" and in_eight_bits(parameter)
+    return 2 * parameter.numel() * (1 + 4 / BLOCK if eight_bits else 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,35 +196,27 @@ class Training:
     """One training, by its configuration alone.
 
     Attributes:
-        work: a step with a model of some depth, made without values.
-        trained: whether a parameter gets gradients, by its name.
+        work: a step of the model, whose depth may be another one, made without values.
         turns: numbers of steps, one of each kind that the training takes (distribution matching alternates), and their shares.
-        before: what is done before a step's forward pass, and how often: clips are encoded, a teacher looks at them.
     """
 
     title: str
     trainer: TrainerConfig
     model: WorldModelConfig
-    work: Callable[[WorldModel], Work]
-    trained: Callable[[str], bool] = lambda _: True
-    lora: LoRAConfig | None = None
-    turns: Mapping[int, float] = field(default_factory=lambda: {0: 1.0})
-    before: Sequence[tuple[int, Callable[[], Held]]] = ()
+    work: Callable[[WorldModelConfig], Work]
+    turns: Sequence[tuple[int, float]] = ((0, 1.0),)
 
-    def outline(self, layers: int, weights: Literal["fp32", "bf16"] | None = None) -> Work:
-        """The step of a model of so many layers; call it within a FakeTensorMode.
+    def outline(self, layers: int, weights: Literal["fp32", "bf16"] | None) -> Work:
+        """The step of a model of so many layers; call it within a FakeTensorMode, or to count weights on the device "meta".
 
         Args:
             weights: those of trained matrices as a device computes with them; None: all in float32, as shards are kept.
         """
-        network = build_world_model(self.model.model_copy(update={"num_layers": layers}))
-        for name, parameter in network.named_parameters():
-            parameter.requires_grad_(self.trained(name))
-        work = self.work(network if self.lora is None else adapted(network.config, self.lora))
+        work = self.work(self.model.model_copy(update={"num_layers": layers}))
         if weights is not None:
             for one in (*work.models, *work.scores):
                 hold_weights(one, self.trainer.precision, weights)
-            if self.lora is not None and len(work.models) > 1:
+            if len(work.models) > 1:
                 share_frozen(work.models[1], work.scores[0])
         return work
 
@@ -238,18 +229,17 @@ class Training:
                 work = self.outline(layers, "bf16" if sharded else trainer.weights)
                 for one in (*work.models, *work.scores):
                     one.checkpointing = trainer.sharding.checkpointing
+                weights = [value for one in work.models for value in one.parameters()]
 
                 def loss() -> Tensor:
                     with autocast(trainer):
-                        return work.run(step)
+                        return work.run(step)[0]
 
-                return traced(loss, [value for one in work.models for value in one.parameters()])
+                return traced(loss, weights)
 
-        steps = {step: extrapolated(partial(trace, step), self.model.num_layers) for step in self.turns}
-        before = [(times, held()) for times, held in self.before]
-        most = max([*(max(held[:2]) for held in steps.values()), *(held.forward for _, held in before)])
-        operations = sum(share * steps[step].operations for step, share in self.turns.items())
-        return Held(most, 0, operations + sum(times * held.operations for times, held in before))
+        kinds = [extrapolated(partial(trace, step), self.model.num_layers) for step, _ in self.turns]
+        operations = sum(share * held.operations for (_, share), held in zip(self.turns, kinds, strict=True))
+        return Held(max(max(held[:2]) for held in kinds), 0, operations)
 
     def estimate(self, devices: int) -> Estimate:
         """Memory on each of so many devices that share the training."""
@@ -257,116 +247,118 @@ class Training:
         shards, clips = min(sharding.shards or devices, devices), trainer.batch_size * devices
         micro_steps = trainer.accumulation if trainer.global_batch is None else -(-trainer.global_batch // clips)
         held = self._held(sharded=shards > 1)
-        with FakeTensorMode():
+        with torch.device("meta"):
             work = self.outline(self.model.num_layers, trainer.weights if shards == 1 else None)
+        before = [(times, look()) for times, look in work.before]
         trained = [[value for value in model.parameters() if value.requires_grad] for model in work.models]
-        count = sum(value.numel() for values in trained for value in values)
+        counts = [sum(value.numel() for value in values) for values in trained]
         block = sum(value.numel() for value in work.models[0].layers[0].parameters())
         summed = micro_steps == 1 or sharding.reduce_every_micro_step
-        seen: set[int] = set()
-        scores = sum(_new_bytes(score, seen) for score in work.scores)
+        scores = _weight_bytes(work.scores)
         parts = {
-            "weights": sum(_new_bytes(model, seen) for model in work.models) / shards,
+            "weights": (_weight_bytes([*work.scores, *work.models]) - scores) / shards,
             "moments": sum(_moment_bytes(value, trainer) for values in trained for value in values) / shards,
-            "average": (trainer.average == "device") * sum(4 * value.numel() for value in trained[0]) / shards,
+            "average": (trainer.average == "device") * 4 * counts[0] / shards,
             **{name: sum(value.nbytes for value in one.state_dict().values()) for name, one in work.whole.items()},
             "frozen scores": scores / shards,
             # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
             "gathered": 0 if shards == 1 else block * (2 * 2 + 2 + 4),
             "gradients": max(sum(value.nbytes for value in values) for values in trained) / (shards if summed else 1),
-            "activations": held.forward,
+            "activations": max([held.forward, *(look.forward for _, look in before)]),
         }
-        operations = micro_steps * held.operations if trainer.precision == "bf16" else None
-        parts = {name: size for name, size in parts.items() if size}
-        parameters = count or sum(value.numel() for value in work.models[0].parameters())
-        return Estimate(self.title, parameters, parts, operations, trainer.steps, trainer.minutes)
-
-
-class _Similarities(ClipSimilarities):
-    """Similarity matrices of a relational teacher."""
-
-    def __init__(self, config: RelationalConfig) -> None:
-        self.config = config
-
-    def similarities(
-        self, clips: Sequence[Clip], views: Sequence[str], grid: tuple[int, int, int], frames: Tensor | None = None
-    ) -> SimilarityMatrices:
-        shape = bins, rows, columns = common_shape(self.config, grid)
-        count, cells = len(clips), rows * columns
-        cross = torch.empty(count, len(views) - 1, bins, cells, cells)
-        return SimilarityMatrices(shape, torch.empty(count, len(views), bins - 1, cells, cells), cross)
+        operations = micro_steps * (held.operations + sum(times * look.operations for times, look in before))
+        return Estimate(
+            self.title,
+            parameters=sum(counts) or sum(value.numel() for value in work.models[0].parameters()),
+            parts={name: size for name, size in parts.items() if size},
+            operations=operations if trainer.precision == "bf16" else None,
+            steps=trainer.steps,
+            minutes=trainer.minutes,
+        )
 
 
 def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> list[Training]:
     """The trainings of one step, in their order."""
-    frames = isinstance(config.input, FrameInput)
-
-    def encoded(clips: ClipSampling, views: Sequence[str], trainer: TrainerConfig) -> tuple[int, Callable[[], Held]]:
-        shown, count = source.shown(trainer, clips, views)
-        return count * len(shown), partial(source.looking, "tokenizer", max(clips.lengths), trainer.precision)
-
-    if isinstance(config, DistillConfig):
-        model, first = model.model_copy(update={"towers": "generation"}), config.teacher_forcing.trainer
-        found = [
-            Training(
-                f"distill: {part.replace('_', ' ')}", getattr(config, part).trainer, model,
-                partial(_distillation, part, config, source), lora=config.lora,
-                turns={0: 1 - 1 / CYCLE, CYCLE - 1: 1 / CYCLE} if part == "distribution_matching" else {0: 1.0},
-                before=[encoded(config.first_clips, config.views, first)] if part == "teacher_forcing" and frames else [],
-            )
-            for part in ("teacher_forcing", "trajectory_regression", "distribution_matching")
-        ]  # fmt: skip
-        return [found[0], _trajectory_shard(config, model, source), *found[1:]]
-    relational = config.relational if isinstance(config, Stage2Config) else None
-    stage1 = config if isinstance(config, Stage1Config) else None
-    text, tower = (0, "") if stage1 is None else (stage1.text.max_length, stage1.text_tower)
-    whole_model, model = model, model.model_copy(update={"towers": "generation"}) if tower == "stored" else model
-
-    def work(network: WorldModel) -> Work:
-        batch, term = source.largest(model, config.trainer, config.clips, model.views, text), None
-        whole: dict[str, nn.Module] = {"tokenizer": tokenizer_outline(source.tokenizer)} if frames else {}
-        if relational is not None:
-            whole["teacher"] = teacher_outline(source.teacher)[0]
-            term = RelationalTerm(relational, _Similarities(relational), network.config.num_layers)
-            term.layer = max(1, network.config.num_layers // 2)  # it makes no difference which: all are held
-        objective = FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
-        if tower == "stored":
-            layers = network.config.num_layers
-            reader = build_world_model(whole_model.model_copy(update={"num_layers": layers}))
-            hold_weights(reader, "bf16", "bf16")
-            objective.encode_text = torch.no_grad()(reader.encode_text)
-
-        def run(step: int) -> Tensor:
-            return objective.loss(batch, torch.Generator(), step)[0]
-
-        return Work(run, (network,), whole=whole)
-
-    title = "stage II" if stage1 is None else {"base": "base", "stage1": "stage I"}[stage1.kind]
-    before = [encoded(config.clips, model.views, config.trainer)] if frames else []
-    if relational is not None:
-        longest, precision, count = max(config.clips.lengths), config.trainer.precision, len(model.views)
-        teaching = partial(source.looking, "teacher", longest, precision, count)
-        before.append((config.trainer.batch_size, teaching))
-    trained = partial(_stage1_trains, tower) if text else lambda _: True
-    return [Training(title, config.trainer, model, work, trained, config.lora, before=before)]
+    if not isinstance(config, DistillConfig):
+        title = "stage II" if isinstance(config, Stage2Config) else {"base": "base", "stage1": "stage I"}[config.kind]
+        return [Training(title, config.trainer, model, partial(_flow_matching, config, source))]
+    steps = config.trajectory_regression.trajectories
+    clips = min(steps.clips, steps.clips_per_shard)
+    shard = TrainerConfig(
+        steps=-(-steps.clips // clips),
+        batch_size=clips,
+        precision=config.trajectory_regression.trainer.precision,
+        sharding=ShardingConfig(shards=1),
+    )
+    # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
+    passes = (1 + sum(steps.substeps)) / (1 + config.spec.steps)
+    model = model.model_copy(update={"towers": "generation"})
+    parts = {
+        "teacher forcing": (config.teacher_forcing.trainer, ((0, 1.0),)),
+        f"trajectories (a shard of {clips} clips)": (shard, ((0, passes),)),
+        "trajectory regression": (config.trajectory_regression.trainer, ((0, 1.0),)),
+        "distribution matching": (config.distribution_matching.trainer, ((0, 1 - 1 / CYCLE), (CYCLE - 1, 1 / CYCLE))),
+    }
+    return [
+        Training(f"distill: {part}", trainer, model, partial(_distillation, part, config, source, trainer), turns)
+        for part, (trainer, turns) in parts.items()
+    ]
 
 
-def _stage1_trains(tower: str, name: str) -> bool:
-    return is_trained(name) and (tower == "trained" or not is_text_parameter(name))
+def _flow_matching(config: Stage1Config | Stage2Config, source: Sources, model: WorldModelConfig) -> Work:
+    """A step of Stage I or II."""
+    trainer, first = config.trainer, config if isinstance(config, Stage1Config) else None
+    stored = first is not None and first.text_tower == "stored"
+    network = outlined(model.model_copy(update={"towers": "generation"}) if stored else model, config.lora)
+    if first is not None and config.lora is None:
+        for name, value in network.named_parameters():
+            read = is_text_parameter(name) and first.text_tower != "trained"
+            value.requires_grad_(is_trained(name) and not read)
+    text = 0 if first is None else first.text.max_length
+    batch = source.largest(model, trainer, config.clips, model.views, text)
+    whole, before, term = dict[str, nn.Module](), list[Before](), None
+    if isinstance(config.input, FrameInput):
+        whole["tokenizer"] = tokenizer_outline(source.tokenizer)
+        before.append(source.encoding(batch, trainer))
+    if isinstance(config, Stage2Config) and config.relational is not None:
+        relational = config.relational.model_copy(update={"student_layer": None})  # all are held, whichever it is
+        whole["teacher"] = teacher_outline(source.teacher)[0]
+        term = RelationalTerm(relational, cast("Any", None), network.config.num_layers)
+        term.targets = lambda batch, grid: similarity_matrices(
+            torch.empty(*batch.latents.shape[:2], *grid, 1), common_shape(relational, grid)
+        )
+        frames, views = max(config.clips.lengths), len(model.views)
+        before.append((trainer.batch_size, partial(source.looking, "teacher", frames, trainer.precision, views)))
+    objective = FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
+    if stored:
+        reader = hold_weights(build_world_model(model), "bf16", "bf16")
+        objective.encode_text = torch.no_grad()(reader.encode_text)
+    return Work(partial(objective.loss, batch, torch.Generator()), [network], whole=whole, before=before)
 
 
-def _distillation(part: str, config: DistillConfig, source: Sources, network: WorldModel) -> Work:
-    """A step of one of the three trainings of Stage III."""
-    first, model = config.teacher_forcing, network.config
-    clips = config.first_clips if part == "teacher_forcing" else config.clips
-    batch = source.largest(model, getattr(config, part).trainer, clips, config.views)
-    whole: dict[str, nn.Module] = {}
+def _distillation(
+    part: str, config: DistillConfig, source: Sources, trainer: TrainerConfig, model: WorldModelConfig
+) -> Work:
+    """A step of one of the trainings of Stage III, or a shard of trajectories, whose clips are made together."""
+    making, forcing = part.startswith("trajectories"), part == "teacher forcing"
+    batch = source.largest(model, trainer, config.first_clips if forcing else config.clips, config.views)
+    whole, before, distance = dict[str, nn.Module](), list[Before](), None
     if isinstance(config.input, FrameInput):  # it stays, though the later steps use the latents of the trajectories
         whole["encoder"] = tokenizer_outline(source.tokenizer)
-    models, scores, distance = [network], list[WorldModel](), None
-    if part == "teacher_forcing":
-        scores = [build_world_model(model).requires_grad_(False)] if first.teacher_share else []
-        objective: Any = TeacherForcingObjective(network, config, *scores)
+        before = [source.encoding(batch, trainer)] if making or forcing else []
+    frozen = build_world_model(model).requires_grad_(False)
+    if making:
+
+        def run(_: int) -> Sequence[Tensor]:
+            noise, spec = torch.empty_like(batch.latents), config.spec
+            given = frozen, batch.latents, maps_of(batch), noise
+            return [teacher_trajectories(*given, views=batch.views, spec=spec, substeps=(1,) * spec.steps)]
+
+        return Work(run, [frozen], whole=whole, before=before)
+    models, scores = [outlined(model, config.lora)], list[WorldModel]()
+    if forcing:
+        scores = [frozen] if config.teacher_forcing.teacher_share else []
+        objective: Any = TeacherForcingObjective(models[0], config, *scores)
     else:
         shown, views, channels, frames, *grid = batch.latents.shape
         nodes = torch.empty(shown, config.spec.steps + 1, views, channels, frames - 1, *grid)
@@ -382,49 +374,12 @@ def _distillation(part: str, config: DistillConfig, source: Sources, network: Wo
             perceptual = PerceptualLoss(decoder, lpips, config.perceptual.latent_frames)
             # One view after the other, and what comes before the compared frames without gradients: neither adds up.
             distance = lambda a, b: perceptual(a[:1, :1, :, -compared:], b[:1, :1, :, -compared:])  # noqa: E731
-        if part == "trajectory_regression":
-            objective = TrajectoryObjective(network, config, distance)
+        if part == "trajectory regression":
+            objective = TrajectoryObjective(models[0], config, distance)
         else:
-            fake = build_world_model(model) if config.lora is None else adapted(model, config.lora)
-            real = build_world_model(model).requires_grad_(False)
-            models, scores = [network, fake], [real]
-            objective = DistributionMatchingObjective(network, real, fake, config, distance)
-
-    def run(step: int) -> Tensor:
-        return objective.loss(batch, torch.Generator(), step)[0]
-
-    return Work(run, models, scores, whole)
-
-
-def _trajectory_shard(config: DistillConfig, model: WorldModelConfig, source: Sources) -> Training:
-    """A shard of the teacher's trajectories, whose clips are made together; the teacher is whole on every device."""
-    regression, steps = config.trajectory_regression, config.trajectory_regression.trajectories
-    clips, longest = min(steps.clips, steps.clips_per_shard), max(config.clips.lengths)
-    frames = isinstance(config.input, FrameInput)
-
-    def work(teacher: WorldModel) -> Work:
-        batch = source.batch(model, clips, config.views, longest)
-
-        def run(_: int) -> None:
-            teacher_trajectories(
-                teacher, batch.latents, maps_of(batch), torch.empty_like(batch.latents), views=batch.views,
-                spec=config.spec, substeps=(1,) * config.spec.steps,
-            )  # fmt: skip
-
-        return Work(run, [teacher], whole={"encoder": tokenizer_outline(source.tokenizer)} if frames else {})
-
-    trainer = TrainerConfig(
-        steps=-(-steps.clips // clips),
-        batch_size=clips,
-        precision=regression.trainer.precision,
-        sharding=ShardingConfig(shards=1),
-    )
-    encoded = (clips * len(config.views), partial(source.looking, "tokenizer", longest, trainer.precision))
-    return Training(
-        f"distill: trajectories (a shard of {clips} clips)", trainer, model, work, trained=lambda _: False,
-        # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
-        turns={0: (1 + sum(steps.substeps)) / (1 + config.spec.steps)}, before=[encoded] if frames else [],
-    )  # fmt: skip
+            models, scores = [*models, outlined(model, config.lora)], [frozen]
+            objective = DistributionMatchingObjective(models[0], frozen, models[1], config, distance)
+    return Work(partial(objective.loss, batch, torch.Generator()), models, scores, whole, before)
 
 
 def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
@@ -436,28 +391,32 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
     if not isinstance(config, AnyStage):
         return
     device = (config.teacher_forcing if isinstance(config, DistillConfig) else config).trainer.device
-    memory, source = device_memory(device), _sources(config, inputs)
-    start = inputs.get({Stage1Config: "base", Stage2Config: "stage1", DistillConfig: "stage2"}[type(config)])
-    if memory is None or source is None or (start is None and not isinstance(config, Stage1Config)):
+    memory, frames = device_memory(device), isinstance(config.input, FrameInput)
+    if memory is None or ("tokenizer" if frames else "latents") not in inputs:
         return  # the training itself names the input that is missing
-    model = config.model if isinstance(config, Stage1Config) else MixtureConfig()
-    if start is not None:
-        model = read_checkpoint_info(Path(start)).config
+    folders = inputs.get("tokenizer"), inputs.get("teacher")
+    if isinstance(config.input, FrameInput):
+        source = Sources.of(*folders, config.input.image_size)
+    else:
+        latents = LatentStore.open(inputs["latents"])
+        source = Sources(*folders, latents.image_size, latents.latent_shape[1:])
+    start = next((inputs[name] for name in ("base", "stage1", "stage2") if name in inputs), None)
+    model = cast("Stage1Config", config).model if start is None else read_checkpoint_info(start).config
     if isinstance(config, Stage2Config):
         model = stage2_model_config(config, model)
     resident = resident_bytes(config, inputs, model)
-    instead = "set input.resident to false, " if resident else ""
     for training in trainings(config, model, source):
         need = training.estimate(int(os.environ.get("WORLD_SIZE", "1")))
-        need = replace(need, parts={**need.parts, **({"resident input": resident} if resident else {})})
+        if resident:
+            need = replace(need, parts={**need.parts, "resident input": resident})
         if not need.fits(memory):
             raise ConfigError(
                 "This training does not fit the device's memory.",
                 where=f"{need.title} on {device}",
                 expected=f"at most {gigabytes(USABLE * memory)} GB",
                 got=f"{gigabytes(need.total)} GB ({need.describe_parts()})",
-                next_step=f"{instead}take more devices or what `worldline plan --fit` proposes, first "
-                "trainer.sharding.checkpointing: block",
+                next_step=f"{'set input.resident to false, ' if resident else ''}take more devices or what `worldline plan --fit` "
+                "proposes, first trainer.sharding.checkpointing: block",
             )
 
 
@@ -467,8 +426,8 @@ def resident_bytes(config: AnyStage, inputs: Mapping[str, Path], model: WorldMod
         return 0
     distilled = isinstance(config, DistillConfig)
     weighting = (config.teacher_forcing if distilled else config).weighting
-    latents, views = LatentStore.open(Path(inputs["latents"])), config.views if distilled else model.views
-    tracks = ActionTracks.open(Path(inputs["tracks"])).rows if "tracks" in inputs else []
+    latents, views = LatentStore.open(inputs["latents"]), config.views if distilled else model.views
+    tracks = ActionTracks.open(inputs["tracks"]).rows if "tracks" in inputs else []
     samples = track_bytes(len(views), max((len(row["arms"] or ()) for row in tracks), default=0), model.native_size)
     shares = 2 * math.prod(latents.latent_shape[1:]) if any(weighting.things) else 0
     return latents.stored_bytes + sum(row.num_frames * (samples + len(row.views) * shares) for row in latents.rows)
@@ -478,13 +437,3 @@ def device_memory(device: str) -> float | None:
     """Bytes of a card; None for a processor, whose memory the system shares out."""
     on_gpu = torch.device(device).type == "cuda"
     return float(torch.cuda.get_device_properties(device).total_memory) if on_gpu else None
-
-
-def _sources(config: AnyStage, inputs: Mapping[str, Path]) -> Sources | None:
-    tokenizer, teacher = (Path(inputs[name]) if name in inputs else None for name in ("tokenizer", "teacher"))
-    if isinstance(config.input, FrameInput):
-        return None if tokenizer is None else Sources.of(tokenizer, teacher, config.input.image_size)
-    if "latents" not in inputs:
-        return None
-    latents = LatentStore.open(Path(inputs["latents"]))
-    return Sources(tokenizer, teacher, latents.image_size, latents.latent_shape[1:])
