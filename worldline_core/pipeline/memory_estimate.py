@@ -346,19 +346,20 @@ def _distillation(
     if isinstance(config.input, FrameInput):  # it stays, though the later steps use the latents of the trajectories
         whole["encoder"] = tokenizer_outline(source.tokenizer)
         before = [source.encoding(batch, trainer)] if making or forcing else []
-    frozen = build_world_model(model).requires_grad_(False)
+    network = outlined(model, None if making else config.lora)
     if making:
+        network.requires_grad_(False)
 
         def run(_: int) -> Sequence[Tensor]:
             noise, spec = torch.empty_like(batch.latents), config.spec
-            given = frozen, batch.latents, maps_of(batch), noise
+            given = network, batch.latents, maps_of(batch), noise
             return [teacher_trajectories(*given, views=batch.views, spec=spec, substeps=(1,) * spec.steps)]
 
-        return Work(run, [frozen], whole=whole, before=before)
-    models, scores = [outlined(model, config.lora)], list[WorldModel]()
+        return Work(run, [network], whole=whole, before=before)
+    models, scores = [network], list[WorldModel]()
     if forcing:
-        scores = [frozen] if config.teacher_forcing.teacher_share else []
-        objective: Any = TeacherForcingObjective(models[0], config, *scores)
+        scores = [build_world_model(model).requires_grad_(False)] if config.teacher_forcing.teacher_share else []
+        objective: Any = TeacherForcingObjective(network, config, *scores)
     else:
         shown, views, channels, frames, *grid = batch.latents.shape
         nodes = torch.empty(shown, config.spec.steps + 1, views, channels, frames - 1, *grid)
@@ -375,10 +376,10 @@ def _distillation(
             # One view after the other, and what comes before the compared frames without gradients: neither adds up.
             distance = lambda a, b: perceptual(a[:1, :1, :, -compared:], b[:1, :1, :, -compared:])  # noqa: E731
         if part == "trajectory regression":
-            objective = TrajectoryObjective(models[0], config, distance)
+            objective = TrajectoryObjective(network, config, distance)
         else:
-            models, scores = [*models, outlined(model, config.lora)], [frozen]
-            objective = DistributionMatchingObjective(models[0], frozen, models[1], config, distance)
+            models, scores = [network, outlined(model, config.lora)], [build_world_model(model).requires_grad_(False)]
+            objective = DistributionMatchingObjective(network, scores[0], models[1], config, distance)
     return Work(partial(objective.loss, batch, torch.Generator()), models, scores, whole, before)
 
 
