@@ -7,62 +7,52 @@ backward pass, as the tokenizers and Stage III do.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch._guards import detect_fake_mode
 from torch._subclasses.fake_tensor import FakeTensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.flop_counter import flop_registry, sdpa_backward_flop_count, sdpa_flop_count
+from torch.utils.flop_counter import flop_registry
 
-_META = torch.device("meta")
 WHOLE = 8
 """Most layers of a model that is traced as it is."""
 SHALLOW = (4, 5)
 """Depths that the line of a deeper model goes through: with fewer layers its worst moment can be another one."""
+_ATEN: Any = torch.ops.aten
+_COUNTS: dict[Any, Callable[..., int]] = {
+    **flop_registry,
+    _ATEN._scaled_dot_product_flash_attention_for_cpu: flop_registry[_ATEN._scaled_dot_product_flash_attention],
+    _ATEN._scaled_dot_product_flash_attention_for_cpu_backward: flop_registry[
+        _ATEN._scaled_dot_product_flash_attention_backward
+    ],
+}
 
 
 class Held(NamedTuple):
-    """Most bytes held at once until the loss is there, and from then on, without gradients of parameters; operations of both."""
+    """Most bytes held at once until the loss is there, and from then on, without gradients of parameters; operations of both:
+    multiplications and additions of products of matrices, convolutions and attention."""
 
     forward: float
     backward: float
     operations: float = 0.0
 
 
-class _Result(NamedTuple):
-    """What an operation returns: a value, one of its arguments, or a tensor like ``like``, on an argument's storage or its own."""
-
-    value: Any = None
-    argument: int | None = None
-    like: tuple[torch.Size, tuple[int, ...], torch.dtype, int, torch.device] | None = None
-
-
-class _Known(NamedTuple):
-    results: list[_Result]
-    form: type | None
-    """Of several results; None: a single one."""
-    operations: float
-
-
 class _Tracker(TorchDispatchMode):
     """Follows the storages that a computation allocates and frees, and counts its operations.
 
-    Decisions that depend on values (a loss is finite, a text is padded) see 0.5, 1 or True. What an operation returns for tensors of
-    some shapes is kept for the next time, which costs a third of what FakeTensorMode's own memory of it does.
+    Decisions that depend on values (a loss is finite, a text is padded) see 0.5, 1 or True. How to make what an operation returns for
+    tensors of some shapes is kept for the next time: tracing takes more than twice as long with FakeTensorMode's own memory.
     """
 
-    _known: ClassVar[dict[tuple[Any, ...], _Known]] = {}
+    _known: ClassVar[dict[Any, tuple[list[Callable[[_Tracker, list[FakeTensor]], Any]], bool, int]]] = {}
 
     def __init__(self) -> None:
         super().__init__()
-        self.live = self.most = 0
-        self.operations = 0.0
-        self._shapes: Any = detect_fake_mode()
-        self._followed: dict[int, weakref.ref[torch.UntypedStorage]] = {}
-        self._fields: dict[torch.device, dict[str, Any]] = {}
+        self.live = self.most = self.operations = 0
+        self._mode: Any = detect_fake_mode()
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
@@ -73,93 +63,68 @@ class _Tracker(TorchDispatchMode):
     ) -> Any:
         if func is torch.ops.prim.device.default:
             return args[0].fake_device
-        if func is torch.ops.aten._local_scalar_dense.default:
+        if func is _ATEN._local_scalar_dense.default:
             return True if args[0].dtype == torch.bool else 0.5 if args[0].is_floating_point() else 1
-        given: list[FakeTensor] = []
-        key: list[Any] = [func]
-        repeatable = _describe((*args, *(kwargs or {}).items()), given, key) and torch.Tag.inplace_view not in func.tags
-        if (known := self._known.get(tuple(key)) if repeatable else None) is not None:
-            self.operations += known.operations
-            values = [self._again(result, given) for result in known.results]
-            return values[0] if known.form is None else known.form(values)
-        returned = func(*args, **(kwargs or {}))
-        form = type(returned) if isinstance(returned, tuple | list) else None
-        results = [self._result(value, given) for value in (returned if form else (returned,))]
-        known = _Known(results, form, _operations(func, args, kwargs or {}, returned))
-        self.operations += known.operations
-        if repeatable:
-            self._known[tuple(key)] = known
+        kwargs, given = kwargs or {}, list[FakeTensor]()
+        key = func, _described((*args, *kwargs.items()), given)
+        if (known := self._known.get(key)) is not None:
+            makers, several, operations = known
+            self.operations += operations
+            values = [make(self, given) for make in makers]
+            return values if several else values[0]
+        returned = func(*args, **kwargs)
+        several, count = isinstance(returned, list | tuple), _COUNTS.get(func._overloadpacket)
+        makers = [self._maker(value, given) for value in (returned if several else (returned,))]
+        operations = 0 if count is None else count(*args, **kwargs, out_val=returned)
+        self.operations += operations
+        if torch.Tag.inplace_view not in func.tags:
+            self._known[key] = makers, several, operations
         return returned
 
-    def _result(self, value: Any, given: list[FakeTensor]) -> _Result:
+    def _maker(self, value: Any, given: list[FakeTensor]) -> Callable[[_Tracker, list[FakeTensor]], Any]:
+        """How to make a result again: it is no tensor, an argument, or a tensor on the storage of an argument or its own."""
         if not isinstance(value, FakeTensor):
-            return _Result(value)
-        if (same := next((n for n, tensor in enumerate(given) if tensor is value), None)) is not None:
-            return _Result(argument=same)
-        key = value.untyped_storage()._cdata
-        shared = next((n for n, tensor in enumerate(given) if tensor.untyped_storage()._cdata == key), None)
+            return lambda *_: value
+        if (same := next((n for n, one in enumerate(given) if one is value), None)) is not None:
+            return lambda _, given: given[same]
+        storage = value.untyped_storage()._cdata
+        shared = next((n for n, one in enumerate(given) if one.untyped_storage()._cdata == storage), None)
         if shared is None:
-            self._follow(value.untyped_storage())
-        like = (value.shape, value.stride(), value.dtype, int(value.storage_offset()), value.fake_device)
-        return _Result(argument=shared, like=like)
+            self._follow(value)
+        shape, stride, offset, dtype = value.shape, value.stride(), value.storage_offset(), value.dtype
+        device = value.fake_device
 
-    def _again(self, result: _Result, given: list[FakeTensor]) -> Any:
-        if result.like is None:
-            return result.value if result.argument is None else given[result.argument]
-        shape, stride, dtype, offset, device = result.like
-        # What FakeTensor's own constructor does, in a third of its time.
-        with torch._C._DisableTorchDispatch():
-            tensor = torch.empty_strided(shape, stride, dtype=dtype, device=_META)
-            if result.argument is not None:
-                tensor.set_(given[result.argument].untyped_storage(), offset, shape, stride)
-            fake = Tensor._make_subclass(
-                FakeTensor, tensor, False, dispatch_device=True, device_for_backend_keys=device
-            )
-        if device not in self._fields:
-            self._fields[device] = vars(FakeTensor(self._shapes, tensor, device))
-        vars(fake).update(self._fields[device])
-        if result.argument is None:
-            self._follow(fake.untyped_storage())
-        return fake
+        def make(tracker: _Tracker, given: list[FakeTensor]) -> FakeTensor:
+            with torch._C._DisableTorchDispatch():
+                tensor = torch.empty_strided(shape, stride, dtype=dtype, device="meta")
+                if shared is not None:
+                    tensor.set_(given[shared].untyped_storage(), offset, shape, stride)
+            made = FakeTensor(tracker._mode, tensor, device)
+            if shared is None:
+                tracker._follow(made)
+            return made
 
-    def _follow(self, storage: torch.UntypedStorage) -> None:
-        key, size = storage._cdata, storage.nbytes()
-        if key not in self._followed:
-            self.live += size
-            self.most = max(self.most, self.live)
-            self._followed[key] = weakref.ref(storage, lambda _: self._freed(key, size))
+        return make
 
-    def _freed(self, key: int, size: int) -> None:
-        del self._followed[key]
+    def _follow(self, tensor: FakeTensor) -> None:
+        storage = tensor.untyped_storage()
+        size = storage.nbytes()
+        self.live += size
+        self.most = max(self.most, self.live)
+        weakref.finalize(storage, self._free, size)
+
+    def _free(self, size: int) -> None:
         self.live -= size
 
 
-def _describe(values: Iterable[Any], given: list[FakeTensor], key: list[Any]) -> bool:
-    """Append tensors to ``given``, and to ``key`` what the result depends on; False where that is more than shapes."""
-    for value in values:
-        if isinstance(value, FakeTensor):
-            given.append(value)
-            key.append((value.dtype, value.shape, value.stride(), value.storage_offset(), value.fake_device))
-        elif isinstance(value, list | tuple):
-            key.append(len(value))
-            if not _describe(value, given, key):
-                return False
-        elif isinstance(value, Tensor):
-            return False
-        else:
-            key.append((type(value), value))
-    return True
-
-
-def _operations(func: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], returned: Any) -> float:
-    """Multiplications and additions of products of matrices, convolutions and attention."""
-    packet = func._overloadpacket
-    if packet is torch.ops.aten._scaled_dot_product_flash_attention_for_cpu:
-        return sdpa_flop_count(*(value.shape for value in args[:3]))
-    if packet is torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward:
-        return sdpa_backward_flop_count(*(value.shape for value in args[:4]))
-    count = flop_registry.get(packet)
-    return 0.0 if count is None else count(*args, **kwargs, out_val=returned)
+def _described(value: Any, given: list[FakeTensor]) -> Any:
+    """What an operation's result depends on, of an argument; tensors are appended to ``given``."""
+    if isinstance(value, FakeTensor):
+        given.append(value)
+        return value.dtype, value.shape, value.stride(), value.storage_offset(), value.fake_device
+    if isinstance(value, list | tuple):
+        return tuple(_described(one, given) for one in value)
+    return type(value), value
 
 
 def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> Held:
