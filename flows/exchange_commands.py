@@ -131,11 +131,11 @@ def _push(arguments: argparse.Namespace) -> None:
     pushed = push(
         arguments.artifact, arguments.where, public=arguments.public, allow_restricted=arguments.allow_restricted
     )
-    print(f"{arguments.where}  {len(pushed.files)} files")
+    print(f"{arguments.where}  {len(pushed.files)} files  {pushed.num_bytes / 2**20:.1f} MiB")
 
 
 def _pull(arguments: argparse.Namespace) -> None:
     from worldline_core.publishing import pull
 
     pulled = pull(arguments.where, arguments.folder)
-    print(f"{arguments.folder}  {len(pulled.files)} files")
+    print(f"{arguments.folder}  {len(pulled.files)} files  {pulled.num_bytes / 2**20:.1f} MiB")

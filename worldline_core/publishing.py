@@ -30,18 +30,17 @@ from worldline_core.report.data import write_card
 from worldline_core.store.artifact_files import (
     MANIFEST_NAME,
     VOLATILE_FOLDER,
-    content_files,
     digest_file,
+    folder_files,
     verify_artifact,
 )
-from worldline_core.store.remote import AnyPath, first_line, list_files, parse_location
+from worldline_core.store.remote import AnyPath, file_system, first_line, list_files, parse_location
 from worldline_core.store.store import folder_lock
-from worldline_core.untrusted_text import cut
 
 FILE_LIST = "worldline_files.json"
 MAX_LIST_BYTES = 64 << 20
 _FILES_AT_ONCE = 8
-_PIECE_BYTES = 8 << 20
+_PIECE_BYTES = 1 << 20
 _HUB_LOCATION = re.compile(r"hf://datasets/(?P<id>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?/?")
 
 
@@ -51,18 +50,25 @@ class PublishedFile(StrictModel):
     size: int = Field(ge=0)
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
 
+    @classmethod
+    def of(cls, path: Path) -> PublishedFile:
+        """Size and digest of the file at a path."""
+        return cls(size=path.stat().st_size, sha256=digest_file(path))
+
+    def is_at(self, path: Path) -> bool:
+        """Returns whether this is the file at a path."""
+        return path.is_file() and self.of(path) == self
+
 
 class FileList(StrictModel):
-    """The files of a set by path; neither the list itself nor the dataset card is among them."""
+    """The files of a published set by path; neither the list itself nor the dataset card is among them."""
 
     version: Literal[3] = 3
     files: dict[str, PublishedFile]
 
-    @classmethod
-    def of(cls, folder: Path) -> FileList:
-        """The files that are in a folder, in the order of their names."""
-        manifest = {p.name: {"size": p.stat().st_size, "sha256": digest_file(p)} for p in folder.glob(MANIFEST_NAME)}
-        return cls.model_validate({"files": dict(sorted((content_files(folder) | manifest).items()))})
+    @property
+    def num_bytes(self) -> int:
+        return sum(file.size for file in self.files.values())
 
 
 def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bool = False) -> FileList:
@@ -76,42 +82,32 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
 
     Raises: DataError when the folder is no set, or its licences do not allow it; ArtifactError when the set is damaged or
         not self-contained, the location holds something else or has another visibility, or the store refuses;
-        ConfigError for an unknown location; UnavailableError without a token; UnreachableInputError when the store does not
-        answer.
+        ConfigError for an unknown location; UnavailableError without a token.
     """
     verify_artifact(folder)
-    require_whole_set(folder)
+    sources = set_files(folder)
     if not allow_restricted:
         _check_may_publish(folder, public=public)
-    contents = FileList.of(folder)
-    _check_names(contents.files, folder)
-    sending = {name: folder / name for name in contents.files}
-    if "README.md" not in sending:
-        sending["README.md"] = write_card(folder, folder / VOLATILE_FOLDER / "card")
-    listed = contents.model_dump_json(indent=1).encode()
+    contents = FileList(files={name: PublishedFile.of(path) for name, path in sorted(sources.items())})
+    _check_names(sources, folder)
+    card = {} if "README.md" in sources else {"README.md": write_card(folder, folder / VOLATILE_FOLDER / "card")}
+    sending = sources | card
     with _client_errors(where, "push"):
         hub = _Repository(where) if where.startswith("hf://") else None
-        if hub is not None:
-            hub.prepare(public=public)
-        location = _location(where)
-        present, earlier = _published(location)
-        foreign = present.keys() - sending.keys() - {".gitattributes"}
-        if foreign and not earlier.files:
+        location = hub.prepare(public=public) if hub else _location(where)
+        present = _sizes(location)
+        foreign = sorted(present.keys() - sending.keys() - {".gitattributes"})
+        if FILE_LIST not in present and foreign:
             raise ArtifactError(
                 "The location holds files that are not of this set",
                 where=where,
                 expected="an empty location, or an earlier push",
-                got=cut("; ".join(sorted(foreign)), 300),
+                got=_shortened(foreign),
                 next_step="push to a location of its own",
             )
-        gone = sorted((earlier.files.keys() - sending.keys()) & present.keys())
-        if hub is not None:
-            hub.commit(sending, gone, listed)
-        else:  # the list at last
-            location.fs.put([str(path) for path in sending.values()], [str(location / name) for name in sending])
-            for name in gone:
-                location.fs.rm_file(str(location / name))
-            location.fs.pipe_file(str(location / FILE_LIST), listed)
+        earlier = _read_list(location, present).files if FILE_LIST in present else {}
+        gone = sorted((earlier.keys() - sending.keys()) & present.keys())
+        (hub.commit if hub else partial(_send, location))(sending, gone, contents.model_dump_json(indent=1).encode())
     return contents
 
 
@@ -128,46 +124,44 @@ def pull(where: str, folder: Path) -> FileList:
         if folder.exists():
             raise ArtifactError("Another command has pulled into this folder", where=folder)
         with _client_errors(where, "pull"):
-            location = _location(where)
-            present, contents = _published(location)
-            if not contents.files:
+            location = _Repository(where).pinned() if where.startswith("hf://") else _location(where)
+            present = _sizes(location)
+            if FILE_LIST not in present:
                 raise ArtifactError("No finished EpisodeSet is published here", where=where, expected=FILE_LIST)
+            contents = _read_list(location, present)
             _check_names(contents.files, where)
-            wrong = {name for name, file in contents.files.items() if present.get(name) != file.size}
-            if not wrong:
-                here = FileList.of(unfinished).files  # of an earlier, interrupted pull
-                for name in here.keys() - contents.files.keys():
-                    (unfinished / name).unlink()
-                missing = dict(contents.files.items() - here.items())
-                with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-                    list(pool.map(partial(_fetch, location, unfinished), missing, missing.values()))
-                wrong = {name for name, _ in contents.files.items() ^ FileList.of(unfinished).files.items()}
-            if wrong:
-                raise ArtifactError(
-                    "Published files are not those of the set",
-                    where=where,
-                    expected=f"the files with the sizes and digests of {FILE_LIST}",
-                    got=cut("; ".join(sorted(wrong)), 300),
-                    next_step="pull again; if it stays, delete the published copy and push the set again",
-                )
-        require_whole_set(unfinished)  # a set that refers to folders beside it would read what others put there
+            _raise_mismatch([name for name, file in contents.files.items() if present.get(name) != file.size], where)
+            for path in folder_files(unfinished, everything=True):  # of an earlier, interrupted pull
+                name = path.relative_to(unfinished)
+                if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
+                    path.unlink()
+            missing = {name: file for name, file in contents.files.items() if not file.is_at(unfinished / name)}
+            with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
+                list(pool.map(partial(_fetch, location, unfinished), missing, [file.size for file in missing.values()]))
+            _raise_mismatch([name for name, file in missing.items() if not file.is_at(unfinished / name)], where)
+        set_files(unfinished)  # a set that refers to folders beside it would read what others put there
         verify_artifact(unfinished)
         unfinished.rename(folder)
         (folder / VOLATILE_FOLDER / ".lock").unlink()
     return contents
 
 
-def require_whole_set(folder: Path) -> None:
-    """Raises: DataError when the folder is no finished EpisodeSet; ArtifactError when it needs another artifact's datasets."""
-    linked = {row.dataset for row in EpisodeSet.open(folder).rows if ".." in PurePosixPath(row.dataset).parts}
+def set_files(folder: Path) -> dict[str, Path]:
+    """The files of a finished, self-contained set, by their path in the publication.
+
+    Raises: DataError when the folder is no finished EpisodeSet; ArtifactError when it needs another artifact's datasets.
+    """
+    linked = sorted({r.dataset for r in EpisodeSet.open(folder).rows if ".." in PurePosixPath(r.dataset).parts})
     if linked:
         raise ArtifactError(
             "The set refers to datasets of another artifact",
             where=folder,
             expected="datasets inside of the folder",
-            got=cut("; ".join(sorted(linked)), 300),
+            got=_shortened(linked),
             next_step=f"make it whole first: worldline export {folder} --format lerobot --output FOLDER",
         )
+    paths = [*folder_files(folder), *(folder.glob(MANIFEST_NAME))]
+    return {path.relative_to(folder).as_posix(): path for path in paths}
 
 
 def _check_may_publish(folder: Path, *, public: bool) -> None:
@@ -202,8 +196,23 @@ def _check_names(names: Mapping[str, object], where: object) -> None:
         plain = name.isprintable() and "\\" not in name and path.as_posix() == name and not path.is_absolute()
         taken = path.parts[:1] in ((), (VOLATILE_FOLDER,), (FILE_LIST,)) or any(str(p) in names for p in path.parents)
         if not plain or taken or ".." in path.parts:
-            expected = "relative names of printable characters"
-            raise ArtifactError("A file name is unsafe or taken", where=where, expected=expected, got=repr(name))
+            what, expected = "A file name of the set is unsafe or taken", "relative names of printable characters"
+            raise ArtifactError(what, where=where, expected=expected, got=repr(name))
+
+
+def _shortened(items: list[str]) -> str:
+    return "; ".join(items[:5]) + (f"; and {len(items) - 5} more" if len(items) > 5 else "")
+
+
+def _raise_mismatch(wrong: list[str], where: str) -> None:
+    if wrong:
+        raise ArtifactError(
+            "Published files are not those of the set",
+            where=where,
+            expected=f"the files with the sizes and digests of {FILE_LIST}",
+            got=_shortened(wrong),
+            next_step="pull again; if it stays, delete the published copy and push the set again",
+        )
 
 
 @contextmanager
@@ -215,53 +224,61 @@ def _client_errors(where: str, verb: str) -> Iterator[None]:
         raise ArtifactError(
             f"The store did not finish the {verb}",
             where=where,
-            got=first_line(error),
+            got=first_line(error)[:300],
             next_step="check the name, the room and the rights (of HF_TOKEN), then run the same command again",
         ) from error
 
 
-def _location(where: str) -> UPath:
-    """A folder, an object store or the newest commit of a repository, as fsspec addresses it."""
-    if where.startswith("hf://"):
-        return _Repository(where).newest_commit()
+def _location(where: str) -> AnyPath:
+    """A folder or an object store, as fsspec addresses it."""
     location = parse_location(where)
     if isinstance(location, Path):
-        return UPath(location.absolute(), protocol="file", auto_mkdir=True)
+        return cast("AnyPath", UPath(location.absolute(), protocol="file", auto_mkdir=True))
     return location
 
 
-def _published(location: UPath) -> tuple[dict[str, int], FileList]:
-    """The size of every regular file at a location by relative name, and the list, of no files where there is none."""
-    found = list_files(cast("AnyPath", location)).items()
-    sizes = {name: about["size"] for name, about in found if about["type"] == "file" and not about.get("islink")}
-    if FILE_LIST not in sizes:
-        return sizes, FileList(files={})
+def _sizes(location: AnyPath) -> dict[str, int]:
+    """Size of every regular file at a location by its relative name."""
+    file_system(location).invalidate_cache()
+    listed = list_files(location).items()
+    return {name: about["size"] for name, about in listed if about["type"] == "file" and not about.get("islink")}
+
+
+def _read_list(location: AnyPath, present: Mapping[str, int]) -> FileList:
+    source = location / FILE_LIST
+    if present[FILE_LIST] > MAX_LIST_BYTES:
+        raise ArtifactError("List of files is too large", where=source, expected=f"at most {MAX_LIST_BYTES} bytes")
     try:
-        content = b"".join(_pieces(location / FILE_LIST, min(sizes[FILE_LIST], MAX_LIST_BYTES)))
-        return sizes, FileList.model_validate_json(content)
+        return FileList.model_validate_json(b"".join(_pieces(source, present[FILE_LIST])))
     except ValidationError as error:
-        raise ArtifactError(
-            "List of files is damaged, too large or of another version",
-            where=location / FILE_LIST,
-            expected=f"version 3 in at most {MAX_LIST_BYTES} bytes",
-            got=error.errors(include_url=False)[0]["msg"],
-        ) from error
+        got = error.errors(include_url=False)[0]["msg"]
+        raise ArtifactError("List of files is damaged or of another version", where=source, got=got) from error
 
 
-def _pieces(source: UPath, size: int) -> Iterator[Any]:
+def _pieces(source: AnyPath, size: int) -> Iterator[bytes]:
     """The content of a file, until one byte more than it should have: a server may send without end."""
+    # Of the hub's files only block size 0 is read as a stream; others are requested by range, which a server may ignore.
+    options = {"block_size": 0} if str(source).startswith("hf://") else {}
     left = size + 1
-    # Block size 0: a stream where the library has one, as a server may send all when asked for a range.
-    with source.fs.open(str(source), "rb", block_size=0) as stream:
+    with file_system(source).open(str(source), "rb", **options) as stream:
         while left and (piece := stream.read(min(_PIECE_BYTES, left))):
             left -= len(piece)
             yield piece
 
 
-def _fetch(location: UPath, folder: Path, name: str, file: PublishedFile) -> None:
+def _fetch(location: AnyPath, folder: Path, name: str, size: int) -> None:
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     with (folder / name).open("wb") as stream:
-        stream.writelines(_pieces(location / name, file.size))
+        stream.writelines(_pieces(location / name, size))
+
+
+def _send(location: AnyPath, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
+    """Send files, remove those that are gone, and write the list of what is there."""
+    fs = file_system(location)
+    fs.put([str(path) for path in sources.values()], [str(location / name) for name in sources])
+    for name in gone:
+        fs.rm_file(str(location / name))
+    fs.pipe_file(str(location / FILE_LIST), listed)
 
 
 class _Repository:
@@ -275,8 +292,8 @@ class _Repository:
         self._repo: dict[str, Any] = {"repo_id": match["id"], "repo_type": "dataset"}
         self._api = HfApi(**hub_access())
 
-    def prepare(self, *, public: bool) -> None:
-        """Make the repository and the branch where they do not exist.
+    def prepare(self, *, public: bool) -> AnyPath:
+        """Make the repository where it does not exist, and return its newest commit.
 
         Raises: ArtifactError when it exists with another visibility: private data must not become public.
         """
@@ -285,25 +302,28 @@ class _Repository:
             raise UnavailableError("Pushing to the hub needs a token", where=self._where, next_step=step)
         self._api.create_repo(**self._repo, private=not public, exist_ok=True)
         if bool(self._api.repo_info(**self._repo).private) == public:
+            names = ("private", "public")
             raise ArtifactError(
                 "Repository has another visibility than asked for",
                 where=self._where,
-                expected="public" if public else "private",
-                got="private" if public else "public",
+                expected=names[public],
+                got=names[not public],
                 next_step="push to another repository, or " + ("leave out --public" if public else "add --public"),
             )
         if self._revision is not None:
             self._api.create_branch(**self._repo, branch=self._revision, exist_ok=True)
+        return self.pinned()
 
-    def newest_commit(self) -> UPath:
-        """The files of the revision's newest commit."""
+    def pinned(self) -> AnyPath:
+        """The newest commit of the revision."""
         commit = str(self._api.repo_info(**self._repo, revision=self._revision).sha)
         if not re.fullmatch("[0-9a-f]{40}", commit):
             raise ValueError(f"the repository's commit is {commit!r}")
-        return UPath(f"hf://datasets/{self._repo['repo_id']}@{commit}", **hub_access(), skip_instance_cache=True)
+        name = f"hf://datasets/{self._repo['repo_id']}@{commit}"
+        return cast("AnyPath", UPath(name, **hub_access(), skip_instance_cache=True))
 
     def commit(self, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
-        """Send files, those that differ, with the list of what is there, and remove those that are gone."""
+        """As `_send`; the client sends what differs."""
         added = [CommitOperationAdd(name, path) for name, path in sources.items()]
         operations = [*map(CommitOperationDelete, gone), *added, CommitOperationAdd(FILE_LIST, listed)]
         message = "Upload EpisodeSet"

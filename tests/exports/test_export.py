@@ -32,7 +32,7 @@ from worldline_core.exports.export import export, export_rollout, shown_tracks, 
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.publishing import require_whole_set
+from worldline_core.publishing import set_files
 from worldline_core.store.artifact_files import write_manifest
 
 FRAMES = 20
@@ -75,7 +75,7 @@ def test_lerobots_own_class_and_tools_work_on_an_export(
         difference = np.abs(after.frames(i, "head").astype(int) - before.frames(i, "head"))
         # Whole rows are copied; the segment begins between key frames and is encoded again.
         assert difference.max() == 0 if i != 1 else difference.mean() < 2
-    require_whole_set(tmp_path / "out")  # can be pushed: nothing of it lies elsewhere
+    assert set_files(tmp_path / "out")  # can be pushed: nothing of it lies elsewhere
     assert json.loads((tmp_path / "out/sources.json").read_text()) == [{"label": "toy", "license": "MIT"}]
     from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

@@ -15,7 +15,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.util import get_temp_dir
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, cast
 
 from fsspec import AbstractFileSystem
@@ -29,14 +29,13 @@ from worldline_core.untrusted_text import carries_credentials
 
 _TRANSIENT_ERRNOS = frozenset(
     getattr(errno, name, errno.EIO)  # as network file systems report, and s3fs for answers of status 5xx
-    for name in ("EIO", "EREMOTEIO", "ESTALE", "EAGAIN", "EBUSY", "ENETDOWN", "ENETUNREACH", "ENETRESET", "EHOSTDOWN",
-                 "EHOSTUNREACH")
+    for name in ("EIO", "EREMOTEIO", "ESTALE", "EAGAIN", "EBUSY", "ETIMEDOUT", "ENETDOWN", "ENETUNREACH", "ENETRESET",
+                 "EHOSTDOWN", "EHOSTUNREACH")
 )  # fmt: skip
-_TRANSIENT_CLASSES = frozenset(  # also of botocore, aiohttp, http.client and httpx, which need not be installed
+_TRANSIENT_CLASSES = frozenset(  # of botocore, aiohttp, http.client and httpx, which need not be installed
     {
-        "ConnectionError", "TimeoutError", "UnreachableInputError", "HTTPClientError", "ResponseStreamingError",
-        "IncompleteReadError", "ResponseParserError", "ClientConnectionError", "ClientPayloadError", "IncompleteRead",
-        "TransportError",
+        "HTTPClientError", "ResponseStreamingError", "IncompleteReadError", "ResponseParserError", "ClientConnectionError",
+        "ClientPayloadError", "IncompleteRead", "TransportError",
     }
 )  # fmt: skip
 
@@ -48,13 +47,33 @@ class UnreachableInputError(UnavailableError):
 def is_transient(error: BaseException | None) -> bool:
     """Returns whether another attempt may help: the error, or one of its causes, comes from a network or a busy store."""
     while error is not None:
-        names = {kind.__name__ for kind in type(error).__mro__}
+        if isinstance(error, ConnectionError | TimeoutError | UnreachableInputError):
+            return True
+        if isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS:
+            return True
+        if any(kind.__name__ in _TRANSIENT_CLASSES for kind in type(error).__mro__):
+            return True
         status = getattr(error, "status", getattr(getattr(error, "response", None), "status_code", None))
-        busy = isinstance(status, int) and (status >= 500 or status == 429)
-        if busy or names & _TRANSIENT_CLASSES or getattr(error, "errno", None) in _TRANSIENT_ERRNOS:
+        if isinstance(status, int) and (status >= 500 or status == 429):
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+@contextmanager
+def _answering(path: AnyPath) -> Iterator[None]:
+    """Around requests to a store, which its own library repeats. Raises: UnreachableInputError when it does not answer."""
+    try:
+        yield
+    except Exception as error:
+        if not is_transient(error):
+            raise
+        raise UnreachableInputError(
+            "A store could not be reached",
+            where=path,
+            got=first_line(error),
+            next_step="run the same command again when the store answers; finished work is kept",
+        ) from error
 
 
 def first_line(error: BaseException) -> str:
@@ -97,64 +116,67 @@ def is_remote(path: AnyPath) -> bool:
     return not isinstance(path, Path)
 
 
-@contextmanager
-def requests_to(path: AnyPath) -> Iterator[Any]:
-    """The fsspec file system of a location, around requests to the store, which its own library repeats.
+def file_system(path: AnyPath) -> Any:
+    """The fsspec file system of a location.
 
-    Raises: UnavailableError where that library is not installed; UnreachableInputError when the store does not answer.
+    Raises: UnavailableError where the store's library is not installed.
     """
     try:
-        yield cast("UPath", path).fs
+        return cast("UPath", path).fs
     except ImportError as error:
         step = f"for s3:// {installing('s3')}; otherwise install the fsspec library of that store"
         raise UnavailableError("A store's library is not installed", where=path, got=error, next_step=step) from error
-    except Exception as error:
-        if not is_transient(error):
-            raise
-        step = "run the same command again when the store answers; finished work is kept"
-        raise UnreachableInputError(
-            "A store could not be reached", where=path, got=first_line(error), next_step=step
-        ) from error
 
 
 def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
-    """The store's present description of every file below `root` by relative name, sorted.
+    """The store's description of every file below `root` by relative name, sorted.
 
-    Raises: as `requests_to`.
+    Raises: UnreachableInputError when the store does not answer.
     """
-    base = cast("UPath", root).path.rstrip("/")
-    with requests_to(root) as fs:
-        fs.invalidate_cache()
-        own: Any = type(fs)._find if isinstance(fs, AsyncFileSystem) else type(fs).find
-        walks = own in (AsyncFileSystem._find, AbstractFileSystem.find)
-        found: Any = _walk(fs, base) if walks else fs.find(base, detail=True)
+    fs = file_system(root)
+    base = fs._strip_protocol(str(root)).rstrip("/")
+    with _answering(root):
+        found = _find(fs, base)
     return {name: found[path] for path in sorted(found) if (name := path.removeprefix(base).lstrip("/"))}
 
 
-def _walk(fs: Any, base: str) -> dict[str, dict[str, Any]]:
-    """As fsspec's own walk, which silently omits folders that it could not list: `on_error` does not reach deeper ones."""
+def _find(fs: Any, base: str) -> dict[str, dict[str, Any]]:
+    own: Any = type(fs)._find if isinstance(fs, AsyncFileSystem) else type(fs).find
+    if own not in (AsyncFileSystem._find, AbstractFileSystem.find):
+        return cast("dict[str, dict[str, Any]]", fs.find(base, detail=True))
+    # fsspec's own walk silently omits the folders it could not list: `on_error` does not reach folders further down.
     found: dict[str, dict[str, Any]] = {}
-    folders = [base]
+    folders = [base] if fs.exists(base) else []
     for folder in folders:
-        with suppress(FileNotFoundError):
-            listed = {about["name"].rstrip("/"): about for about in fs.ls(folder, detail=True)}
-            found |= {name: about for name, about in listed.items() if about["type"] != "directory"}
-            folders += [name for name in listed.keys() - found.keys() if name != folder]
+        listed = {about["name"].rstrip("/"): about for about in fs.ls(folder, detail=True)}
+        found |= {name: about for name, about in listed.items() if about["type"] != "directory"}
+        folders += [name for name in listed.keys() - found.keys() if name != folder]
     return found
+
+
+def remote_kind(path: AnyPath) -> str | None:
+    """The kind of a location: "file", "directory", or None for nothing.
+
+    Raises: PermissionError where the store refuses; UnreachableInputError when it does not answer, for which fsspec's
+        `isfile` returns False.
+    """
+    fs = file_system(path)
+    with _answering(path), suppress(FileNotFoundError):
+        return fs.info(str(path))["type"]
+    return None
 
 
 def remote_digest(root: AnyPath) -> str:
     """Digest of a store's listing below `root`: names, sizes and ETags (elsewhere what fsspec compares).
 
-    Raises: ArtifactError when nothing is there; as `requests_to`.
+    Raises: ArtifactError when nothing is there; UnreachableInputError when the store does not answer.
     """
-    files = list_files(root)
+    files, fs = list_files(root), file_system(root)
     if not files:
         raise ArtifactError("There is nothing at an input's location", where=root, next_step="check the URL")
-    with requests_to(root) as fs:
-        return digest_value(
-            [[name, about["size"], about.get("ETag") or fs.ukey(about["name"])] for name, about in files.items()]
-        )
+    return digest_value(
+        [[name, about["size"], about.get("ETag") or fs.ukey(about["name"])] for name, about in files.items()]
+    )
 
 
 class RemoteCache:
@@ -172,21 +194,22 @@ class RemoteCache:
 
     def place(self, path: AnyPath) -> Path:
         """The path of a remote file's copy, which repeats the store's own names, so that messages can be made portable."""
-        parts = str(path).replace("://", "/").split("/")
-        return self.folder.joinpath(*(part for part in parts if part not in ("", ".", "..")))
+        parts = PurePosixPath(file_system(path)._strip_protocol(str(path))).parts
+        kept = (part for part in parts if part not in ("/", "..", "."))
+        return self.folder.joinpath(cast("UPath", path).protocol, *kept)
 
     def fetch(self, path: AnyPath) -> Path:
         """A copy of the file on this machine.
 
-        Raises: FileNotFoundError; as `requests_to`.
+        Raises: FileNotFoundError; UnreachableInputError when the store does not answer.
         """
         with self._lock:
             copy = self.place(path)
             size = self._sizes.pop(copy, None)
             if size is None:
                 copy.parent.mkdir(parents=True, exist_ok=True)
-                with requests_to(path) as fs:
-                    fs.get_file(str(path), str(copy))
+                with _answering(path):
+                    file_system(path).get_file(str(path), str(copy))
                 size = copy.stat().st_size
             self._sizes[copy] = size
             while len(self._sizes) > 1 and sum(self._sizes.values()) > self.max_bytes:

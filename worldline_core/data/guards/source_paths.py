@@ -24,7 +24,7 @@ from worldline_core.data.guards.reader_process import still_reading
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.artifact_files import leads_out
-from worldline_core.store.remote import AnyPath, list_files, parse_location, process_cache, requests_to
+from worldline_core.store.remote import AnyPath, list_files, parse_location, process_cache, remote_kind
 
 type FileState = tuple[int, int, int, int] | None
 
@@ -199,10 +199,7 @@ def exists(path: AnyPath) -> bool:
 
 def _remote_kind(path: AnyPath) -> str | None:
     try:
-        with requests_to(path) as fs:  # fsspec's own `exists` and `isfile` say False when the store does not answer
-            return fs.info(str(path))["type"]
-    except FileNotFoundError:
-        return None
+        return remote_kind(path)
     except PermissionError as error:
         raise _not_allowed(path) from error
 
