@@ -92,11 +92,17 @@ def installing(extra: str) -> str:
 
 
 @contextmanager
-def needing(extra: str, library: str) -> Iterator[None]:
-    """Around the imports of an optional library. Raises: UnavailableError where it is not installed."""
+def needing(extra: str, library: str, *, where: str | None = None, otherwise: str = "") -> Iterator[None]:
+    """Around the imports of an optional library. Raises: UnavailableError where it is not installed.
+
+    Args:
+        where: the setting that asks for it.
+        otherwise: what can be done without it.
+    """
     try:
         yield
     except ImportError as error:
         raise UnavailableError(
-            f"{library} is not installed", expected=f"the extra `{extra}`", got=str(error), next_step=installing(extra)
-        ) from error
+            f"{library} is not installed", where=where, expected=f"the extra `{extra}`", got=str(error),
+            next_step=", or ".join(filter(None, [installing(extra), otherwise])),
+        ) from error  # fmt: skip

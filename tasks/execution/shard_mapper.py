@@ -142,7 +142,7 @@ def _outcome(shard: Shard[Any], future: Any) -> Exception | None:
 
 
 def _dask_runner(workers: int, address: str | None) -> Any:
-    with needing("dask", "A library of the runner dask"):
+    with needing("dask", "A library of the runner dask", where="runner.kind", otherwise="runner.kind=processes"):
         from dask import config as dask_config
         from prefect_dask.task_runners import DaskTaskRunner
     # Doing a shard again after its worker died is this module's business.
@@ -158,7 +158,7 @@ def _ray_runner(workers: int, address: str | None) -> Any:
         # Read when Ray is imported. Started by `uv run`, it would have every worker build an environment of its own from
         # a copy of the working directory; workers of this machine have this one.
         os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
-    with needing("ray", "A library of the runner ray"):
+    with needing("ray", "A library of the runner ray", where="runner.kind", otherwise="runner.kind=processes"):
         from prefect_ray import RayTaskRunner
     if address is not None:
         return RayTaskRunner(address=address)

@@ -249,7 +249,7 @@ def frozen_views(observation: Observation, reading: Reading) -> list[str]:
 
 
 def speed_and_change(observation: Observation, reading: Reading, view: str) -> tuple[np.ndarray, np.ndarray]:
-    """Of the steps of a view: speed (s,) of what moves it (its own arm, or the fastest), and change of its cells (s, r, c)."""
+    """Speed (s,) of the arm that moves a view, its own or the fastest, and change of the view's cells (s, r, c), at every step."""
     states, images = reading.steps(observation.num_images, view)
     own = observation.wrists.get(view)
     speed = reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own]

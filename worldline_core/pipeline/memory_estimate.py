@@ -109,7 +109,7 @@ class Sources:
         return self.batch(model, count * trainer.batch_size, views, max(clips.lengths), text)
 
     def encoding(self, batch: Batch, trainer: TrainerConfig) -> Before:
-        """What encodes a batch, one view of a clip after the other."""
+        """Encode a batch, one view of a clip after the other: number of passes, and memory of one."""
         encode = partial(self.looking, "tokenizer", batch.clips[0].num_frames, trainer.precision)
         return len(batch.clips) * len(batch.views), encode
 

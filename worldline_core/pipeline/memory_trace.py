@@ -82,7 +82,7 @@ class _Tracker(TorchDispatchMode):
         return returned
 
     def _maker(self, value: Any, given: list[FakeTensor]) -> Callable[[_Tracker, list[FakeTensor]], Any]:
-        """How to make a result again: it is no tensor, an argument, or a tensor on the storage of an argument or its own."""
+        """Return a function that makes a result again: a value that is no tensor, an argument, a view of one, or a new tensor."""
         if not isinstance(value, FakeTensor):
             return lambda *_: value
         if (same := next((n for n, one in enumerate(given) if one is value), None)) is not None:
@@ -118,7 +118,7 @@ class _Tracker(TorchDispatchMode):
 
 
 def _described(value: Any, given: list[FakeTensor]) -> Any:
-    """What an operation's result depends on, of an argument; tensors are appended to ``given``."""
+    """Key of an argument: all that an operation's result depends on. Its tensors are appended to ``given``."""
     if isinstance(value, FakeTensor):
         given.append(value)
         return value.dtype, value.shape, value.stride(), value.storage_offset(), value.fake_device

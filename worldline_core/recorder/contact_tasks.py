@@ -183,7 +183,7 @@ def _balance_plan(robot: Robot, layout: Layout, random: np.random.Generator, kno
 
 
 def _level_judge(ended: Ended, layout: Layout) -> Judged:
-    """Of balance and level."""
+    """Judge `balance` and `level`: a bar or a tray must be lifted and stay level."""
     name, half = ("bar_0", BAR_HALF) if layout.target.kind == "bar" else ("tray_0", TRAY_HALF)
     height, lean = ended.place(name)[:, 2] - half[2], ended.lean(name)
     facts = {"height": float(height[-1]), "lean": lean}

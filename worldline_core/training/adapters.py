@@ -79,7 +79,7 @@ def add_adapters(model: WorldModel, config: LoRAConfig, seed: int) -> None:
 
 def load_peft() -> ModuleType:
     """The library, which takes seconds the first time. Raises: UnavailableError: it is not installed."""
-    with needing("one-gpu", "peft"):
+    with needing("one-gpu", "peft", where="lora"):
         import peft
     return peft
 

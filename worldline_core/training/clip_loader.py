@@ -131,10 +131,12 @@ class ClipLoader:
             try:
                 read = next(ahead[index])
             except RuntimeError as error:
-                read = TrainingError(
+                ahead.clear()
+                raise TrainingError(
                     "A loader process has ended.", where=f"micro-step {index}: {'; '.join(map(str, batch.clips))}",
-                    got=error, next_step="see its traceback above; if memory ran out, lower input.workers or the batch",
-                )  # fmt: skip
+                    expected="clips", got=error,
+                    next_step="see its traceback above; if memory ran out, lower input.workers or the batch",
+                ) from error  # fmt: skip
             if isinstance(read, WorldLineError):
                 ahead.clear()  # nothing holds the loader processes any more
                 raise read

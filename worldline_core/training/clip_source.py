@@ -45,6 +45,7 @@ logger = logging.getLogger(__name__)
 
 Layout = Literal["groups", "clips"]
 INDEX, DESCRIPTION = "index.parquet", "store.json"
+_VIEWS_LEFT_OUT = "views without a camera, which take train_stage2.native_size, in"
 
 
 class ClipSource(Dataset[Tensor | WorldLineError], ABC):
@@ -91,7 +92,7 @@ class ClipSource(Dataset[Tensor | WorldLineError], ABC):
     """True where clips are kept on the training device."""
 
     def __getitem__(self, batch: ClipBatch) -> Tensor | WorldLineError:
-        """What `read_batch` gives; an error is an item like any other, and reaches the training process as it is."""
+        """As `read_batch`, but an error is an item like any other, and reaches the training process as it is."""
         try:
             return self.read_batch(batch)
         except WorldLineError as error:
@@ -388,7 +389,7 @@ def training_rows(
             left_out["none of the views"] += 1
         else:
             rows.append(replace(row, views=shown))
-            left_out["views without a camera (train_stage2.native_size), of"] += shown != row.views
+            left_out[_VIEWS_LEFT_OUT] += shown != row.views
     reasons = ", ".join(f"{reason} {count}" for reason, count in left_out.most_common() if count)
     if not rows:
         raise DataError(
@@ -398,7 +399,11 @@ def training_rows(
             next_step="docs/filters.md says what each reason asks for; other episodes are in the quarantine tables of earlier steps",
         )  # fmt: skip
     if reasons:
-        logger.info("Stage %d: clips of %d of %d episodes; left out: %s.", stage, len(rows), len(episodes), reasons)
+        unexpected = left_out["no controls"] or left_out[_VIEWS_LEFT_OUT]
+        logger.log(
+            logging.WARNING if unexpected else logging.INFO,
+            "Stage %d: clips of %d of %d episodes; left out: %s.", stage, len(rows), len(episodes), reasons,
+        )  # fmt: skip
     return rows
 
 

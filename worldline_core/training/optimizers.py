@@ -60,7 +60,7 @@ def _torchao_classes() -> tuple[Any, Any]:
     Raises:
         UnavailableError: torchao is not installed.
     """
-    with needing("one-gpu", "torchao"):
+    with needing("one-gpu", "torchao", where="trainer.weights, trainer.optimizer.moments"):
         from torchao.optim import AdamW8bit
         from torchao.optim.quant_utils import scale_tensor
         from torchao.optim.subclass_8bit import OptimState8bit

@@ -87,7 +87,7 @@ class _Recording:
         self.tools: dict[str, _Signal] = {}
         """Poses (n, 7) by topic."""
         self.tool_frames: list[str] = []
-        """Of each arm: the frame of its recorded poses or, without them, the tool itself."""
+        """For each arm, the frame that is its tool, or the one that its recorded poses are given in."""
         for arm in config.arms:
             if arm.tool_frame is not None:
                 self.tool_frames.append(arm.tool_frame.lstrip("/"))

@@ -29,7 +29,7 @@ _SAME_VALUE = 1e-3
 """Messages of one time that differ by less [rad, m] say the same: a simulation sends several per tick of its clock."""
 _FEWEST_FOR_ALTERNATION = 8
 MAX_TRIM_S = 1.0
-"""How much later a topic may begin, or earlier end, than the others; see `check_gaps`."""
+"""A topic may begin this much later than the others, and end this much earlier [s]; see `check_gaps`."""
 MAX_DISORDER_S = 1.0
 """A message that comes later than this behind a younger one was stamped by a clock that was set back."""
 
