@@ -16,8 +16,8 @@ digested part of an artifact. Importing this module imports Rerun.
 
 from __future__ import annotations
 
-import errno
 import hashlib
+import os
 import shutil
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
@@ -25,6 +25,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import batched
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
 PIECE_FRAMES = 64
 """So many pictures are logged together."""
-_FULL_BELOW_BYTES = 2**16
+_PIPE_BYTES = 1 << 16
 FRUSTUM_M = {"fixed": 0.25, "moving": 0.08}
 """Depth at which a frustum ends: wrist cameras are near to what they see."""
 ROBOT_COLOUR = (190, 194, 202)
@@ -71,39 +72,64 @@ class RecordingContent:
 
 def write_rerun_recording(path: Path, content: RecordingContent) -> None:
     """Write one `.rrd` with a blueprint; opens with `rerun <file>`."""
-    episode, tracks = content.episode, content.tracks
-    identity = uuid.UUID(bytes=hashlib.sha256(episode.episode_id.encode()).digest()[:16])
+    identity = uuid.UUID(bytes=hashlib.sha256(content.episode.episode_id.encode()).digest()[:16])
     stream = rr.RecordingStream("worldline", recording_id=identity, send_properties=False)
-    with atomic_path(path) as temporary, _errors_of_writing(temporary):
-        stream.save(temporary, default_blueprint=_blueprint(content))
-        stream.send_recording_name(episode.episode_id)
-        _log_cameras(stream, content)
-        for method, views in content.predicted_frames.items():
-            for view, frames in views.items():
-                _log_frames(stream, f"predicted/{method}/{view}", frames, episode.fps)
-        if tracks is not None:
-            _log_tools(stream, tracks, episode.fps)
-            _log_robot(stream, tracks, episode.fps)
-            for view in [view for view in tracks.views if view in content.true_frames]:
-                frames = content.true_frames[view]
-                size, count = (frames.shape[1], frames.shape[2]), min(len(frames), tracks.num_frames)
-                heat = (png_bytes(heat_layer(tracks, n, view, size, content.sigma_px_ref)) for n in range(count))
-                _log_images(stream, f"world/cameras/{view}/actions", heat, "image/png", episode.fps)
-                stream.log(f"world/cameras/{view}/actions", rr.EncodedImage.from_fields(draw_order=10.0), static=True)
-        _log_signals(stream, episode)
-        _log_description(stream, episode, "none" if tracks is None else tracks.controls_label)
-        stream.flush()  # raises what `disconnect` only logs
-        stream.disconnect()
+    with atomic_path(path) as temporary, _pipe_into(temporary) as pipe:
+        stream.save(pipe, default_blueprint=_blueprint(content))
+        try:
+            _log_content(stream, content)
+        finally:
+            stream.disconnect()  # until then the pipe is open
+
+
+def _log_content(stream: rr.RecordingStream, content: RecordingContent) -> None:
+    episode, tracks = content.episode, content.tracks
+    stream.send_recording_name(episode.episode_id)
+    _log_cameras(stream, content)
+    for method, views in content.predicted_frames.items():
+        for view, frames in views.items():
+            _log_frames(stream, f"predicted/{method}/{view}", frames, episode.fps)
+    if tracks is not None:
+        _log_tools(stream, tracks, episode.fps)
+        _log_robot(stream, tracks, episode.fps)
+        for view in [view for view in tracks.views if view in content.true_frames]:
+            frames = content.true_frames[view]
+            size, count = (frames.shape[1], frames.shape[2]), min(len(frames), tracks.num_frames)
+            heat = (png_bytes(heat_layer(tracks, n, view, size, content.sigma_px_ref)) for n in range(count))
+            _log_images(stream, f"world/cameras/{view}/actions", heat, "image/png", episode.fps)
+            stream.log(f"world/cameras/{view}/actions", rr.EncodedImage.from_fields(draw_order=10.0), static=True)
+    _log_signals(stream, episode)
+    _log_description(stream, episode, "none" if tracks is None else tracks.controls_label)
 
 
 @contextmanager
-def _errors_of_writing(path: Path) -> Iterator[None]:
-    """Rerun's errors as those of the operating system; its writing thread does not say why it ended."""
+def _pipe_into(path: Path) -> Iterator[str]:
+    """A pipe, by its path, whose bytes a thread writes to the file ``path``; at the end its error is raised.
+
+    Where the disk is full, Rerun's own writing does not always end (0.41: `flush` and `disconnect` wait for a thread that is gone).
+    """
+    failed: list[OSError] = []
+    reader, writer = os.pipe()
+
+    def write() -> None:
+        with os.fdopen(reader, "rb", buffering=0) as piped:
+            try:
+                with path.open("wb") as file:
+                    shutil.copyfileobj(piped, file)
+            except OSError as error:
+                failed.append(OSError(error.errno, error.strerror, str(path)))
+                while piped.read(_PIPE_BYTES):
+                    pass
+
+    thread = Thread(target=write)
+    thread.start()
     try:
-        yield
-    except RuntimeError as error:
-        code = errno.EIO if shutil.disk_usage(path.parent).free > _FULL_BELOW_BYTES else errno.ENOSPC
-        raise OSError(code, str(error), str(path)) from error
+        yield f"/dev/fd/{writer}"
+    finally:
+        os.close(writer)
+        thread.join()
+    if failed:
+        raise failed[0]
 
 
 def _timeline(count: int, fps: float, first: int = 0) -> list[rr.TimeColumn]:
