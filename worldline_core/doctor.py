@@ -18,6 +18,7 @@ from typing import Literal
 
 from worldline_core.config import CONFIG_ROOT
 from worldline_core.errors import WorldLineError, installing
+from worldline_core.processor import processor_has_bfloat16, processor_name
 from worldline_core.shipped import SHIPPED, project_path
 
 EXTRAS = {
@@ -112,9 +113,9 @@ def _hardware(project: Path) -> Iterator[MachineCheck]:
         found = f"{card.name}, {card.total_memory / 2**30:.0f} GiB, torch {torch.__version__}"
     advice = "the tiny preset needs none; cosmos3-nano wants a CUDA GPU with 80 GiB or more"
     yield _check("accelerator", present, found, advice, optional=True)
-    wide = bool(torch.backends.cpu.get_cpu_capability().startswith("AVX512"))
-    fast = wide and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    yield _check("CPU bfloat16", fast, "native" if fast else "emulated: training is slower", optional=True)
+    fast = processor_has_bfloat16()
+    found = f"{processor_name()}: {'yes' if fast else 'no, it computes in float32 unless told otherwise'}"
+    yield _check("CPU bfloat16", fast, found, optional=True)
 
 
 def _libraries() -> Iterator[MachineCheck]:

@@ -134,7 +134,7 @@ def test_the_teacher_is_in_the_memory_sheet(make_model, monkeypatch):
     source = Sources(None, None, (32, 32), (4, 4))
 
     def planned(**forcing):
-        config = config_of(FRAMES, **ONE_STEP, teacher_forcing=forcing)
+        config = config_of(FRAMES, **ONE_STEP, teacher_forcing=forcing | {"trainer": {"steps": 1, "precision": "bf16"}})
         return trainings(config, make_model(0).config, source)[0].estimate(1)
 
     alone, taught = planned(), planned(teacher_share=0.5)
@@ -149,7 +149,8 @@ def test_scores_that_share_their_weights_are_planned_once(make_model, monkeypatc
     source = Sources(None, None, (32, 32), (4, 4))
 
     def planned(**adapters):
-        config = config_of(FRAMES, **ONE_STEP, **adapters)
+        matching = {"trainer": {"steps": 1, "precision": "bf16"}}
+        config = config_of(FRAMES, **ONE_STEP, distribution_matching=matching, **adapters)
         return trainings(config, make_model(0).config, source)[-1].estimate(1)
 
     full, lora = planned(), planned(lora={"rank": 1})

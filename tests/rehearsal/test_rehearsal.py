@@ -20,6 +20,7 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import UnavailableError
 from worldline_core.model.checkpoint import read_checkpoint_info
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
+from worldline_core.processor import processor_has_bfloat16
 from worldline_core.rehearsal.outside_models import OUTSIDE_MODELS, write_outside_models
 from worldline_core.rehearsal.rehearsal import ABLATION_SIZES, changes_of, table
 from worldline_core.report.ablation_table import load_variants
@@ -30,6 +31,8 @@ from worldline_core.store.artifact_files import finished_artifacts, read_manifes
 PRESET = "cosmos3-nano"
 SIZES = {"image_size", "device", "steps", "workers", "student_layer", "clips", "start_step", "seeds", "timed_blocks",
          "sources", "steps_at_once"}  # fmt: skip
+if not processor_has_bfloat16():
+    SIZES |= {"precision", "weights", "bfloat16"}
 FOLDERS = ("Cosmos3-Nano/vae", "Cosmos3-Nano/text_tokenizer", "base", "vjepa2-vitg-fpc64-384", "lpips", "sam3",
            "Qwen3-VL-8B-Instruct")  # fmt: skip
 

@@ -13,6 +13,7 @@ from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError
 from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, requested
+from worldline_core.processor import processor_has_bfloat16
 from worldline_core.training.training_config import OptimizerConfig, TrainerConfig
 from worldline_core.untrusted_text import carries_credentials
 
@@ -48,6 +49,7 @@ class _NetworkTraining(StrictModel):
     learning_rate: float = Field(default=3e-3, gt=0)
     checkpoint_every: int = Field(default=200, ge=1)
     seed: int = Field(default=42, ge=0)
+    bfloat16: bool = Field(default_factory=processor_has_bfloat16, description="compute in mixed precision")
 
     @property
     def trainer(self) -> TrainerConfig:
@@ -60,6 +62,7 @@ class _NetworkTraining(StrictModel):
                 learning_rate=self.learning_rate, betas=(0.9, 0.999), weight_decay=self.WEIGHT_DECAY
             ),
             ema_decay=0.995,
+            precision="bf16" if self.bfloat16 else "fp32",
             log_every=1,
             save_every_steps=self.checkpoint_every,
         )

@@ -21,6 +21,7 @@ from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.geometry.transforms import nearest_rotation
 from worldline_core.pipeline.ablations import choose_variants, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.processor import processor_has_bfloat16
 from worldline_core.rehearsal.outside_models import write_outside_models
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.atomic import write_bytes_atomic
@@ -30,6 +31,13 @@ RECORDINGS, TWO_VIEW_RECORDINGS = "recordings", "recordings_two_views"
 
 WEIGHTS = "weights"
 _SMALL = "its small version"
+_SLOW = "the processor has no bfloat16"
+_IN_FLOAT32: tuple[tuple[str, Any, str], ...] = (
+    ("*.precision", "fp32", _SLOW),
+    ("*.bfloat16", False, _SLOW),
+    ("*.trainer.weights", "fp32", _SLOW),
+    ("rollouts.*.weights", "float32", _SLOW),
+)
 SIZES: tuple[tuple[str, Any, str], ...] = (
     (
         "curate.sources",
@@ -57,6 +65,7 @@ SIZES: tuple[tuple[str, Any, str], ...] = (
     ("rollouts.*.steps", 4, "Euler steps of a whole clip"),
     ("rollouts.*.timed_blocks", 10, "past the window of the cache"),
     ("runner.steps_at_once", 2, "two cores"),
+    *(() if processor_has_bfloat16() else _IN_FLOAT32),
 )
 """Pattern of a dotted key, its small value, and why; the first that fits holds. What no pattern names stays as it is."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +23,7 @@ from worldline_core.data.episodes.episode_index import QuarantineRow, write_quar
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.tokenizers import frames_to_video, require_device
+from worldline_core.processor import processor_name
 from worldline_core.progress import Progress
 from worldline_core.rollout.baselines import FirstFrameCopy, TextToVideo
 from worldline_core.rollout.ge_sim import GeSim, RefusedPredictionError
@@ -318,8 +318,4 @@ def device_name(device: str) -> str:
     """Name of the GPU, or of the processor with the number of threads in use."""
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_name(device)
-    facts = Path("/proc/cpuinfo")
-    lines = facts.read_text(encoding="utf-8").splitlines() if facts.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    processor = names[0] if names else platform.processor() or platform.machine()
-    return f"{processor}, {torch.get_num_threads()} threads of {os.cpu_count()} cores"
+    return f"{processor_name()}, {torch.get_num_threads()} threads of {os.cpu_count()} cores"

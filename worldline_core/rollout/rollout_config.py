@@ -15,6 +15,7 @@ from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.model.world_model_config import FULL_STEPS, TextConfig
 from worldline_core.policies.openpi import PolicyConfig
+from worldline_core.processor import bfloat16_by_default
 
 Controls = Literal["true", "zero", "shuffled", "mirrored", "delayed"]
 """The episode's own controls, none, those of another episode, or its own changed in a known way
@@ -131,7 +132,7 @@ class RolloutConfig(StrictModel):
             ``whole``: every recording to its end; the last block (or clip) keeps the last controls, and its frames after the
             end are cut off.
         stride: predict every ``stride``-th frame; the model must have been trained at this stride.
-        bfloat16: compute in mixed precision.
+        bfloat16: compute in mixed precision; by default unless the device is a processor that has no products in bfloat16.
         weights: type of the model's weights in memory, and of those of a Wan autoencoder, which then computes in bfloat16
             too: half the memory, without any copy in float32.
         compile: torch.compile of each layer but its attention, for a GPU.
@@ -151,10 +152,10 @@ class RolloutConfig(StrictModel):
     stride: int = Field(default=1, ge=1)
     batch_size: int = Field(default=8, ge=1)
     crf: int = Field(default=8, ge=0, le=51)
-    bfloat16: bool = True
     weights: Literal["float32", "bfloat16"] = "float32"
     compile: bool = False
     device: str = "cpu"
+    bfloat16: bool = Field(default_factory=bfloat16_by_default)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -197,8 +198,8 @@ class PolicyRolloutConfig(StrictModel):
     seed: int = Field(default=42, ge=0)
     steps: int | None = Field(default=None, ge=1)
     crf: int = Field(default=8, ge=0, le=51)
-    bfloat16: bool = True
     device: str = "cpu"
+    bfloat16: bool = Field(default_factory=bfloat16_by_default)
 
 
 NAME_FIELD = re.compile(r"\{(\w+)\}|(\*)")

@@ -23,6 +23,7 @@ from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video, require_device
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import match_views
+from worldline_core.processor import bfloat16_by_default
 from worldline_core.rollout.observation import (
     Camera,
     check_controls,
@@ -63,7 +64,7 @@ class WorldLine:
         tokenizer: VideoTokenizer,
         *,
         device: str = "cpu",
-        bfloat16: bool = True,
+        bfloat16: bool | None = None,
         steps: int | None = None,
         shift: float = 1.0,
         clip_frames: int | None = None,
@@ -72,7 +73,7 @@ class WorldLine:
         self.info = info
         self.tokenizer = tokenizer
         self.device = device
-        self.bfloat16 = bfloat16
+        self.bfloat16 = bfloat16_by_default({"device": device}) if bfloat16 is None else bfloat16
         self.views, self.view_sets = info.views, info.view_sets
         self.needs_cameras, self.takes_maps = info.vectors is None, info.config.takes_maps
         self.vector_robots = () if info.vectors is None else info.vectors.embodiments
@@ -97,7 +98,7 @@ class WorldLine:
         decoder: Path | str | None = None,
         expect_kind: Literal["stage2", "causal"] | None = None,
         device: str = "cpu",
-        bfloat16: bool = True,
+        bfloat16: bool | None = None,
         weights: Literal["float32", "bfloat16"] = "float32",
         compiled: bool = False,
         steps: int | None = None,
@@ -112,7 +113,8 @@ class WorldLine:
                 of its store.
             decoder: folder of a small decoder for its latents (train_tokenizer), which decodes in the tokenizer's place.
             expect_kind: refuse checkpoints of another kind.
-            bfloat16: mixed precision of the model and the decoder.
+            bfloat16: mixed precision of the model and the decoder; None: unless the device is a processor without products in
+                bfloat16, where these take some 80 times as long.
             weights: how the model's weights are held, and those of a Wan autoencoder; in bfloat16 they take half the
                 memory and are cast only once, on reading, so that no copy in float32 ever exists.
             compiled: torch.compile of each layer but its attention: faster on a GPU after a minute at the first step.
@@ -139,6 +141,8 @@ class WorldLine:
             codec = SmallDecoder.load(Path(decoder), codec, fingerprint, device)
         if compiled:
             model.compile_blocks()
+        if bfloat16 is None:
+            bfloat16 = bfloat16_by_default({"device": device, "weights": weights})
         return cls(
             model, info, codec, device=device, bfloat16=bfloat16, steps=steps, shift=shift, clip_frames=clip_frames
         )  # fmt: skip

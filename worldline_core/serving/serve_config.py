@@ -9,6 +9,7 @@ from pydantic import Field
 
 from worldline_core.config import StrictModel
 from worldline_core.policies.openpi import PolicyConfig
+from worldline_core.processor import bfloat16_by_default
 from worldline_core.shipped import SHIPPED
 
 PROTOCOL = 1
@@ -40,7 +41,7 @@ class ServeConfig(StrictModel):
     tokenizer: Path | None = None
     decoder: Path | None = None
     device: str = "cpu"
-    bfloat16: bool = True
+    bfloat16: bool = Field(default_factory=bfloat16_by_default)
     steps: int | None = Field(None, ge=1)
     compile: bool = False
     episodes: Path = SHIPPED / "recordings"

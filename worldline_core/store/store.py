@@ -31,6 +31,7 @@ from safetensors import SafetensorError
 
 from worldline_core.config import StrictModel, cache_relevant_config
 from worldline_core.errors import ArtifactError, WorldLineError
+from worldline_core.processor import processor_has_bfloat16
 from worldline_core.store.artifact_files import (
     KEY_LENGTH,
     MANIFEST_NAME,
@@ -444,6 +445,7 @@ def describe_environment() -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu_count": os.cpu_count(),
+        "processor_has_bfloat16": processor_has_bfloat16(),
         "processes": int(os.environ.get("WORLD_SIZE", "1")),
         "packages": versions,
         "git_commit": _git_commit(),

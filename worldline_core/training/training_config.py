@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.model.world_model_config import MixtureConfig, NetworkConfig, TextConfig
+from worldline_core.processor import bfloat16_by_default
 from worldline_core.training.clip_config import ClipInput, ClipSampling, LatentInput
 
 
@@ -106,7 +107,8 @@ class TrainerConfig(StrictModel):
     ``batch_size`` counts examples per device and micro-step, ``accumulation`` micro-steps per device and step.
     ``global_batch`` fixes the examples of a step over all devices instead: how many micro-steps each takes follows from
     it, and the run learns the same on 8 or 64 devices.
-    ``precision``: of what is computed; weights that are not trained are held in it, too. ``weights``: of the blocks' trained matrices,
+    ``precision``: of what is computed; weights that are not trained are held in it, too. By default fp32 on a processor without
+    products in bfloat16, where these take many times as long, else bf16. ``weights``: of the blocks' trained matrices,
     and so of their gradients; "bf16" rounds each update up or down at random, so that small ones are not lost.
     ``average``: where the moving average is, always in float32; "host" keeps it off the card.
     """
@@ -118,10 +120,12 @@ class TrainerConfig(StrictModel):
     seed: int = Field(default=0, ge=0)
     optimizer: OptimizerConfig = OptimizerConfig()
     ema_decay: float = Field(default=0.999, ge=0, lt=1)
-    precision: Literal["fp32", "bf16"] = "bf16"
     weights: Literal["fp32", "bf16"] = "fp32"
     average: Literal["device", "host"] = "device"
     device: str = "cpu"
+    precision: Literal["fp32", "bf16"] = Field(
+        default_factory=lambda given: "bf16" if bfloat16_by_default(given) else "fp32"
+    )
     log_every: int = Field(default=20, ge=1)
     validate_every: int = Field(default=0, ge=0, description="0: only after the last step")
     validation_batches: int = Field(default=4, ge=0)
@@ -323,8 +327,8 @@ class TokenizerConfig(StrictModel):
     """Largest standard deviation of the noise added to the codes of the groups (0 trains on exact codes only)."""
     seed: int = Field(default=0, ge=0)
     checkpoint_every: int = Field(default=500, ge=1)
-    bfloat16: bool = True
     device: str = "cpu"
+    bfloat16: bool = Field(default_factory=bfloat16_by_default)
 
     @property
     def trainer(self) -> TrainerConfig:

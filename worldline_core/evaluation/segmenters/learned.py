@@ -33,6 +33,7 @@ from worldline_core.evaluation.recordings import HEAD
 from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
 from worldline_core.evaluation.small_network import WEIGHTS_FILE, load_network
 from worldline_core.geometry.cameras import ImageTransform
+from worldline_core.processor import bfloat16_by_default
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
@@ -131,7 +132,7 @@ class LearnedSegmenter:
         for start in range(0, len(video), _BATCH):
             frames = torch.from_numpy(np.ascontiguousarray(video[start : start + _BATCH])).to(device)
             frames = frames_to_unit(frames).contiguous(memory_format=torch.channels_last)
-            with torch.autocast(device.type, dtype=torch.bfloat16):
+            with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16_by_default({"device": device.type})):
                 logits = self.network(frames)
             masks.append((torch.sigmoid(logits.float()) > self.threshold).cpu().numpy())
         return np.concatenate(masks) if masks else np.zeros(video.shape[:3], dtype=bool)
