@@ -1,4 +1,4 @@
-"""What a model computes in where nobody says, on processors with and without products in bfloat16."""
+"""Default precision on processors with and without native bfloat16."""
 
 from __future__ import annotations
 

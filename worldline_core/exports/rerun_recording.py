@@ -78,8 +78,9 @@ def write_rerun_recording(path: Path, content: RecordingContent) -> None:
         stream.save(pipe, default_blueprint=_blueprint(content))
         try:
             _log_content(stream, content)
+            stream.flush()  # raises what `disconnect` only logs
         finally:
-            stream.disconnect()  # until then the pipe is open
+            stream.disconnect()  # closes Rerun's end of the pipe
 
 
 def _log_content(stream: rr.RecordingStream, content: RecordingContent) -> None:
@@ -104,9 +105,9 @@ def _log_content(stream: rr.RecordingStream, content: RecordingContent) -> None:
 
 @contextmanager
 def _pipe_into(path: Path) -> Iterator[str]:
-    """A pipe, by its path, whose bytes a thread writes to the file ``path``; at the end its error is raised.
+    """Yield the path of a pipe that a thread copies into the file ``path``; an error of writing is raised at the end.
 
-    Where the disk is full, Rerun's own writing does not always end (0.41: `flush` and `disconnect` wait for a thread that is gone).
+    Rerun may hang when it writes to a full disk itself (0.41: `flush` and `disconnect` wait for a writing thread that has ended).
     """
     failed: list[OSError] = []
     reader, writer = os.pipe()

@@ -65,7 +65,6 @@ SIZES: tuple[tuple[str, Any, str], ...] = (
     ("rollouts.*.steps", 4, "Euler steps of a whole clip"),
     ("rollouts.*.timed_blocks", 10, "past the window of the cache"),
     ("runner.steps_at_once", 2, "two cores"),
-    *(() if processor_has_bfloat16() else _IN_FLOAT32),
 )
 """Pattern of a dotted key, its small value, and why; the first that fits holds. What no pattern names stays as it is."""
 
@@ -107,6 +106,8 @@ def changes_of(
         config = PipelineConfig.load(preset, path, [*overrides, *more])
         return dict(_leaves(config.model_dump(mode="json")))
 
+    if not processor_has_bfloat16():
+        sizes = (*sizes, *_IN_FLOAT32)
     small: list[Change] = []
     before = values()
     backbone = f"Cosmos3-{before.get('import_backbone.size', 'nano').title()}"

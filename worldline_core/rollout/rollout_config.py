@@ -132,7 +132,7 @@ class RolloutConfig(StrictModel):
             ``whole``: every recording to its end; the last block (or clip) keeps the last controls, and its frames after the
             end are cut off.
         stride: predict every ``stride``-th frame; the model must have been trained at this stride.
-        bfloat16: compute in mixed precision; by default unless the device is a processor that has no products in bfloat16.
+        bfloat16: compute in mixed precision; false by default on a processor without native bfloat16.
         weights: type of the model's weights in memory, and of those of a Wan autoencoder, which then computes in bfloat16
             too: half the memory, without any copy in float32.
         compile: torch.compile of each layer but its attention, for a GPU.

@@ -113,8 +113,7 @@ class WorldLine:
                 of its store.
             decoder: folder of a small decoder for its latents (train_tokenizer), which decodes in the tokenizer's place.
             expect_kind: refuse checkpoints of another kind.
-            bfloat16: mixed precision of the model and the decoder; None: unless the device is a processor without products in
-                bfloat16, where these take some 80 times as long.
+            bfloat16: mixed precision of the model and the decoder; None: true, except on a processor without native bfloat16.
             weights: how the model's weights are held, and those of a Wan autoencoder; in bfloat16 they take half the
                 memory and are cast only once, on reading, so that no copy in float32 ever exists.
             compiled: torch.compile of each layer but its attention: faster on a GPU after a minute at the first step.

@@ -107,8 +107,8 @@ class TrainerConfig(StrictModel):
     ``batch_size`` counts examples per device and micro-step, ``accumulation`` micro-steps per device and step.
     ``global_batch`` fixes the examples of a step over all devices instead: how many micro-steps each takes follows from
     it, and the run learns the same on 8 or 64 devices.
-    ``precision``: of what is computed; weights that are not trained are held in it, too. By default fp32 on a processor without
-    products in bfloat16, where these take many times as long, else bf16. ``weights``: of the blocks' trained matrices,
+    ``precision``: of what is computed; weights that are not trained are held in it, too. The default is bf16, or
+    fp32 on a processor without native bfloat16. ``weights``: of the blocks' trained matrices,
     and so of their gradients; "bf16" rounds each update up or down at random, so that small ones are not lost.
     ``average``: where the moving average is, always in float32; "host" keeps it off the card.
     """
