@@ -25,7 +25,7 @@ import numpy as np
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment_report import bare_mjcf, bare_urdf
 from worldline_core.geometry.kinematic_tree import parse_xml
-from worldline_core.geometry.link_surfaces import surfaces_of
+from worldline_core.geometry.link_surfaces import COARSE, FINE, surfaces_of
 from worldline_core.store.atomic import write_bytes_atomic
 
 ROUND_TRIP_TOLERANCE = 1e-9
@@ -200,17 +200,21 @@ SPHERES = '  <default><geom type="sphere" contype="0" conaffinity="0"/></default
 def add_surfaces(description: Path, model: Path) -> int:
     """Add spheres on the surfaces of a model's links to a description of kinematics alone; returns their number.
 
-    A body of the description is the one of the model with the same pose, all joints at zero.
+    A body of the description is the one of the model with the same pose, all joints at zero. Fingers and their palm, the
+    last two bodies of each branch, get many small spheres: a wrist camera sees them from near.
 
     Raises: DataError where no body of the model has a pose of the description, or it has shapes already.
     """
     text, source = description.read_text(), mujoco.MjModel.from_xml_path(str(model))
     written = mujoco.MjModel.from_xml_string(text)
     poses = [_poses_at_zero(each) for each in (source, written)]
-    count = 0
     if "<geom" in text:
         raise DataError("The description has shapes", where=description, expected="kinematics alone")
-    for body, (points, radii) in surfaces_of(parse_xml(model.read_text(), model), model.parent).items():
+    root = parse_xml(model.read_text(), model)
+    parents = {child: body for body in root.iter("body") for child in body.findall("body")}
+    hand = {b.get("name") for leaf, parent in parents.items() if leaf.find("body") is None for b in (leaf, parent)}
+    count, (shapes, fine) = 0, (surfaces_of(root, model.parent, sampling) for sampling in (COARSE, FINE))
+    for body, (points, radii) in {**shapes, **{name: fine[name] for name in hand & fine.keys()}}.items():
         same = [name for name, pose in poses[1].items() if np.allclose(pose, poses[0][body], atol=ROUND_TRIP_TOLERANCE)]
         for name in same:
             begin = text.index("<inertial", text.index(f'<body name="{name}"'))
@@ -262,15 +266,11 @@ def _compare(source: Any, written: Any, where: str) -> None:
 
 
 def main() -> None:
-    """Write the descriptions, all or the named ones."""
     parser = argparse.ArgumentParser(description="Write kinematics-only descriptions from Python packages.")
     parser.add_argument("output", type=Path)
     parser.add_argument("--wheels", type=Path, help="folder with the wheels of the packages")
     parser.add_argument(
-        "--surfaces",
-        nargs=2,
-        metavar=("NAME", "MODEL"),
-        help="add spheres on the links of a model with meshes to this one",
+        "--surfaces", nargs=2, metavar=("NAME", "MODEL"), help="add spheres on the links of MODEL to NAME"
     )
     parser.add_argument("--only", nargs="*", choices=sorted(RECIPES), help="these only")
     arguments = parser.parse_args()

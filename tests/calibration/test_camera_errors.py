@@ -66,18 +66,36 @@ def solved(view: StillView | WristView) -> np.ndarray:
     [("rotation", (0.8, -1.0, 1.5)), ("translation", (15.0, -10.0, 5.0)), ("focal length", (3.0,)), ("lag", (0.3,))],
 )
 def test_what_was_put_into_a_still_view_is_found(kind: str, sizes: tuple[float, ...]) -> None:
+    view = waving_points()
+    view.measured = view._predicted(theta_of(kind, *sizes))[0]
+    tolerance = np.array([0.25] * 3 + [5.0] * 3 + [0.8, 0.08])  # of all kinds at once
+    assert (np.abs(solved(view) - theta_of(kind, *sizes) * SCALE) < tolerance).all()
+
+
+def waving_points() -> StillView:
     random, count = np.random.default_rng(0), 24
     time = np.linspace(0, 3, count)[:, None]
     centres = random.uniform(-0.25, 0.25, (12, 3)) + np.array([0.0, 0.0, 1.0])
     phase, speed = random.uniform(0, 6, (2, 12, 3))
     points = centres + 0.12 * np.sin(phase + speed * time[..., None] * np.ones((1, 12, 1)))
-    radii = np.full(12, 0.04)
     camera = CameraTrack("head", np.array([[100.0, 0, 47.5], [0, 100, 31.5], [0, 0, 1]]), np.eye(4)[None], 96, 64)
     blank = np.zeros((count - 1, 16, 24))
-    view = StillView(camera, points, radii, Motion(np.zeros((*blank.shape, 2)), blank, blank))
-    view.measured = view._predicted(theta_of(kind, *sizes))[0]
-    tolerance = np.array([0.25] * 3 + [5.0] * 3 + [0.8, 0.08])  # of all kinds at once
-    assert (np.abs(solved(view) - theta_of(kind, *sizes) * SCALE) < tolerance).all()
+    return StillView(camera, points, np.full(12, 0.04), Motion(np.zeros((*blank.shape, 2)), blank, blank))
+
+
+def test_steps_that_are_left_out_count_neither_as_seen_nor_as_predicted() -> None:
+    view, turned = waving_points(), theta_of("rotation", 0.8, -1.0, 1.5)
+    steps = np.arange(len(view.measured)) < 12
+    view.measured = view._predicted(turned)[0]
+    first = view.only(steps)
+    view.measured[~steps] = np.random.default_rng(1).normal(0, 3, view.measured[~steps].shape)
+    for lag in (0.0, 0.3):
+        theta = turned + theta_of("lag", lag)
+        expected, found = first.equations(theta, 0.7), view.only(steps).equations(theta, 0.7)
+        np.testing.assert_array_equal(found.information, expected.information)
+        assert found.likelihood == expected.likelihood
+    assert not first._predicted(np.zeros(PARAMETERS))[0][~steps].any()
+    assert (np.abs(solved(view.only(steps)) - turned * SCALE)[:3] < 0.5).all()
 
 
 @pytest.mark.parametrize(("kind", "sizes"), [("rotation", (3.0, -4.0, 2.0)), ("focal length", (8.0,)), ("lag", (0.4,))])

@@ -42,6 +42,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.sources.calibration_file import add_calibrated_view, mounted_camera, read_calibration
 from worldline_core.errors import DataError
+from worldline_core.geometry.cameras import project_points
 from worldline_core.geometry.embodiment import RigidOffset, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.transforms import pose_from_rotation, rigid_inverse, rotation_angle_deg
@@ -261,6 +262,33 @@ def test_searched_mounts_see_the_tool_from_behind_the_hand(hand: np.ndarray) -> 
     assert (np.hypot(seen[:, 0], seen[:, 1]) < 0.5 * seen[:, 2]).all() and (mounts[:, 2, 3] < 0).all()
 
 
+def test_a_longer_lens_from_farther_away_shows_the_tool_at_the_same_place_and_size() -> None:
+    camera = CameraTrack("right_wrist", np.diag([50.0, 50.0, 1.0]), next(mounts_around(np.empty((0, 3))))[None], 96, 72)
+    far = wrist_camera._zoomed(camera, 1.5)
+    assert far.K[0, 0] == far.K[1, 1] == 75.0
+    across = camera.T_base_camera[0, :3, :2].T * 0.01  # beside the tool, at its distance
+    points = np.concatenate([np.zeros((1, 3)), across])
+    (near_uv, near_depth), (uv, depth) = (project_points(points, c.K, c.T_base_camera) for c in (camera, far))
+    np.testing.assert_allclose(uv, near_uv, atol=1e-9)
+    np.testing.assert_allclose(depth, 1.5 * near_depth)
+
+
+def test_wrist_views_have_more_and_smaller_points_of_the_hand() -> None:
+    robot = ArmKinematics(load_embodiment("so101"))
+    random, count = np.random.default_rng(0), 12
+    state = random.uniform(-0.5, 0.5, (count, 6)).astype(np.float32)
+    episode = Episode(
+        episode_id="a", source="s", embodiment="so101", scene="s", task_family="unknown", instruction="", outcome="unknown",
+        split="train", fps=8.0, state=state, action=state, timestamps=np.arange(count) / 8.0,
+    )  # fmt: skip
+    pictures = random.integers(0, 255, (count, 48, 64, 3)).astype(np.uint8)
+    views = recorded_views(iter([(episode, {"head": pictures, "right_wrist": pictures})]), robot, 1)
+    head, wrist = (views[view].episodes[0] for view in ("head", "right_wrist"))
+    links = len(robot.surfaces)
+    assert head.points.shape == (count, 12 * links, 3) and wrist.points.shape[1] == 12 * (links - 2) + 2 * 150
+    assert np.median(wrist.radii) < 0.006 < head.radii.min()
+
+
 def without_mounts(kinematics: ArmKinematics) -> ArmKinematics:
     arms = [arm.model_copy(update={"wrist_camera": None}) for arm in kinematics.embodiment.arms]
     return ArmKinematics(kinematics.embodiment.model_copy(update={"arms": tuple(arms)}))
@@ -282,7 +310,7 @@ def test_of_searched_mounts_the_one_that_held_out_episodes_show_is_kept(monkeypa
     monkeypatch.setattr(wrist_camera, "wrist_evidence", lambda *_: [])
     monkeypatch.setattr(wrist_camera, "fit_wrist", lambda _, camera, *__: next(f for f in fits if f.camera is camera))
     monkeypatch.setattr(
-        wrist_camera, "_made_exact", lambda _, __, fit, *___: WristCamera(fit, (fit, fit), shown[id(fit)], (), 30)
+        wrist_camera, "_made_exact", lambda _, __, fit, *___: WristCamera(fit, (fit, fit), shown[id(fit)], (), 30, 1.0)
     )
     found = wrist_camera.estimate_wrist(cast("RecordedView", None), 0, None)
     assert (found.fitted, found.rival, found.searched) == (fits[1], fits[0], True)

@@ -14,7 +14,7 @@ from tools import description_import
 from tools.description_import import Recipe, import_description
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematic_tree import parse_xml, read_mjcf
-from worldline_core.geometry.link_surfaces import surfaces_of
+from worldline_core.geometry.link_surfaces import COARSE, FINE, Sampling, surfaces_of
 
 ARM = """
 <mujoco><compiler angle="degree"/><asset><mesh name="link" file="missing.stl"/></asset>
@@ -74,19 +74,30 @@ def test_what_cannot_be_imported_exactly_is_not_kept(wheels, tmp_path, monkeypat
 
 def test_spheres_of_a_model_s_links_are_added_to_the_bodies_at_the_same_poses(tmp_path: Path) -> None:
     model, description = tmp_path / "model.xml", tmp_path / "arm.xml"
-    body = '<body name="{0}link" pos="0 0 0.3">\n<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>\n{1}<joint name="{0}j"/></body>'
+    body = '<body name="{0}link" pos="0 0 0.3">\n<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>\n{1}<joint name="{0}j"/>{2}</body>'
     box = '<geom type="box" size="0.1 0.2 0.3" pos="1 0 0"/>'
-    for file, text in ((model, body.format("", box)), (description, body.format("right/", ""))):
-        file.write_text(f"<mujoco>\n  <worldbody>\n{text}\n  </worldbody>\n</mujoco>")
+
+    def chain(prefix: str, shape: str) -> str:
+        text = ""
+        for name in ("finger", "palm", ""):
+            text = body.format(f"{prefix}{name}", shape, text)
+        return f"<mujoco>\n  <worldbody>\n{text}\n  </worldbody>\n</mujoco>"
+
+    model.write_text(chain("", box))
+    description.write_text(chain("right/", ""))
     count = description_import.add_surfaces(description, model)
-    found = surfaces_of(parse_xml(description.read_text(), "arm"), tmp_path)
-    points, radii = found["right/link"]
-    assert found.keys() == {"right/link"} and len(points) == len(radii) == count == 8
-    assert np.allclose(np.abs(points - (1, 0, 0)), (0.1, 0.2, 0.3), atol=1e-4)
+    found = surfaces_of(parse_xml(description.read_text(), "arm"), tmp_path, Sampling(1000, 0.0))
+    sizes = {link: len(points) for link, (points, _) in found.items()}
+    coarse, fine = COARSE.points, FINE.points
+    assert sizes == {"right/link": coarse, "right/palmlink": fine, "right/fingerlink": fine}
+    assert count == coarse + 2 * fine
+    for points, _ in found.values():
+        apart = np.abs(points - (1, 0, 0)) / (0.1, 0.2, 0.3)
+        assert apart.max(axis=1) == pytest.approx(1.0, abs=1e-3) and (apart.max(axis=0) > 0.99).all()
     with pytest.raises(DataError, match="has shapes"):
         description_import.add_surfaces(description, model)
     description.write_text(
-        "<mujoco>\n  <worldbody>\n" + body.format("", "").replace("0.3", "0.4") + "</worldbody></mujoco>"
+        "<mujoco>\n  <worldbody>\n" + body.format("", "", "").replace("0.3", "0.4") + "</worldbody></mujoco>"
     )
     with pytest.raises(DataError, match="No body has a pose"):
         description_import.add_surfaces(description, model)

@@ -13,7 +13,7 @@ import pytest
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import Embodiment, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.link_surfaces import link_surfaces, mesh_vertices
+from worldline_core.geometry.link_surfaces import COARSE, FINE, Sampling, link_surfaces, points_on_mesh
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=np.float32)
 MJCF = """<mujoco><compiler angle="degree" meshdir="meshes"/>
@@ -62,22 +62,49 @@ def described(folder: Path, form: str, text: str, **changes: Any) -> Embodiment:
 def test_points_are_where_the_shapes_are(tmp_path: Path, form: str, mesh: str) -> None:
     write_mesh(tmp_path / "meshes", mesh)
     text = (MJCF if form == "mjcf" else URDF).format(form=mesh, joints=JOINTS)
-    found = link_surfaces(described(tmp_path, form, text))
-    points, _ = found["arm"]
-    turned = np.array([[0, 0, 1], [0, 0.1, 1], [-0.2, 0, 1], [0, 0, 1.3]])
-    assert {tuple(np.round(point, 6) + 0.0) for point in points} == {tuple(row) for row in turned}
+    robot = described(tmp_path, form, text)
+    found = link_surfaces(robot, COARSE)
+    points, _ = link_surfaces(robot, FINE)["arm"]
+    # Corners at 0, 0.1 y, -0.2 x and 0.3 z, one above the link's origin.
+    inside = np.c_[points @ [0, 10, 0], points @ [-5, 0, 0], (points @ [0, 0, 1] - 1) / 0.3]
+    weights = np.c_[1 - inside.sum(axis=1), inside]  # of the four corners
+    assert len(points) == FINE.points and (weights > -1e-9).all() and (np.abs(weights).min(axis=1) < 1e-6).all()
+    assert all((weights[:, side] < 1e-6).sum() > 15 for side in range(4))
     points, radii = found["ball"]
     assert (points.tolist(), radii.tolist()) == ([[1, 0, 0]], [0.2])
     assert np.abs(found["brick"][0]).max(axis=0) == pytest.approx([0.1, 0.2, 0.3])
+    on_a_side = np.isclose(np.abs(found["brick"][0]), (0.1, 0.2, 0.3)).any(axis=1)
+    assert len(on_a_side) == COARSE.points and on_a_side.all()
 
 
 def test_a_mesh_that_is_not_here_gives_no_points_and_a_damaged_one_is_refused(tmp_path: Path) -> None:
-    assert "arm" not in link_surfaces(described(tmp_path, "mjcf", MJCF.format(form="stl")))
-    assert len(mesh_vertices(tmp_path / "part.dae")) == 0
+    assert "arm" not in link_surfaces(described(tmp_path, "mjcf", MJCF.format(form="stl")), COARSE)
+    assert len(points_on_mesh(tmp_path / "part.dae")) == 0
     for data in (b"", bytes(80) + struct.pack("<I", 5) + b"\0" * 50):
         (tmp_path / "part.stl").write_bytes(data)
         with pytest.raises(DataError, match="mesh"):
-            mesh_vertices(tmp_path / "part.stl")
+            points_on_mesh(tmp_path / "part.stl")
+    for text in ("v 0 0 0\nf 1 2 3", "v 0 0 0\nf 0 1 1", "v 0 0\nf 1 1 1", "v 0 0 0", "v 0 0 nan\nf 1 1 1", "f 1 1 1"):
+        (tmp_path / "part.obj").write_text(text)
+        with pytest.raises(DataError, match="mesh"):
+            points_on_mesh(tmp_path / "part.obj")
+
+
+def test_corners_counted_from_the_end_and_polygons(tmp_path: Path) -> None:
+    (tmp_path / "square.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4/1/1 2//1 3 -1\n")
+    points = points_on_mesh(tmp_path / "square.obj")
+    assert (points[:, 2] == 0).all() and points.min() == 0 and points.max() == 1
+    assert np.histogram2d(*points[6:, :2].T, bins=2, range=[[0, 1]] * 2)[0] == pytest.approx(1000, abs=120)
+
+
+def test_spheres_are_thinned_and_grow_to_cover_what_they_stand_for(tmp_path: Path) -> None:
+    line = "".join(f'<geom type="sphere" size=".002" pos="{i / 100} 0 0"/>' for i in range(41))
+    text = f'<mujoco><worldbody><body name="arm"><joint name="j"/>{line}</body></worldbody></mujoco>'
+    robot = described(tmp_path, "mjcf", text)
+    points, radii = link_surfaces(robot, Sampling(5, 0.008))["arm"]
+    assert sorted(points[:, 0]) == pytest.approx([0, 0.1, 0.2, 0.3, 0.4]) and radii == pytest.approx(0.03)
+    points, radii = link_surfaces(robot, FINE)["arm"]
+    assert len(points) == 41 and radii == pytest.approx(0.002)
 
 
 @pytest.mark.parametrize("name", ["viperx_graphite", "ur5e_silver", "xarm7_single", "panda_ivory"])

@@ -226,6 +226,7 @@ class StillView:
         self.camera, self.points, self.radii, self.certainty = camera, points, radii, certainty
         change = np.log1p(np.maximum(motion.change - NOISE_CHANGE, 0.0))
         self.measured = np.concatenate([motion.flow, change[..., None]], axis=-1).astype(np.float32)
+        self.steps = np.ones(len(self.measured), dtype=bool)
         self._by_blur: dict[float, np.ndarray] = {}
         self._maps: dict[bytes, tuple[np.ndarray, ...]] = {}
 
@@ -253,6 +254,12 @@ class StillView:
         """The same without what moves in some cells (n, r, c)."""
         other = copy(self)
         other.measured, other._by_blur, other._maps = self.measured * ~cells[..., None], {}, {}
+        return other
+
+    def only(self, steps: np.ndarray) -> StillView:
+        """The same in some steps (n,) alone: in the others nothing moves, in the pictures and in the prediction."""
+        other = self.without(~steps[:, None, None])
+        other.steps = steps
         return other
 
     def equations(self, theta: np.ndarray, blur: float) -> Equations:
@@ -325,7 +332,7 @@ class StillView:
         uv = delayed(uv, float(theta[LAG]))
         step = np.diff(uv, axis=0)
         length = lengths(step)
-        alive = ahead[1:] & ahead[:-1] & (length > STILL_STEP_PX)
+        alive = ahead[1:] & ahead[:-1] & (length > STILL_STEP_PX) & self.steps[:, None]
         kept = (length * alive).max(axis=0) > MIN_STEP_PX
         count, (rows, columns) = len(step), self.measured.shape[1:3]
         step, length, alive = step[:, kept].astype(np.float32), length[:, kept].astype(np.float32), alive[:, kept]

@@ -13,6 +13,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from torch import Tensor
 
 from worldline_core.actions.robot_masks import robot_capsules
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, arm_blocks, frames_with_all
@@ -327,19 +328,24 @@ def _moved_arms(observation: Observation, kinematics: ArmKinematics, episode: Ep
     both = np.concatenate([episode.state, episode.action]).astype(np.float64)
     key = (id(kinematics), both.tobytes())
     if key not in observation.moved_arms:
-        noted = kinematics.embodiment.noted_posture(observation.episode.conventions)  # waist, head
-        posture = {name: np.full(len(both), value) for name, value in noted.items()}
-        links = kinematics.link_poses(both, posture=posture)
+        links = kinematics.link_poses(both, kinematics.embodiment.noted_posture(observation.episode.conventions))
         fk = kinematics.tools_of(links).numpy()
         links = {name: poses[: episode.num_frames] for name, poses in links.items()}
         capsules, radius = robot_capsules(kinematics, links)
         points, radii = along = _sampled(capsules.numpy(), radius.numpy())
         if _has_surfaces(kinematics):
-            poses = ((links[name].numpy(), shape) for name, shape in kinematics.surfaces.items())
-            parts = [(shape @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3], size) for T, (shape, size) in poses]
-            points, radii = np.concatenate([p for p, _ in parts], axis=1), np.concatenate([r for _, r in parts])
+            points, radii = placed_surfaces(kinematics.surfaces, links)
         observation.moved_arms[key] = fk[: episode.num_frames], fk[episode.num_frames :], points, radii, *along
     return observation.moved_arms[key]
+
+
+def placed_surfaces(
+    surfaces: Mapping[str, tuple[np.ndarray, np.ndarray]], links: Mapping[str, Tensor]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, p, 3) and radii (p,) of `ArmKinematics.surfaces` at poses of the links (n, 4, 4)."""
+    poses = ((links[name].numpy(), shape) for name, shape in surfaces.items())
+    parts = [(shape @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3], size) for T, (shape, size) in poses]
+    return np.concatenate([p for p, _ in parts], axis=1), np.concatenate([r for _, r in parts])
 
 
 def _has_surfaces(kinematics: ArmKinematics) -> bool:

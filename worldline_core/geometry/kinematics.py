@@ -18,7 +18,7 @@ from torch import Tensor
 from worldline_core.errors import ConfigError, DataError, UnavailableError, WorldLineError
 from worldline_core.geometry.embodiment import Embodiment, load_embodiment
 from worldline_core.geometry.kinematic_tree import TreeBody, read_tree
-from worldline_core.geometry.link_surfaces import link_surfaces
+from worldline_core.geometry.link_surfaces import COARSE, FINE, link_surfaces
 from worldline_core.geometry.tensor_transforms import invert
 
 if TYPE_CHECKING:  # imports a plotting library: seconds that most commands and processes need not wait
@@ -148,7 +148,12 @@ class ArmKinematics:
     @cached_property
     def surfaces(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Points (p, 3) in the link's frame and radii (p,) [m] of the links whose shapes the description has."""
-        return {name: found for name, found in link_surfaces(self.embodiment).items() if name in self.links}
+        return {name: of for name, of in link_surfaces(self.embodiment, COARSE).items() if name in self.links}
+
+    @cached_property
+    def fine_surfaces(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """`surfaces` in more and smaller points."""
+        return {name: of for name, of in link_surfaces(self.embodiment, FINE).items() if name in self.links}
 
     @cached_property
     def link_parents(self) -> dict[str, str]:

@@ -12,7 +12,16 @@ import numpy as np
 
 from worldline_core.calibration.camera_errors import ESTIMATED_AT_HZ, StillView, delayed
 from worldline_core.calibration.estimate.camera_search import MotionOfSteps
-from worldline_core.calibration.observation import GRAY_WIDTH, Motion, cell_means, measured_motion, observe, read
+from worldline_core.calibration.observation import (
+    GRAY_WIDTH,
+    Motion,
+    arms_of_embodiment,
+    cell_means,
+    measured_motion,
+    observe,
+    placed_surfaces,
+    read,
+)
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -173,6 +182,7 @@ def recorded_views(
     sizes: dict[str, tuple[int, int]] = {}
     every, frame_s, surfaces = 1, 1.0, True
     faults: list[DataError | RejectedInputError] = []
+    wrists = {arm.wrist_view for arm in arms_of_embodiment(kinematics)}
     for episode, frames in loaded:
         every = max(1, round(episode.fps / ESTIMATED_AT_HZ))
         frame_s = every / episode.fps
@@ -202,8 +212,13 @@ def recorded_views(
             if frames_of.stop - frames_of.start < FEWEST_FRAMES:
                 continue
             gripper = None if openings is None else openings[::every][frames_of]
+            points, radii = reading.points[::every][frames_of], reading.radii
+            if surfaces and view in wrists:
+                states = episode.state[::every][frames_of].astype(np.float64)
+                links = kinematics.link_poses(states, kinematics.embodiment.noted_posture(episode.conventions))
+                points, radii = placed_surfaces(kinematics.fine_surfaces, links)
             shown = ViewOfEpisode(
-                episode.episode_id, np.stack(gray[frames_of]), reading.points[::every][frames_of], reading.radii,
+                episode.episode_id, np.stack(gray[frames_of]), points, radii,
                 reading.tools[::every][frames_of], gripper, np.stack(coloured[frames_of]) if colour else None,
             )  # fmt: skip
             found[view].append(shown)

@@ -31,7 +31,7 @@ from worldline_core.calibration.estimate.still_camera import (
     tools_apart,
     tools_in_view,
 )
-from worldline_core.calibration.estimate.wrist_camera import LEAST_WRIST_AGREEMENT, SHARED_WRIST_CAMERA, WristCamera
+from worldline_core.calibration.estimate.wrist_camera import LEAST_WRIST_AGREEMENT, WristCamera
 from worldline_core.calibration.observation import tool_travel
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.discovery.cameras import watch
@@ -238,7 +238,7 @@ def judge_wrist(recorded: RecordedView, found: WristCamera, arm: int) -> ViewEst
     fitted = found.fitted
     _, _, ahead, slope = projected(np.zeros((1, 1, 3)), fitted.camera)
     shown = 100 / fitted.camera.width * np.c_[slope[:, :, 0, 0], np.zeros(2)]
-    kinds = _intervals(recorded, fitted, shown, SHARED_WRIST_CAMERA, np.zeros(PARAMETERS))
+    kinds = _intervals(recorded, fitted, shown, found.shared, np.zeros(PARAMETERS))
     reasons: list[str] = []
     typical, known = found.agreement, int(np.isfinite(found.agreements).sum())
     if known < FEWEST_EPISODES:

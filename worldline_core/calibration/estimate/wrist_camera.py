@@ -58,19 +58,23 @@ RIVAL_APART, RIVAL_TURNED = 0.05, 0.15
 """A rival shows the tool elsewhere [widths], or is turned against the best camera [rad]."""
 USUAL_WRIST_FOCAL, WRIST_FOCAL_PRIOR = 0.6, 0.4
 """Focal length of usual wrist cameras in widths of the picture (80 degrees), and standard deviation of its logarithm."""
-SHARED_WRIST_CAMERA = 3.0
-"""Variance that more episodes do not reduce, in variances of one episode: held things hide fingers."""
+SHARED_WRIST_CAMERA, SHARED_WITH_FINE_HAND, FINE_HAND_M = 3.0, 1.5, 0.006
+"""Variance that more episodes do not reduce, in variances of one episode (held things hide fingers, a hand is drawn as spheres), and
+of a hand of spheres that are smaller than this; from recordings whose cameras are known."""
+ZOOMS = (0.75, 1.33)
+"""Focal length and distance hide each other's errors: cameras this much longer and farther are tried, too."""
 ROUNDS, BLURS = 8, (1.8, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class WristEvidence:
-    """One episode's evidence of a camera whose pose is that in the tool's frame."""
+    """One episode's evidence of a camera whose pose is that in the tool's frame. `shared`: variance that more episodes do not reduce."""
 
     tools: np.ndarray
     scene: WristView
     fingers: StillView | None
     finger_steps: int
+    shared: float
 
     def agreement(self, camera: CameraTrack, lag: float) -> float:
         """Share of the scene's flow that a camera explains, by the logarithms of errors; NaN where nothing is seen."""
@@ -118,9 +122,9 @@ def _evidence(episode: ViewOfEpisode, recorded: RecordedView, arm: int, seen_fro
             points = _in_tool(hand, tools)
             seen = _seen(points, radii, seen_from)
             still = recorded.unknown_camera(fine=True)
-            fingers = StillView(still, points[:, seen], radii[seen], episode.fine, certainty(episode.fine))
-            fingers.measured[~moves] = 0.0
-    return WristEvidence(tools, scene, fingers, int(moves.sum()))
+            fingers = StillView(still, points[:, seen], radii[seen], episode.fine, certainty(episode.fine)).only(moves)
+    shared = SHARED_WITH_FINE_HAND if len(radii) and np.median(radii) < FINE_HAND_M else SHARED_WRIST_CAMERA
+    return WristEvidence(tools, scene, fingers, int(moves.sum()), shared)
 
 
 def _near_hand(episode: ViewOfEpisode, arm: int) -> np.ndarray:
@@ -164,6 +168,7 @@ class WristCamera:
         agreements: (e,) of each episode with the camera of the half that it does not belong to; NaN where it shows nothing.
         own: equations of each episode alone at the fitted camera.
         fingers: number of steps in which the fingers' own motion is seen.
+        shared: variance that more episodes do not reduce, in variances of one episode.
         searched: whether the mount was searched, not described.
         rival: the best camera of a search that is mounted otherwise.
         rival_agreements: (e,) of each episode with the rival; NaN as above.
@@ -175,6 +180,7 @@ class WristCamera:
     agreements: np.ndarray
     own: tuple[Equations, ...]
     fingers: int
+    shared: float
     searched: bool = False
     rival: FittedCamera | None = None
     rival_agreements: np.ndarray | None = None
@@ -221,7 +227,7 @@ def _estimate_wrist(recorded: RecordedView, arm: int, T_tool_mount: np.ndarray |
             fit_wrist(evidence, s, late, starts[1], MOUNT_PRIOR) for s in starts for late in dict.fromkeys((0.0, lag))
         ]
         best = max(rough, key=lambda fit: fit.likelihood)
-        found = _made_exact(recorded, arm, best, starts[1], MOUNT_PRIOR)
+        found = _made_exact(recorded, arm, best, starts[1])
         if found.agreement >= LEAST_WRIST_AGREEMENT:
             return found
     starts = _searched_starts(few, arm, lag)
@@ -233,7 +239,7 @@ def _estimate_wrist(recorded: RecordedView, arm: int, T_tool_mount: np.ndarray |
     fits.sort(key=lambda fit: -fit.likelihood)
     rival = next((fit for fit in fits[1:] if _apart(fit.camera, fits[0].camera)), None)
     followed = fits[:1] if rival is None else [fits[0], rival]
-    exact = [_made_exact(recorded, arm, fit, fit.camera, SEARCHED_PRIOR) for fit in followed]
+    exact = [_made_exact(recorded, arm, fit, None) for fit in followed]
     # What one of them hides of the scene decides too much of that likelihood: episodes that are held out have the last word.
     found, *others = sorted(exact, key=lambda each: -each.agreement)
     apart = [other for other in others if _apart(other.fitted.camera, found.fitted.camera)]
@@ -242,17 +248,34 @@ def _estimate_wrist(recorded: RecordedView, arm: int, T_tool_mount: np.ndarray |
     return replace(found, searched=True, rival=apart[0].fitted, rival_agreements=apart[0].agreements)
 
 
-def _made_exact(
-    recorded: RecordedView, arm: int, rough: FittedCamera, prior_at: CameraTrack, prior: np.ndarray
-) -> WristCamera:
-    """A rough camera fitted to all episodes, and to each half of them; cells that the hand hides are known now."""
+def _made_exact(recorded: RecordedView, arm: int, rough: FittedCamera, mount: CameraTrack | None) -> WristCamera:
+    """A rough camera fitted to all episodes, and to each half of them; cells that the hand hides are known now.
+
+    Args:
+        mount: the camera as the description mounts it; None where it was searched.
+    """
+    prior = SEARCHED_PRIOR if mount is None else MOUNT_PRIOR
+    evidence = wrist_evidence(_few(recorded), arm, rough.camera)
+    starts = [rough.camera, *(_zoomed(rough.camera, factor) for factor in ZOOMS)]
+    zoomed = [fit_wrist(evidence, start, rough.lag, mount or start, prior) for start in starts]
+    rough = max(zoomed, key=lambda fit: fit.likelihood)
+    prior_at = mount or rough.camera
     evidence = wrist_evidence(recorded, arm, rough.camera)
     best = fit_wrist(evidence, rough.camera, rough.lag, prior_at, prior)
     halves = tuple(fit_wrist(evidence[i::2], best.camera, best.lag, prior_at, prior) for i in (0, 1))
     others = [halves[1 - i % 2] for i in range(len(evidence))]
     agreements = np.array([e.agreement(other.camera, other.lag) for e, other in zip(evidence, others, strict=True)])
     own = tuple(each.at(best.camera, best.lag, BLURS[-1]) for each in evidence)
-    return WristCamera(best, halves, agreements, own, sum(each.finger_steps for each in evidence))
+    steps = sum(each.finger_steps for each in evidence)
+    return WristCamera(best, halves, agreements, own, steps, evidence[0].shared)
+
+
+def _zoomed(camera: CameraTrack, factor: float) -> CameraTrack:
+    """A camera of a longer lens that is as much farther from the tool, which it shows at the same size."""
+    K, back = camera.K.copy(), np.eye(4)
+    K[0, 0] = K[1, 1] = factor * camera.K[0, 0]
+    back[2, 3] = (1 - factor) * rigid_inverse(camera.T_base_camera)[0, 2, 3]
+    return replace(camera, K=K, T_base_camera=camera.T_base_camera @ back)
 
 
 def _searched_starts(few: RecordedView, arm: int, lag: float) -> list[tuple[CameraTrack, list[WristEvidence]]]:
@@ -331,7 +354,7 @@ def _equations(
     towards = np.concatenate([cv2.Rodrigues(apart[:3, :3])[0][:, 0], apart[:3, 3]])
     focal = float(np.log(camera.K[0, 0] / camera.width / USUAL_WRIST_FOCAL))
     towards = np.append(towards, [-focal, -lag])
-    weight = np.append(prior, [WRIST_FOCAL_PRIOR, LAG_PRIOR]) ** -2.0 * inflation(len(evidence), SHARED_WRIST_CAMERA)
+    weight = np.append(prior, [WRIST_FOCAL_PRIOR, LAG_PRIOR]) ** -2.0 * inflation(len(evidence), evidence[0].shared)
     return Equations(
         information + np.diag(weight), gradient + weight * towards, likelihood - float(weight @ towards**2) / 2
     )
