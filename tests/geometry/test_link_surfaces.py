@@ -77,6 +77,17 @@ def test_points_are_where_the_shapes_are(tmp_path: Path, form: str, mesh: str) -
     assert len(on_a_side) == COARSE.points and on_a_side.all()
 
 
+@pytest.mark.parametrize(("contact", "count"), [("", 1), ('contype="0" conaffinity="0"', 2)])
+def test_shapes_for_contacts_count_only_where_a_body_has_no_others(tmp_path: Path, contact: str, count: int) -> None:
+    seen = '<geom class="seen" type="sphere" size=".1"/>'
+    touched = f'<geom type="sphere" size=".2" pos="1 0 0" {contact}/>'
+    text = f"""<mujoco><default><default class="seen"><geom contype="0" conaffinity="0"/></default></default>
+    <worldbody><body name="arm"><joint name="j"/>{seen}{touched}</body>
+    <body name="bare">{touched}</body></worldbody></mujoco>"""
+    found = link_surfaces(described(tmp_path, "mjcf", text), COARSE)
+    assert (len(found["arm"][1]), found["arm"][1][0], found["bare"][1].tolist()) == (count, 0.1, [0.2])
+
+
 def test_a_mesh_that_is_not_here_gives_no_points_and_a_damaged_one_is_refused(tmp_path: Path) -> None:
     assert "arm" not in link_surfaces(described(tmp_path, "mjcf", MJCF.format(form="stl")), COARSE)
     assert len(points_on_mesh(tmp_path / "part.dae")) == 0

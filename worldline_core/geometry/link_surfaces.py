@@ -1,6 +1,6 @@
 """Points on the surfaces of a robot's links, from the meshes and primitive shapes of its description.
 
-A description of kinematics alone has none. MJCF: the geoms of bodies, with defaults by class; URDF: visuals and collisions.
+A description of kinematics alone has none. MJCF: the geoms of bodies, with defaults by class; URDF: visuals, or collisions.
 Meshes are STL or OBJ files beside the description; links whose meshes are of another form, or are not there, have no points.
 """
 
@@ -76,7 +76,9 @@ def spread(points: np.ndarray, radii: np.ndarray, sampling: Sampling) -> tuple[n
 
 
 def _mjcf_shapes(root: ET.Element, folder: Path) -> Iterator[tuple[str, np.ndarray, float]]:
-    """(body, points in its frame, radius of a sphere or 0) of every geom."""
+    """(body, points in its frame, radius of a sphere or 0) of every geom; where some touch nothing, of these: the others are
+    for contacts, and not seen.
+    """
     compiler = {key: value for each in root.findall("compiler") for key, value in each.attrib.items()}
     folder = folder / compiler.get("meshdir", compiler.get("assetdir", ""))
     geoms, meshes = dict[str, dict[str, str]](), dict[str, dict[str, str]]()
@@ -93,8 +95,11 @@ def _mjcf_shapes(root: ET.Element, folder: Path) -> Iterator[tuple[str, np.ndarr
         body, inherited = front.pop()
         childclass = body.get("childclass", inherited)
         front += [(child, childclass) for child in body.findall("body")]
-        for geom in body.findall("geom"):
-            values = {**geoms.get(geom.get("class", childclass) or "main", {}), **geom.attrib}
+        described = [
+            {**geoms.get(geom.get("class", childclass) or "main", {}), **geom.attrib} for geom in body.findall("geom")
+        ]
+        seen = [values for values in described if values.get("contype") == values.get("conaffinity") == "0"]
+        for values in seen or described:
             points, radius = _geom_points(values, files, folder)
             if len(points) and body.get("name"):
                 place = np.array(_floats(values.get("pos", "0 0 0")))

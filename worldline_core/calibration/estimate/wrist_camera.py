@@ -58,7 +58,7 @@ RIVAL_APART, RIVAL_TURNED = 0.05, 0.15
 """A rival shows the tool elsewhere [widths], or is turned against the best camera [rad]."""
 USUAL_WRIST_FOCAL, WRIST_FOCAL_PRIOR = 0.6, 0.4
 """Focal length of usual wrist cameras in widths of the picture (80 degrees), and standard deviation of its logarithm."""
-SHARED_WRIST_CAMERA, SHARED_WITH_FINE_HAND, FINE_HAND_M = 3.0, 1.5, 0.006
+SHARED_WRIST_CAMERA, SHARED_WITH_FINE_HAND, FINE_HAND_M = 4.0, 2.0, 0.006
 """Variance that more episodes do not reduce, in variances of one episode (held things hide fingers, a hand is drawn as spheres), and
 of a hand of spheres that are smaller than this; from recordings whose cameras are known."""
 ZOOMS = (0.75, 1.33)
