@@ -383,7 +383,9 @@ SPOILED: dict[str, Callable[[Recorded], Recorded]] = {
 }
 
 
-def hidden_sets(hidden: Path | None, foreign: Path | None, count: int) -> Iterator[tuple[str, ArmKinematics, Recorded]]:
+def hidden_sets(
+    hidden: Path | None, foreign: Path | None, count: int, described: str | None = None
+) -> Iterator[tuple[str, ArmKinematics, Recorded]]:
     for path in sorted(hidden.glob("*.json")) if hidden else ():
         from benchmarks.hidden_cameras import read_set  # imports mujoco
 
@@ -393,6 +395,9 @@ def hidden_sets(hidden: Path | None, foreign: Path | None, count: int) -> Iterat
         from benchmarks.foreign_robots import read_source
 
         embodiment, episodes = read_source(path)
+        if described is not None:
+            embodiment = load_embodiment(described)
+            episodes = [(replace(episode, embodiment=described), frames) for episode, frames in episodes]
         yield path.stem, ArmKinematics(embodiment), episodes[:count]
 
 
@@ -429,17 +434,8 @@ def measure_estimates(sets: Iterator[tuple[str, ArmKinematics, Recorded]], spoil
             print(f"    {name}: {time.process_time() - start:.0f} s of CPU", flush=True)
 
     columns = (
-        "set",
-        "view",
-        "verdict",
-        "tool error, % of the width",
-        "95 %",
-        "deg",
-        "mm",
-        "% focal",
-        "frames",
-        "agreement, reason",
-    )
+        "set", "view", "verdict", "tool error, % of the width", "95 %", "deg", "mm", "% focal", "frames", "agreement, reason",
+    )  # fmt: skip
     print_table(columns, rows())
     for kind, values in ratios.items():
         worst = f"{np.quantile(values, 0.95):.2f}"
@@ -514,6 +510,7 @@ def main() -> None:
     parser.add_argument("--splits", default="test,ood_test")
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--foreign", type=Path, help="cameras: what benchmarks.foreign_robots wrote")
+    parser.add_argument("--described", help="estimate: read the foreign robots by this shipped description (so101)")
     parser.add_argument("--hidden", type=Path, help="estimate: what benchmarks.hidden_cameras wrote")
     parser.add_argument(
         "--spoil", choices=list(SPOILED), default="nothing", help="estimate: what is done to the sets first"
@@ -523,7 +520,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.what == "estimate":
-        measure_estimates(hidden_sets(arguments.hidden, arguments.foreign, arguments.episodes), arguments.spoil)
+        measure_estimates(
+            hidden_sets(arguments.hidden, arguments.foreign, arguments.episodes, arguments.described), arguments.spoil
+        )
         return
     if arguments.what == "bases":
         measure_bases(
