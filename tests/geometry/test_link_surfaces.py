@@ -108,6 +108,12 @@ def test_corners_counted_from_the_end_and_polygons(tmp_path: Path) -> None:
     assert np.histogram2d(*points[6:, :2].T, bins=2, range=[[0, 1]] * 2)[0] == pytest.approx(1000, abs=120)
 
 
+@pytest.mark.parametrize("far", ["0", "1e300"])
+def test_corners_alone_stand_for_triangles_without_a_finite_area(tmp_path: Path, far: str) -> None:
+    (tmp_path / "line.obj").write_text(f"v 0 0 0\nv {far} 0 0\nv 0 {far} 0\nf 1 2 3\n")
+    assert points_on_mesh(tmp_path / "line.obj").shape == (3, 3)
+
+
 def test_spheres_are_thinned_and_grow_to_cover_what_they_stand_for(tmp_path: Path) -> None:
     line = "".join(f'<geom type="sphere" size=".002" pos="{i / 100} 0 0"/>' for i in range(41))
     text = f'<mujoco><worldbody><body name="arm"><joint name="j"/>{line}</body></worldbody></mujoco>'

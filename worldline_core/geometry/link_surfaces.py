@@ -235,8 +235,9 @@ def _points_on(triangles: np.ndarray) -> np.ndarray:
     random = np.random.default_rng(0)
     corners = random.permutation(triangles.reshape(-1, 3))[:SAMPLED_POINTS]
     sides = triangles[:, 1:] - triangles[:, :1]
-    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    if not area.sum() > 0:
+    with np.errstate(over="ignore", invalid="ignore"):  # of a damaged file
+        area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    if not 0 < area.sum() < np.inf:
         return corners
     chosen = random.choice(len(triangles), SAMPLED_POINTS, p=area / area.sum())
     along = random.random((SAMPLED_POINTS, 2, 1))
