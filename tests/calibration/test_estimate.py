@@ -39,8 +39,8 @@ from worldline_core.calibration.estimate.wrist_camera import WristCamera, mounts
 from worldline_core.calibration.observation import CELL_PX, CLEAR_CHANGE
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.episodes.recorded_poses import RecordedCameras
-from worldline_core.data.sources.calibration_file import add_calibrated_view, mounted_camera, read_calibration
+from worldline_core.data.episodes.source import LoadedEpisode
+from worldline_core.data.sources.calibration_file import calibrated, read_calibration
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import project_points
 from worldline_core.geometry.embodiment import RigidOffset, load_embodiment
@@ -347,19 +347,15 @@ def test_sure_cameras_are_read_back_as_a_calibration_file(tmp_path, bank, kinema
         ViewEstimate("right_wrist", wrist=True, verdict="unsure", camera=camera),
     ]
     (tmp_path / "cameras.json").write_text(json.dumps(camera_file(sure)))
-    views = read_calibration(tmp_path / "cameras.json").views
-    assert views.keys() == {"left_wrist", "head"}
-    cameras = RecordedCameras()
-    for view, entry in views.items():
-        add_calibrated_view(
-            cameras, view, entry, image_size=(128, 192), num_frames=episode.num_frames,
-            read_feature=lambda _: np.empty(0), where="here",
-            mounted=lambda view, entry: mounted_camera(episode.embodiment, episode.state, view, entry, "here"),
-        )  # fmt: skip
+    entries = read_calibration(tmp_path, "cameras.json")
+    assert entries.keys() == {"left_wrist", "head"}
+    pictures = [np.zeros((128, 192, 3), np.uint8)]
+    loaded = calibrated(LoadedEpisode(episode, ("head", "left_wrist"), lambda _: pictures), entries, "here")
+    cameras = loaded.with_mounted(loaded).episode.cameras
     tools = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()[:, 0]
-    assert np.allclose(cameras.tracks["left_wrist"].T_base_camera, tools @ pose, atol=1e-5)
-    assert np.allclose(cameras.tracks["head"].T_base_camera, pose[None])
-    assert np.allclose(cameras.tracks["head"].K[:2, 2], (95.5, 63.5))
+    assert np.allclose(cameras["left_wrist"].T_base_camera, tools @ pose, atol=1e-5)
+    assert np.allclose(cameras["head"].T_base_camera, pose[None])
+    assert np.allclose(cameras["head"].K[:2, 2], (95.5, 63.5))
 
 
 def test_an_estimated_wrist_camera_is_drawn_where_its_tool_carries_it(bank, kinematics, monkeypatch):
@@ -395,7 +391,7 @@ def test_the_command_writes_cameras_pages_and_pictures(tmp_path, bank, monkeypat
     assert "conventions.image_lag_frames: 2" in said and "<b>too little</b>" in said
     assert "<b>too little</b>" not in page and "head.jpg" in page
     assert (tmp_path / "out" / "head.jpg").is_file()
-    assert read_calibration(tmp_path / "out" / "cameras.json").views.keys() == {"head"}
+    assert read_calibration(tmp_path / "out", "cameras.json").keys() == {"head"}
     listed = json.loads((tmp_path / "out" / "estimate.json").read_text())
     assert [view["verdict"] for view in listed["views"]] == ["sure", "unsure"] and not listed["sure"]
     with pytest.raises(SystemExit) as ended:

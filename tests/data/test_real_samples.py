@@ -19,7 +19,7 @@ from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 def run(
     tmp_path: Path, *, image_size: Any = (48, 64), trim: Any = None, **source: Any
 ) -> tuple[dict[str, Any], EpisodeSet]:
-    return curating.run(tmp_path, source, image_size=(48, 64), trim=trim)
+    return curating.run(tmp_path, source, image_size=image_size, trim=trim)
 
 
 def test_agibot_v1(tmp_path: Path, shared_data: Path) -> None:
@@ -144,26 +144,27 @@ def test_unitree_with_its_arms_named(tmp_path: Path, shared_data: Path) -> None:
 
 
 def test_droid_with_the_self_calibration(tmp_path: Path, shared_data: Path) -> None:
-    """The sample's own calibration, put into the layout of a calibration file: fingertips land in both pictures."""
-    from worldline_core.data.episodes.recorded_poses import RecordedCameras
-    from worldline_core.data.sources.calibration_file import CameraEntry, add_calibrated_view
-
+    """The sample's own calibration as a calibration file: fingertips land in both pictures."""
     folder = shared_data / "droid_ctrl_world"
     recorded = json.loads((folder / "selfcal_droid_new_setup_0003.json").read_text())
     width, height = recorded["image_size"]
     record = json.loads((folder / "droid_new_setup/annotation/val/0003.json").read_text())
     states = np.asarray(record["states"])
     tips = pose_from_euler_fixed_xyz(states[:, :3], states[:, 3:6]) @ np.array([0, 0, 0.155, 1.0])
-    for number in (0, 1):
+    views = {}
+    for number, view in enumerate(("head", "exterior_2")):
         camera = recorded[f"camera_{number}"]
         size = {"width": width, "height": height, "maps": "camera_to_base", "axes": "opencv"}
-        entry = CameraEntry.model_validate({**size, "K": camera["K"], "T": camera["c2w_opencv"]})
-        cameras = RecordedCameras()
-        add_calibrated_view(
-            cameras, "head", entry, image_size=(height // 2, width // 2), num_frames=len(states),
-            read_feature=lambda name: np.zeros(0), where="sample",
-        )  # fmt: skip
-        found = cameras.tracks["head"]
+        views[view] = {**size, "K": camera["K"], "T": camera["c2w_opencv"]}
+    (tmp_path / "cameras.json").write_text(json.dumps({"views": views}))
+    _, curated = run(
+        tmp_path, kind="droid_annotation", path=str(folder), calibration=str(tmp_path / "cameras.json"),
+        include=["*new_setup*0003"], image_size=(height // 2, width // 2), trim="common",
+    )  # fmt: skip
+    (row,), cameras = curated.rows, curated.episode(0).cameras
+    assert row.stage2_ok and set(cameras) == set(views)
+    tips = tips[: row.num_frames]
+    for found in cameras.values():
         seen = tips @ np.linalg.inv(found.T_base_camera[0]).T
         pixels = (seen[:, :3] / seen[:, 2:3] @ found.K.T)[:, :2]
         inside = (seen[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < [width // 2, height // 2]).all(axis=1)

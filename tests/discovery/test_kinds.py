@@ -96,6 +96,18 @@ def test_unitree(tmp_path: Path, write: Any) -> None:
     assert counts["found"] == 3
 
 
+def test_the_file_that_an_estimate_writes_is_found_beside_recordings(tmp_path: Path) -> None:
+    for n in range(3):
+        write_hdf5(tmp_path / "raw", n, 20 * n)
+    camera = {"width": 64, "height": 48, "K": [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], "T": np.eye(4).tolist()}
+    views = {"head": camera | {"maps": "camera_to_base", "axes": "opencv"}}
+    (tmp_path / "raw/cameras.json").write_text(json.dumps({"views": views}))
+    found, config, counts = init(tmp_path)
+    assert (found.cameras, found.head_camera, counts["kept"]) == ("some", True, 3)
+    assert config.render_actions is not None and config.train_stage2.native_size == 16
+    assert set(EpisodeSet.open(tmp_path / "curated").episode(0).cameras) == {"head"}
+
+
 def test_unitrees_other_arms(tmp_path: Path) -> None:
     write_hdf5(tmp_path / "one", robot="z1_single")
     found = look(tmp_path / "one")

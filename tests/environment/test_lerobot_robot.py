@@ -185,7 +185,7 @@ def test_cameras_of_an_episode_are_written_into_its_dataset(robot, replay, start
             (recorded / "meta").mkdir(parents=True)
             (recorded / "meta" / "info.json").write_text("{}")
     robot.disconnect()
-    camera = read_calibration(recorded / "meta" / "cameras" / "000001.json").views["head"]
+    camera = read_calibration(recorded, "meta/cameras/000001.json")["head"]
     np.testing.assert_allclose(camera.T, starts[1].cameras["head"].T_base_camera[None], atol=1e-6)
     np.testing.assert_array_equal(camera.K, starts[1].cameras["head"].K)
     source = read_yaml(recorded / "curate.yaml")["curate"]["sources"][0]
@@ -238,9 +238,9 @@ def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: 
         robot.send_action(robot._columns.named(command))
     assert np.array_equal(robot.get_observation()["head"], simulation.step(starts.commands(1)[:16])[0]["head"][-1])
     for name, content, said in (
-        ("state.yaml", state | {names[0]: "zero"}, r"(?s)Not the robot's state.*left/shoulder_pan_joint"),
         ("calibration.yaml", {"views": {"head": entries["head"]}}, r"(?s)each view.*view left_wrist.*got: nothing"),
         ("left_wrist.png", None, r"(?s)Not a picture to start from.*left_wrist.png"),
+        ("state.yaml", state | {names[0]: "zero"}, r"(?s)Not the robot's state.*left/shoulder_pan_joint"),
     ):
         (folder / name).write_text(yaml.safe_dump(content))
         with pytest.raises(DataError, match=said):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -56,6 +57,17 @@ def test_known_functions_of_time_come_back(tmp_path: Path) -> None:
         expected[:3, 3] = place + np.array([0, 0, 0.1])
         assert np.abs(wrist.T_base_camera[i] - expected).max() < 1e-6  # place and angle are linear: nothing is lost
     assert np.array_equal(head.K, [[20, 0, 7.5], [0, 21, 5.5], [0, 0, 1]])
+
+
+def test_a_calibration_file_takes_the_place_of_a_topic(tmp_path: Path) -> None:
+    source, T = changed(tmp_path, {}), np.diag([1.0, -1.0, -1.0, 1.0])
+    entry = {"width": 16, "height": 12, "K": [[9, 0, 7.5], [0, 9, 5.5], [0, 0, 1]]}
+    entry |= {"maps": "camera_to_base", "axes": "opencv", "T": T.tolist()}
+    (tmp_path / "cameras.json").write_text(json.dumps({"views": {"head": entry}}))
+    cameras = load(source | {"calibration": "cameras.json"}).episode.cameras
+    assert np.array_equal(cameras["head"].K, entry["K"])
+    assert np.allclose(cameras["head"].T_base_camera, T[None])
+    assert cameras["right_wrist"].moving  # by its topic, as before
 
 
 def test_messages_out_of_order_are_sorted_and_those_sent_twice_count_once(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.errors import CheckpointError, ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.model.world_model_config import NativeVectors, TrainedClips
@@ -396,6 +397,21 @@ def test_an_observation_as_files_may_lack_cameras(tmp_path):
     assert (set(found.images), found.cameras) == (set(VIEWS), {})
     with pytest.raises(Exception, match=r"calibration\.yaml"):
         read_start(tmp_path, robot, VIEWS)
+    # Cameras as `worldline calibrate estimate` writes them: that of a wrist is where the state has the tool.
+    height, width = next(iter(IMAGES.values())).shape[:2]
+    known = {"width": width, "height": height, "K": [[60, 0, width / 2], [0, 60, height / 2], [0, 0, 1]]}
+    still = known | {"maps": "camera_to_base", "axes": "opencv", "T": np.eye(4).tolist()}
+    mount = np.eye(4)
+    mount[:3, 3] = 0.06, 0.0, -0.05
+    views = {view: known | {"T_tool_camera": mount.tolist()} if "wrist" in view else still for view in VIEWS}
+    (tmp_path / "calibration.yaml").write_text(json.dumps({"views": views}))
+    found = read_start(tmp_path, robot, VIEWS)
+    tools = ArmKinematics(robot).tool_poses(found.state[None]).numpy()[0]
+    by_view = {arm.camera_view: tool for arm, tool in zip(robot.arms, tools, strict=True)}
+    assert any("wrist" in view for view in VIEWS)
+    for view in VIEWS:
+        expected = by_view[view] @ mount if "wrist" in view else np.eye(4)
+        assert np.allclose(found.cameras[view].T_base_camera, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(

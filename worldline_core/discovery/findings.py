@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from worldline_core.config import QUESTIONS
 from worldline_core.data.guards.source_paths import AnyPath, is_file, regular_file
+from worldline_core.data.sources.calibration_file import read_calibration
 from worldline_core.untrusted_text import cut, printable, shown, visible
 
 Place = tuple[str, ...]
@@ -74,6 +75,22 @@ class Discovery:
     def questions(self) -> list[Question]:
         """Everything that has to be asked, once."""
         return list(dict.fromkeys(_questions(self.source)))
+
+
+_CALIBRATIONS = (
+    *(f"meta/calibration.{suffix}" for suffix in ("yaml", "yml", "json")),
+    *("calibration.yaml", "calibration.json", "cameras.json"),
+)
+
+
+def name_calibration(found: Discovery, root: AnyPath) -> None:
+    """Names the calibration file of a source's folder, if there is one. Raises: RejectedInputError: it cannot be read."""
+    for name in _CALIBRATIONS:
+        if (root / name).exists():
+            known = list(read_calibration(root, name))
+            found.say(("calibration",), name, f"cameras of {named(known)}")
+            found.count_cameras(known)
+            return
 
 
 def _questions(value: Any) -> list[Question]:

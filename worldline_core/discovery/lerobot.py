@@ -16,24 +16,16 @@ from worldline_core.data.lerobot.dataset import (
     is_depth,
     read_info,
 )
-from worldline_core.data.sources.calibration_file import read_calibration
 from worldline_core.data.sources.lerobot import flat_names
 from worldline_core.data.video.clip import decode_frames
 from worldline_core.discovery.cameras import Seen, name_views, watch
 from worldline_core.discovery.columns import ArmColumns, Column, Side, columns_of, find_arms
-from worldline_core.discovery.findings import Discovery, named, stated_licence
+from worldline_core.discovery.findings import Discovery, name_calibration, named, stated_licence
 from worldline_core.discovery.lerobot_arms import EPISODES, ArmDescription, Sample, sample_of
 from worldline_core.errors import DataError
 
 _PICTURES, _PICTURE_S = 48, 0.25
 _STATE, _ACTION = "observation.state", "action"
-_CALIBRATIONS = (
-    "meta/calibration.yaml",
-    "meta/calibration.yml",
-    "meta/calibration.json",
-    "calibration.yaml",
-    "calibration.json",
-)
 _DROID_VIDEOS = {"observation.images.exterior_1_left", "observation.images.exterior_2_left"}
 _RATE_TOLERANCE = 0.02
 
@@ -73,7 +65,7 @@ def discover_lerobot(root: AnyPath) -> Discovery:
     _success(found, dataset)
     if (licence := stated_licence(root)) is not None:
         found.say(("license",), *licence)
-    _calibration(found, root)
+    name_calibration(found, root)
     return found
 
 
@@ -181,16 +173,6 @@ def _success(found: Discovery, dataset: LeRobotDataset) -> None:
     )
     if known is not None:
         found.say(("success_column",), known, "a column of outcomes")
-
-
-def _calibration(found: Discovery, root: AnyPath) -> None:
-    for name in _CALIBRATIONS:
-        if not (root / name).exists():
-            continue
-        known = list(read_calibration(root / name).views)
-        found.say(("calibration",), name, f"cameras of {named(known)}")
-        found.count_cameras(known)
-        return
 
 
 def discover_collection(root: AnyPath) -> Discovery:

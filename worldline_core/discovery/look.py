@@ -8,7 +8,7 @@ from pathlib import Path
 
 from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
 from worldline_core.data.guards.source_paths import AnyPath, find_files, relative_name
-from worldline_core.discovery.findings import Discovery, named
+from worldline_core.discovery.findings import Discovery, name_calibration, named
 from worldline_core.discovery.lerobot import discover_collection, discover_lerobot
 from worldline_core.discovery.mcap import discover_mcap
 from worldline_core.discovery.recordings import (
@@ -124,4 +124,7 @@ def discover(folder: Path) -> Discovery:
 def look(folder: Path) -> Discovery:
     """`discover`, in this process."""
     kind, root = recognise(folder)
-    return _LOOKS[kind](root)
+    found = _LOOKS[kind](root)
+    if kind in ("mcap", "robomind", "unitree_h5", "droid_annotation") and found.cameras == "none":
+        name_calibration(found, root)
+    return found

@@ -18,7 +18,7 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
-from worldline_core.data.sources.calibration_file import add_calibrated_view, read_calibration
+from worldline_core.data.sources.calibration_file import add_camera, mounted_poses, read_calibration, still_poses
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import Embodiment
 from worldline_core.model.tokenizers import resized_frames
@@ -215,7 +215,16 @@ def read_start(
         DataError: a file, view or number is missing, or cannot be used.
     """
     path, cameras = folder / "calibration.yaml", RecordedCameras()
-    calibration = read_calibration(path).views if needs_cameras or path.is_file() else {}
+    calibration = read_calibration(folder, path.name) if needs_cameras or path.is_file() else {}
+    named, names = read_yaml(folder / "state.yaml"), embodiment.state_names
+    if set(named) != set(names) or not all(isinstance(value, int | float) for value in named.values()):
+        raise DataError(
+            "Not the robot's state",
+            where=folder / "state.yaml",
+            expected=f"a number each: {', '.join(names)}",
+            got=named,
+        )
+    state = np.array([named[name] for name in names], np.float64)
     images: dict[str, np.ndarray] = {}
     for view in views:
         try:
@@ -225,27 +234,16 @@ def read_start(
         entry = calibration.get(view)
         if entry is None and not needs_cameras:
             continue
-        if entry is None or entry.T is None or entry.distortion is not None:
+        at = f"{path}, view {view}"
+        if entry is None or entry.T_feature is not None or entry.distortion is not None:
             raise DataError(
-                "A start needs the pinhole camera of each view", where=f"{path}, view {view}",
-                expected="K, T and no distortion", got="nothing" if entry is None else "T_feature or distortion",
-                next_step="write K and T; undistort the picture",
+                "A start needs the pinhole camera of each view", where=at, expected="K, a pose and no distortion",
+                got="nothing" if entry is None else "T_feature or distortion", next_step="write K and T; undistort the picture",
             )  # fmt: skip
+        poses = mounted_poses(view, entry, embodiment, state[None], at) if entry.on_hand else still_poses(entry, 1, at)
         height, width = images[view].shape[:2]
-        add_calibrated_view(
-            cameras, view, entry, image_size=(height, width), num_frames=1, read_feature=lambda _: np.empty(0),
-            where=str(folder),
-        )  # fmt: skip
-    state = read_yaml(folder / "state.yaml")
-    names = embodiment.state_names
-    if set(state) != set(names) or not all(isinstance(value, int | float) for value in state.values()):
-        raise DataError(
-            "Not the robot's state",
-            where=folder / "state.yaml",
-            expected=f"a number each: {', '.join(names)}",
-            got=state,
-        )
+        add_camera(cameras, view, entry, poses, (height, width), at)
     return RecordedStart(
         folder.name, "", images, {view: Camera(track.K, track.T_base_camera[0]) for view, track in cameras.tracks.items()},
-        np.array([state[name] for name in names], np.float64), np.empty((0, len(names))),
+        state, np.empty((0, len(names))),
     )  # fmt: skip

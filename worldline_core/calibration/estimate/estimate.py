@@ -128,7 +128,7 @@ def estimate_command(
             got=", ".join(sorted(sources)) or "none", next_step="--set 'curate.sources=[...]' with one of them",
         )  # fmt: skip
     folder = output or OUTPUT_ROOT / f"{config.stem}_estimate"
-    return _estimate_source(listed, descriptions, views, folder, mask_robot)
+    return _estimate_source(listed, descriptions, views, folder, mask_robot, known=True)
 
 
 def estimate_cameras(config: EstimateConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -159,12 +159,16 @@ def _estimate_source(
     views: Sequence[str],
     folder: Path,
     mask_robot: MaskRobot | None = None,
+    *,
+    known: bool = False,
 ) -> SourceEstimate:
+    """Cameras of `views`, or of those that have none; ``known``: of all where all have one."""
     chosen = _readable(listed)
     first = chosen[0].load()
     if unknown := set(views) - set(first.views):
         raise DataError("No such view", expected=", ".join(first.views), got=", ".join(sorted(unknown)))
-    wanted = tuple(views) or tuple(v for v in first.views if v not in first.episode.cameras) or first.views
+    wanted = tuple(views) or tuple(v for v in first.views if v not in first.episode.cameras)
+    wanted = wanted or (first.views if known else ())
 
     def loaded(shown: Sequence[str]) -> LoadedViews:
         with Progress("calibrate estimate: reading", len(chosen), "episode") as progress:

@@ -16,7 +16,7 @@ from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import NO_EMBODIMENT, TRAINING_SPLITS, Episode, Outcome, Split, TaskFamily
 from worldline_core.data.guards.rejection import RejectedInputError, check_texts, collect_faults
 from worldline_core.data.guards.source_paths import SourceFolder
-from worldline_core.data.video.clip import VideoClip, read_clip
+from worldline_core.data.video.clip import VideoClip, read_clip, video_size
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import CalibrationError, ConfigError
 from worldline_core.geometry.cameras import Fit
@@ -45,6 +45,7 @@ class LoadedEpisode:
         clips: view -> its encoded video, of the views that are videos; curation decodes it once, and stores it without
             encoding where no picture changes.
         absent: view -> why, of the views that the source names and whose pictures are not there.
+        with_mounted: adds the cameras that a calibration file places by the measured joints, once these are the contract's.
         thing_labels: view -> uint8 (N, H, W) as in `EpisodeSet.thing_labels`, or None where the source has none.
     """
 
@@ -56,6 +57,7 @@ class LoadedEpisode:
     clips: Mapping[str, VideoClip] = field(default_factory=dict)
     thing_labels: Callable[[str], Masks | None] = lambda view: None
     absent: Mapping[str, RejectedInputError] = field(default_factory=dict)
+    with_mounted: Callable[[LoadedEpisode], LoadedEpisode] = lambda loaded: loaded
 
     def __post_init__(self) -> None:
         """Raises: RejectedInputError (invalid_text): texts of every source pass here, before anything is stored."""
@@ -71,6 +73,13 @@ class LoadedEpisode:
             yield from (picture.rgb for picture in read_clip(self.clips[view], calibrated=view in self.episode.cameras))
         else:
             yield from self.images(view)
+
+    def image_size(self, view: str) -> tuple[int, int]:
+        """(height, width) of a view's pictures. Raises: RejectedInputError where the first cannot be read."""
+        if view in self.clips:
+            return video_size(self.clips[view].path)[:2]
+        height, width = next(iter(self.images(view))).shape[:2]
+        return height, width
 
     def frames(self, view: str) -> np.ndarray:
         """uint8 (episode.num_video_frames, H, W, 3) RGB, all in memory.
@@ -186,6 +195,11 @@ class ForeignSourceConfig(SourceConfigBase):
     scene: str | None = Field(default=None, description="scene of all episodes; default: one scene per episode folder")
     task_family: TaskFamily = "unknown"
     outcome: Outcome = "unknown"
+    calibration: str | None = Field(
+        default=None,
+        description="file with cameras of the views, in place of the recordings' own (docs/sources.md): in the source's folder,"
+        " or an absolute path",
+    )
 
     def declared(self, scene: str) -> dict[str, Any]:
         """Fields of an `Episode` that the configuration decides.

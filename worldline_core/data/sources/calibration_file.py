@@ -1,4 +1,4 @@
-"""Calibration beside a dataset whose format has no place for it, in JSON or YAML.
+"""Calibration beside recordings whose format has no place for it, in JSON or YAML.
 
     views:
       head:
@@ -18,7 +18,9 @@ camera, `mount: embodiment`: where the robot's description mounts it, by the mea
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -26,14 +28,15 @@ import yaml
 from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel, read_yaml
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose
-from worldline_core.data.episodes.source import LensConfig
+from worldline_core.data.episodes.source import LensConfig, LoadedEpisode
 from worldline_core.data.guards.plain_files import read_json, validated
 from worldline_core.data.guards.rejection import RejectedInputError, check_shape, unreadable
-from worldline_core.data.guards.source_paths import AnyPath, regular_file
+from worldline_core.data.guards.source_paths import AnyPath, inside, regular_file
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.geometry.cameras import CameraAxes, Extrinsics, ImageTransform
-from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.embodiment import Embodiment, load_embodiment
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 _ASPECT_TOLERANCE = 0.01
@@ -84,12 +87,13 @@ class CalibrationFile(StrictModel):
     views: dict[str, CameraEntry] = Field(min_length=1)
 
 
-def read_calibration(path: AnyPath) -> CalibrationFile:
-    """A calibration file.
+def read_calibration(root: AnyPath, name: str) -> Mapping[str, CameraEntry]:
+    """Cameras by view from a calibration file: one in the source's folder, or by an absolute path the user's own.
 
-    Raises: RejectedInputError: missing_calibration (no such file), unreadable, too_large, missing_column (a key that is
-        unknown or missing, or a value of another kind).
+    Raises: RejectedInputError: missing_calibration (no such file), path_traversal, unreadable, too_large, missing_column (a key that
+        is unknown or missing, or a value of another kind).
     """
+    path = Path(name) if Path(name).is_absolute() else inside(root, name)
     try:
         file = regular_file(path, "Calibration file")
     except RejectedInputError as error:
@@ -102,51 +106,99 @@ def read_calibration(path: AnyPath) -> CalibrationFile:
     faults = (ConfigError, OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError)
     with unreadable("Calibration file is no YAML", path, faults):
         content = read_json(path) if path.suffix.lower() == ".json" else read_yaml(file)
-    return validated(CalibrationFile, content, path, "Calibration file")
+    return validated(CalibrationFile, content, path, "Calibration file").views
 
 
-def add_calibrated_view(
+def calibrated(
+    loaded: LoadedEpisode,
+    entries: Mapping[str, CameraEntry],
+    where: str,
+    read_feature: Callable[[str], np.ndarray] | None = None,
+) -> LoadedEpisode:
+    """The episode as it was recorded with the cameras of a calibration file, in place of its own; those on hands follow by
+    `LoadedEpisode.with_mounted`.
+
+    Args:
+        read_feature: a column of the recording by its name, for files that name one.
+
+    Raises: RejectedInputError: missing_view, missing_calibration (K is of another picture), length_mismatch, invalid_extrinsics,
+        missing_column.
+    """
+    if not entries.keys() <= (known := {*loaded.views, *loaded.absent}):
+        expected, got = ", ".join(sorted(known)), ", ".join(entries)
+        raise RejectedInputError(
+            "missing_view", "Calibration names views that are not read", where=where, expected=expected, got=got
+        )
+    shown = {view: entry for view, entry in entries.items() if view in loaded.views}
+    placed = {view: entry for view, entry in shown.items() if not entry.on_hand}
+    mounted = {view: entry for view, entry in shown.items() if entry.on_hand}
+
+    def recorded(view: str, entry: CameraEntry, episode: Episode) -> np.ndarray | None:
+        at, length = f"{where}, view {view}", episode.num_frames
+        if entry.T_feature is None:
+            return still_poses(entry, length, at)
+        if read_feature is None:
+            raise RejectedInputError(
+                "missing_column",
+                "Recordings of this kind have no features",
+                where=at,
+                got=entry.T_feature.name,
+                next_step="give T",
+            )
+        return _feature_poses(entry.T_feature, read_feature, length, at)
+
+    def by_joints(view: str, entry: CameraEntry, episode: Episode) -> np.ndarray:
+        at = f"{where}, view {view}"
+        if episode.state_kind != "joints":
+            raise RejectedInputError("missing_calibration", "A mount needs joints", where=at, next_step="give T")
+        return mounted_poses(view, entry, episode.embodiment, episode.state, at)
+
+    loaded = _with_cameras(loaded, placed, recorded, where)
+    return replace(loaded, with_mounted=lambda later: _with_cameras(later, mounted, by_joints, where))
+
+
+def _with_cameras(
+    loaded: LoadedEpisode,
+    entries: Mapping[str, CameraEntry],
+    poses: Callable[[str, CameraEntry, Episode], np.ndarray | None],
+    where: str,
+) -> LoadedEpisode:
+    """The episode with these cameras and their lenses; without a pose a view keeps what it has."""
+    cameras, episode = RecordedCameras(), loaded.episode
+    for view, entry in entries.items():
+        image_size = loaded.image_size(view)
+        if (matrices := poses(view, entry, episode)) is not None:
+            add_camera(cameras, view, entry, matrices, image_size, f"{where}, view {view}")
+    lenses = {view: lens for view, lens in loaded.distortions.items() if view not in cameras.tracks}
+    known, conventions = {**episode.cameras, **cameras.tracks}, {**episode.conventions, **cameras.notes()}
+    episode = replace(episode, cameras=known, conventions=conventions)
+    return replace(loaded, episode=episode, distortions=lenses | cameras.lenses)
+
+
+def add_camera(
     cameras: RecordedCameras,
     view: str,
     entry: CameraEntry,
-    *,
+    matrices: np.ndarray,
     image_size: tuple[int, int],
-    num_frames: int,
-    read_feature: Callable[[str], np.ndarray],
     where: str,
-    mounted: Callable[[str, CameraEntry], np.ndarray] | None = None,
 ) -> None:
-    """Add the camera of a view, and its lens where images still show it; nothing where the dataset's own column holds no
-    pose (all zeros: it was never measured).
+    """Add a camera of a file, with these of its poses (n or 1, 4, 4), for images of (height, width): K follows where only the scale
+    differs.
 
-    Args:
-        image_size: (height, width) of the recorded video. K follows where only the scale differs.
-        mounted: poses (num_frames, 4, 4) of a wrist camera by the measured joints; None where nothing has joints.
-
-    Raises: RejectedInputError: missing_calibration (K is of another picture), length_mismatch, invalid_extrinsics,
-        missing_column.
+    Raises: RejectedInputError: missing_calibration (K is of another picture), invalid_extrinsics.
     """
     height, width = image_size
     if abs(entry.width * height / (entry.height * width) - 1) > _ASPECT_TOLERANCE:
         raise RejectedInputError(
             "missing_calibration",
             "Calibration is of an image of another shape",
-            where=f"{where}, view {view}",
+            where=where,
             expected=f"the aspect of {width}x{height}",
             got=f"{entry.width}x{entry.height}",
             next_step="give K for the recorded image: the sizes do not show what was cropped",
         )
     extrinsics, axes = entry.maps or "camera_to_base", entry.axes or "opencv"
-    if entry.on_hand:
-        if mounted is None:
-            raise RejectedInputError("missing_calibration", "A mount needs joints", where=f"{where}, view {view}")
-        matrices = mounted(view, entry)
-    elif entry.T_feature is not None:
-        matrices = _feature_poses(entry.T_feature, read_feature, num_frames, f"{where}, view {view}")
-        if matrices is None:
-            return
-    else:
-        matrices = _matrices(entry.T or [], num_frames, f"{where}, view {view}")
     pose = camera_pose(view, matrices, extrinsics=extrinsics, axes=axes, where=where)
     K = ImageTransform.of((entry.height, entry.width)).resize(image_size).intrinsics(np.asarray(entry.K))
     cameras.add(view, K, pose, image_size, None if entry.distortion is None else entry.distortion.distortion)
@@ -154,39 +206,40 @@ def add_calibrated_view(
         cameras.mounted.append(view)
 
 
-def mounted_camera(embodiment: str, state: np.ndarray, view: str, entry: CameraEntry, where: str) -> np.ndarray:
-    """T_base_camera (n, 4, 4) of a wrist camera, by its robot's description or in its tool's frame, from the measured joints (n, j).
+def mounted_poses(view: str, entry: CameraEntry, robot: str | Embodiment, state: np.ndarray, where: str) -> np.ndarray:
+    """T_base_camera (n, 4, 4) of a wrist camera, by its robot's description or in its tool's frame, from joints (n, j).
 
     Raises: RejectedInputError (missing_calibration) where the description is not here, or has no such arm or camera.
     """
     from worldline_core.geometry.kinematics import ArmKinematics  # needs torch, which configurations do without
 
     try:
-        kinematics = ArmKinematics(load_embodiment(embodiment))
+        embodiment = load_embodiment(robot) if isinstance(robot, str) else robot
+        kinematics, state = ArmKinematics(embodiment), state.astype(np.float64)
         if entry.T_tool_camera is not None:
-            tools = kinematics.tool_poses(state.astype(np.float64)).numpy()
-            names = [arm.camera_view for arm in kinematics.embodiment.arms]
+            tools = kinematics.tool_poses(state).numpy()
+            names = [arm.camera_view for arm in embodiment.arms]
             poses = {name: tools[:, i] @ np.array(entry.T_tool_camera) for i, name in enumerate(names)}
         else:
-            described = kinematics.wrist_camera_poses(state.astype(np.float64))
-            poses = {name: pose.numpy() for name, pose in described.items()}
+            poses = {name: pose.numpy() for name, pose in kinematics.wrist_camera_poses(state).items()}
     except (ConfigError, UnavailableError) as error:
         raise RejectedInputError(
-            "missing_calibration", "The robot's description mounts no camera", where=f"{where}, view {view}",
-            got=error.what, next_step="give T or T_feature",
+            "missing_calibration", "The robot's description mounts no camera", where=where, got=error.what,
+            next_step="give T or T_feature",
         ) from error  # fmt: skip
     if view not in poses:
         raise RejectedInputError(
-            "missing_calibration", "The robot's description mounts no camera of this view", where=f"{where}, view {view}",
-            expected=f"one of {', '.join(poses)}" if poses else f"wrist_camera in {embodiment}.yaml", got=view,
+            "missing_calibration", "The robot's description mounts no camera of this view", where=where,
+            expected=f"one of {', '.join(poses)}" if poses else f"wrist_camera in {embodiment.name}.yaml", got=view,
             next_step="give T or T_feature, or add wrist_camera to the embodiment (docs/embodiments.md)",
         )  # fmt: skip
     return poses[view]
 
 
-def _matrices(listed: list[Any], num_frames: int, where: str) -> np.ndarray:
+def still_poses(entry: CameraEntry, num_frames: int, where: str) -> np.ndarray:
+    """(1 or num_frames, 4, 4). Raises: RejectedInputError: invalid_extrinsics, length_mismatch."""
     try:
-        values = np.asarray(listed, dtype=np.float64)
+        values = np.asarray(entry.T or [], dtype=np.float64)
         values = values.reshape(-1, 4, 4) if values.shape[-2:] == (4, 4) else values.reshape(0, 4, 4)
     except (ValueError, TypeError, OverflowError) as error:
         raise RejectedInputError(

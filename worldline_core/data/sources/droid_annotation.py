@@ -1,7 +1,7 @@
 """DROID-style episodes: one annotation JSON and three videos each (Franka arm, Robotiq gripper).
 
 States: xyz [m], roll pitch yaw [rad] about fixed axes of the flange, gripper 0 open .. 1 closed (inverted here). Views:
-two exterior cameras and a wrist camera, without published calibration: such episodes serve action-free training only.
+two exterior cameras and a wrist camera, without published calibration.
 """
 
 from __future__ import annotations

@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import cache, lru_cache
-from pathlib import Path
+from functools import cache, lru_cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +19,6 @@ from pydantic import Field, model_validator
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.conventions import is_gripper
 from worldline_core.data.episodes.episode import NO_EMBODIMENT, REPEATS_STATE, TRAINING_SPLITS, Episode
-from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import (
     EVALUATION_ONLY,
     EmbodimentName,
@@ -40,9 +38,9 @@ from worldline_core.data.guards.rejection import (
     collect_faults,
     depth_picture,
 )
-from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
+from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, relative_name
 from worldline_core.data.lerobot.dataset import DatasetInfo, LeRobotV3Dataset, LeRobotV21Dataset, check_files, is_depth
-from worldline_core.data.sources.calibration_file import add_calibrated_view, mounted_camera, read_calibration
+from worldline_core.data.sources.calibration_file import calibrated, read_calibration
 from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
@@ -140,11 +138,6 @@ class LeRobotSourceConfig(ForeignSourceConfig):
         default=None, min_length=1, description="left, right: columns of joints and grippers; null: the whole state"
     )
     collection: bool = Field(default=False, description="read every dataset below the folder")
-    calibration: str | None = Field(
-        default=None,
-        description="file with K and poses of the views (docs/sources.md): in the dataset's folder, where a name with "
-        "{episode_index:06d} is one file per episode, or an absolute path",
-    )
     task_column: str = Field(default="task_index", description="column of indices into the dataset's tasks")
     task_separator: str | None = Field(
         default=None, min_length=1, description="of texts in several languages the part after the last one is taken"
@@ -433,12 +426,7 @@ class LeRobotSource:
         if depth := [key for key in config.views if is_depth(features.get(key, {}))]:
             raise depth_picture(root, f"is_depth_map of {', '.join(depth)} in meta/info.json")
         self._columns = state_columns(config, features, str(root))
-        absolute = Path(
-            config.calibration or ""
-        ).is_absolute()  # the user's own file; a name of the dataset stays in its folder
-        self._calibration = lru_cache(maxsize=1)(
-            lambda name: read_calibration(Path(name) if absolute else inside(root, name))
-        )
+        self._calibration = lru_cache(maxsize=1)(partial(read_calibration, root))
 
     def episode_ids(self) -> list[str]:
         return [f"{self._label}-{int(index):06d}" for index in self._dataset.episodes.indices]
@@ -472,22 +460,24 @@ class LeRobotSource:
         views, absent = sorted_views(key_of, read_view, faults)
         with collect_faults(faults):
             times = dataset.column(index, "timestamp").reshape(-1).astype(np.float64)
-            cameras = self._cameras(index, {view: key_of[view] for view in views}, len(times))
-            episode = self._episode(episode_id, index, times, cameras)
+            loaded = LoadedEpisode(
+                self._episode(episode_id, index, times),
+                tuple(views),
+                images=lambda view: dataset.images(index, key_of[view]),
+                clips={view: clip for view, clip in views.items() if clip is not None},
+                absent=absent,
+            )
+            if config.calibration is not None and not faults:
+                name = fill_template(config.calibration, episode_index=index)
+                read_feature = partial(dataset.column, index)
+                loaded = calibrated(loaded, self._calibration(name), f"{self._root}, {name}", read_feature)
             if not faults:
-                return LoadedEpisode(
-                    episode,
-                    tuple(views),
-                    images=lambda view: dataset.images(index, key_of[view]),
-                    distortions=cameras.lenses,
-                    clips={view: clip for view, clip in views.items() if clip is not None},
-                    absent=absent,
-                )
+                return loaded
         raise all_of([*faults, *absent.values()], f"episode {episode_id}")
 
-    def _episode(self, episode_id: str, index: int, times: np.ndarray, cameras: RecordedCameras) -> Episode:
+    def _episode(self, episode_id: str, index: int, times: np.ndarray) -> Episode:
         config, dataset = self._config, self._dataset
-        state, action, overshoot = self._read_columns(index)
+        state, action, overshoot = self._columns.read(partial(dataset.column, index))
         instruction, tasks = self._instruction(index)
         return Episode(
             **config.declared(self._label),
@@ -499,7 +489,6 @@ class LeRobotSource:
             state=state,
             action=action,
             timestamps=times - times[0],
-            cameras=cameras.tracks,
             primary_view=config.primary_view or "head",
             state_names=self._columns.names,
             state_kind="none" if self._columns.names == () else "joints",
@@ -510,12 +499,8 @@ class LeRobotSource:
                 **({EVALUATION_ONLY: "true"} if self._evaluation_only else {}),
                 **({"action": REPEATS_STATE} if not self._columns.action else {}),
                 **({"tasks": tasks} if tasks > 1 else {}),
-                **cameras.notes(),
             },
         )
-
-    def _read_columns(self, index: int) -> tuple[np.ndarray, np.ndarray, int]:
-        return self._columns.read(lambda feature: self._dataset.column(index, feature))
 
     def _instruction(self, index: int) -> tuple[str, int]:
         """The first frame's task, and how many different ones the episode has."""
@@ -540,35 +525,6 @@ class LeRobotSource:
             return self._config.outcome
         succeeded = self._dataset.column(index, self._config.success_column).reshape(-1)
         return "success" if bool(succeeded[-1]) else "failure"
-
-    def _cameras(self, index: int, key_of: dict[str, str], length: int) -> RecordedCameras:
-        """Calibrated cameras of the views that are there, without those whose pose was never measured."""
-        cameras = RecordedCameras()
-        if self._config.calibration is None:
-            return cameras
-        name = fill_template(self._config.calibration, episode_index=index)
-        entries = self._calibration(name).views
-        where = f"{self._root}, {name}"
-        known = self._config.views.values()
-        if not entries.keys() <= set(known):
-            expected, got = ", ".join(known), ", ".join(entries)
-            raise RejectedInputError(
-                "missing_view", "Calibration names views that are not read", where=where, expected=expected, got=got
-            )
-        for view in entries.keys() & key_of.keys():
-            add_calibrated_view(
-                cameras,
-                view,
-                entries[view],
-                image_size=self._dataset.image_size(index, key_of[view]),
-                num_frames=length,
-                read_feature=lambda feature: self._dataset.column(index, feature),
-                where=where,
-                mounted=lambda view, entry: mounted_camera(
-                    self._config.embodiment, self._read_columns(index)[0], view, entry, where
-                ),
-            )
-        return cameras
 
 
 def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: DatasetInfo) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,6 +30,7 @@ from worldline_core.data.sources.agibot import (
     EnerverseAcSource,
     EnerverseAcSourceConfig,
 )
+from worldline_core.data.sources.calibration_file import calibrated, read_calibration
 from worldline_core.data.sources.droid_annotation import DroidAnnotationSource, DroidAnnotationSourceConfig
 from worldline_core.data.sources.lerobot import LeRobotSourceConfig, open_lerobot
 from worldline_core.data.sources.mcap import McapSource, McapSourceConfig, McapTopicsSource, McapTopicsSourceConfig
@@ -150,6 +152,7 @@ class _RepairedSource:
         self._source = source
         self._config = config
         self._root = root
+        self._calibration = lru_cache(maxsize=1)(partial(read_calibration, root))
         self.looked_for = source.looked_for
 
     def episode_ids(self) -> list[str]:
@@ -170,7 +173,14 @@ class _RepairedSource:
         return included
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        loaded = undistorted(repair(self._source.load(episode_id), self._config.conventions))
+        loaded = self._source.load(episode_id)
+        name = getattr(self._config, "calibration", None)
+        if name is not None and not isinstance(
+            self._config, LeRobotSourceConfig
+        ):  # which may have a file for each episode
+            loaded = calibrated(loaded, self._calibration(name), f"{self._root}, {name}")
+        loaded = repair(loaded, self._config.conventions)
+        loaded = undistorted(loaded.with_mounted(loaded))
         source = self._config.name or loaded.episode.source
         return replace(loaded, episode=replace(loaded.episode, source=source))
 

@@ -28,7 +28,6 @@ from pydantic import Field
 
 from worldline_core.config import FrameRate
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
-from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import (
     EVALUATION_LAYOUTS,
     EmbodimentName,
@@ -40,7 +39,6 @@ from worldline_core.data.episodes.source import (
 from worldline_core.data.guards.plain_files import read_image, read_json, read_npy
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.data.sources.calibration_file import add_calibrated_view, read_calibration
 from worldline_core.data.sources.episode_files import EpisodeFiles, timed_video_size
 from worldline_core.data.sources.hdf5 import open_hdf5, require_h5py
 from worldline_core.data.video.clip import VideoClip, read_clip
@@ -52,14 +50,11 @@ _ASPECT_TOLERANCE = 0.01
 
 
 class WorldArenaSourceConfig(EvaluationSourceConfig):
-    """The sets hold no cameras: a model of action maps needs `calibration`, one of control vectors the robot's name."""
+    """The sets hold no cameras: a model of action maps needs `calibration` of `head`, one of control vectors the robot's name."""
 
     kind: Literal["worldarena"] = "worldarena"
     fps: FrameRate = Field(default=24.0, description="of trajectories and true videos, which must have it")
     embodiment: EmbodimentName = NO_EMBODIMENT
-    calibration: str | None = Field(
-        default=None, description="file in the folder with the camera of `head`, the same in all episodes"
-    )
 
 
 class WorldArenaSource(EpisodeFiles[WorldArenaSourceConfig]):
@@ -102,17 +97,6 @@ class WorldArenaSource(EpisodeFiles[WorldArenaSourceConfig]):
                     expected=f"the proportions of {size[1]} x {size[0]}",
                     got=f"{first.shape[1]} x {first.shape[0]}",
                 )
-        cameras = RecordedCameras()
-        if config.calibration is not None:
-            entry = read_calibration(inside(self.root, config.calibration)).views.get("head")
-            if entry is None:
-                raise RejectedInputError(
-                    "missing_calibration", "Calibration file has no head view", where=config.calibration
-                )
-            add_calibrated_view(
-                cameras, "head", entry, image_size=size, num_frames=length, read_feature=lambda _: np.empty(0),
-                where=str(path),
-            )  # fmt: skip
 
         def images(_: str) -> Iterator[np.ndarray]:
             yield first if first.shape[:2] == size else cv2.resize(first, size[::-1], interpolation=cv2.INTER_CUBIC)
@@ -129,13 +113,12 @@ class WorldArenaSource(EpisodeFiles[WorldArenaSourceConfig]):
             action=values,
             overshoot=overshoot,
             instruction=self._instruction(parts),
-            cameras=cameras.tracks,
             video_frames=None if filmed or length == 1 else 1,
             primary_view="head",
             state_names=_NAMES,
-            conventions={"state": "repeats the actions", **cameras.notes()},
+            conventions={"state": "repeats the actions"},
         )
-        return LoadedEpisode(episode, ("head",), images, distortions=cameras.lenses)
+        return LoadedEpisode(episode, ("head",), images)
 
     def _file(self, kind: str, parts: tuple[str, ...], suffix: str) -> AnyPath:
         """A file of an episode: that of its task, else the only one of its number."""
