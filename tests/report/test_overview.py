@@ -9,7 +9,7 @@ import pytest
 
 from tasks.execution.run_page import FinishedStep, write_finished_page, write_progress_page
 from worldline_core.report.context import ReportConfig, ReportContext, VideoScores, in_order, method, share_interval
-from worldline_core.report.report import Figure, first_page, head_view, headline, planning_figure, video_figure
+from worldline_core.report.report import Figure, first_page, head_views, headline, planning_figure, video_figure
 from worldline_core.report.videos import best_median_worst, choose_episodes
 
 COPY, SHUFFLED = "copy_first_frame", "shipped_stage2_shuffled"
@@ -56,8 +56,7 @@ def context_of(
 
 
 def headline_of(context: ReportContext) -> str:
-    view = head_view(context)
-    assert view is not None
+    view = head_views(context)[0]
     return headline(context, view, video_figure(view), planning_figure(context))
 
 
@@ -83,9 +82,32 @@ def test_the_tool_error_heads_the_page_of_a_robot_that_no_segmenter_knows(tmp_pa
     summary = tmp_path / "evaluate_video" / "summary.json"
     summary.write_text(summary.read_text().replace("robot_iou@head", "end_effector_error_px@head"))
     assert headline_of(context) == "The shipped simulator follows the controls."
-    figure = video_figure(head_view(context))  # type: ignore[arg-type]
-    assert figure.verdict == "better"
+    figure = video_figure(head_views(context)[0])
+    assert figure is not None and figure.verdict == "better"
     assert "better than copying the first frame: 3.80\u202fpx" in first_page(context, [])
+
+
+def test_the_tool_error_comes_first_where_no_outcomes_were_judged(tmp_path: Path) -> None:
+    """A robot of one's own: its segmenter was made from few recordings, and nothing is planned."""
+    context_of(tmp_path / "tools", iou=1.5, copy=3.8, over_copy=(-2.7, -1.8), over_shuffled=(-1.3, -1.1))
+    of_tools = (
+        (tmp_path / "tools/evaluate_video/summary.json").read_text().replace("robot_iou", "end_effector_error_px")
+    )
+    for success, first in ((None, "follows the controls."), (0.9, "does not yet beat a copy")):
+        folder = tmp_path / str(success)
+        context, summary = (
+            context_of(folder, over_copy=(-0.1, 0.4), success=success),
+            folder / "evaluate_video/summary.json",
+        )
+        content, added = json.loads(summary.read_text()), json.loads(of_tools)
+        for name, values in content["metrics"]["test"].items():
+            values |= added["metrics"]["test"][name]
+        content["differences"]["test"] += added["differences"]["test"]
+        summary.write_text(json.dumps(content))
+        page = first_page(context, [])
+        assert f"The shipped simulator {first}" in page
+        places = [page.find(text) for text in ("distance of the predicted tools", "overlap of the predicted robot")]
+        assert (places[0] > 0) == (success is None) and places[1] > places[0]
 
 
 def test_a_perfect_score_of_few_cases_is_no_certainty(tmp_path: Path) -> None:

@@ -48,7 +48,8 @@ SPLIT_LABELS = {
     "bank": "candidate banks",
 }
 """Labels of the splits, in the report's order."""
-HEADLINES = ("robot_iou_exact", "robot_iou", "end_effector_error_px")
+TOOL_ERROR = "end_effector_error_px"
+HEADLINES = ("robot_iou_exact", "robot_iou", TOOL_ERROR)
 """Metrics that head the report, the most trustworthy first: IoU with exact masks, with the segmenter's own masks of the truth; for
 robots that no segmenter knows, the distance of the predicted tools from the true ones."""
 
@@ -169,9 +170,13 @@ class VideoScores:
                 return {**row, "mean": -row["mean"], "low": -row["high"], "high": -row["low"]}
         return None
 
+    def headlines(self, group: str, method: str) -> list[Metric]:
+        """Those of HEADLINES that were measured of a method in the head view."""
+        return [METRICS[name] for name in HEADLINES if self.value(group, method, f"{name}@head")]
+
     def headline(self, group: str, method: str) -> Metric | None:
-        """The first of HEADLINES that was measured of a method in the head view."""
-        return next((METRICS[name] for name in HEADLINES if self.value(group, method, f"{name}@head")), None)
+        """The first of them."""
+        return next(iter(self.headlines(group, method)), None)
 
     def primary(self, group: str) -> Method | None:
         """The method that heads the page: the first Stage II, long-trained weights before this run's."""

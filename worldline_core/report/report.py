@@ -20,6 +20,7 @@ from worldline_core.pages.page import percent, render, words
 from worldline_core.progress import with_progress
 from worldline_core.report.context import (
     SPLIT_LABELS,
+    TOOL_ERROR,
     Method,
     ReportConfig,
     ReportContext,
@@ -127,28 +128,31 @@ class HeadView(NamedTuple):
         return (-found["high"], -found["low"]) if self.metric.lower_is_better else (found["low"], found["high"])
 
 
-def head_view(context: ReportContext) -> HeadView | None:
-    """The scores that head the page; None where neither robot IoU nor tool error was measured."""
+def head_views(context: ReportContext) -> list[HeadView]:
+    """Scores that may head the page, the most trustworthy first: of robot IoU and tool error those that were measured."""
     scores = context.video_scores
     group = scores.groups[0] if scores.groups else ""
     primary = scores.primary(group)
-    metric = primary and scores.headline(group, primary.name)
-    return HeadView(scores, group, primary, metric) if primary and metric else None
+    metrics = [] if primary is None else scores.headlines(group, primary.name)
+    return [HeadView(scores, group, primary, metric) for metric in metrics if primary]
 
 
 def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
     """The headline, one video, up to three figures beside their references, and the list of pages."""
-    view = head_view(context)
-    controls = None if view is None else video_figure(view)
-    planning = planning_figure(context)
+    views, outcomes = head_views(context), [planning_figure(context), policy_figure(context)]
+    if any(outcomes):
+        views = views[:1]
+    else:  # a robot of one's own: how its tools follow the controls comes first
+        views.sort(key=lambda view: view.metric.name != TOOL_ERROR)
+    controls = [video_figure(view) for view in views[:2]]
     return render(
         "report/overview.html",
         title="WorldLine: from robot recordings to an action-driven simulator",
         section=None,
         sections=sections,
         next=None,
-        headline=headline(context, view, controls, planning),
-        figures=list(filter(None, (controls, planning, policy_figure(context)))),
+        headline=headline(context, next(iter(views), None), next(iter(controls), None), outcomes[0]),
+        figures=list(filter(None, (*controls, *outcomes))),
         card=context.first_card,
         entries=list(zip(sections, PAGES.values(), strict=False)),
     )
@@ -156,7 +160,7 @@ def first_page(context: ReportContext, sections: Sequence[Section]) -> Markup:
 
 def video_figure(view: HeadView) -> Figure | None:
     """The main method beside a copy of the first frame."""
-    tools = view.metric.name == "end_effector_error_px"
+    tools = view.metric.name == TOOL_ERROR
     what = f"{'distance' if tools else 'overlap'} of the predicted {'tools' if tools else 'robot'}"
     what += " from the recorded ones" if tools else " with the recorded one (IoU)"
     copy = view.method("copy", "baseline")
