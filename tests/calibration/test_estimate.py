@@ -350,7 +350,8 @@ def test_sure_cameras_are_read_back_as_a_calibration_file(tmp_path, bank, kinema
     entries = read_calibration(tmp_path, "cameras.json")
     assert entries.keys() == {"left_wrist", "head"}
     pictures = [np.zeros((128, 192, 3), np.uint8)]
-    loaded = calibrated(LoadedEpisode(episode, ("head", "left_wrist"), lambda _: pictures), entries, "here")
+    loaded = LoadedEpisode(episode, ("head", "left_wrist"), lambda _: pictures)
+    loaded = calibrated(loaded, entries, "here", entries)
     cameras = loaded.with_mounted(loaded).episode.cameras
     tools = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()[:, 0]
     assert np.allclose(cameras["left_wrist"].T_base_camera, tools @ pose, atol=1e-5)

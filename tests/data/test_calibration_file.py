@@ -91,6 +91,16 @@ def test_a_file_that_does_not_belong_to_the_recordings_is_refused(tmp_path: Path
     assert set(reasons(curated).values()) == {reason}
 
 
+def test_a_recording_may_lack_a_view_of_the_file(tmp_path: Path) -> None:
+    source = robomind(tmp_path / "raw")
+    views = {"head": STILL, "left_wrist": {**SIZE, "T_tool_camera": ON_HAND}}
+    (Path(source["path"]) / "cameras.json").write_text(json.dumps({"views": views}))
+    declared = source["views"] | {"left_wrist": "camera_that_is_not_there"}
+    changed = {"calibration": "cameras.json", "views": declared}
+    _, curated = run(tmp_path, {**source, **changed}, views="available")
+    assert set(curated.episode(0).cameras) == {"head"}
+
+
 def test_a_lens_of_the_file_is_taken_out(tmp_path: Path) -> None:
     source = robomind(tmp_path / "raw")
     (Path(source["path"]) / "cameras.json").write_text(json.dumps({"views": {"head": {**STILL, "distortion": LENS}}}))

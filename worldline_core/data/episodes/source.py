@@ -78,8 +78,12 @@ class LoadedEpisode:
         """(height, width) of a view's pictures. Raises: RejectedInputError where the first cannot be read."""
         if view in self.clips:
             return video_size(self.clips[view].path)[:2]
-        height, width = next(iter(self.images(view))).shape[:2]
-        return height, width
+        first = next(iter(self.images(view)), None)
+        if first is None:
+            raise RejectedInputError(
+                "length_mismatch", "View has no pictures", where=f"{self.episode.episode_id}, view {view}"
+            )
+        return first.shape[0], first.shape[1]
 
     def frames(self, view: str) -> np.ndarray:
         """uint8 (episode.num_video_frames, H, W, 3) RGB, all in memory.

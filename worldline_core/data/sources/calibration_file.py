@@ -18,7 +18,7 @@ camera, `mount: embodiment`: where the robot's description mounts it, by the mea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -113,19 +113,21 @@ def calibrated(
     loaded: LoadedEpisode,
     entries: Mapping[str, CameraEntry],
     where: str,
+    views: Collection[str],
     read_feature: Callable[[str], np.ndarray] | None = None,
 ) -> LoadedEpisode:
     """The episode as it was recorded with the cameras of a calibration file, in place of its own; those on hands follow by
     `LoadedEpisode.with_mounted`.
 
     Args:
+        views: names that views of the source may have, whether this recording has them or not.
         read_feature: a column of the recording by its name, for files that name one.
 
     Raises: RejectedInputError: missing_view, missing_calibration (K is of another picture), length_mismatch, invalid_extrinsics,
         missing_column.
     """
-    if not entries.keys() <= (known := {*loaded.views, *loaded.absent}):
-        expected, got = ", ".join(sorted(known)), ", ".join(entries)
+    if not entries.keys() <= set(views):
+        expected, got = ", ".join(sorted(filter(None, views))), ", ".join(entries)
         raise RejectedInputError(
             "missing_view", "Calibration names views that are not read", where=where, expected=expected, got=got
         )

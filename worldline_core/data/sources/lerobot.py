@@ -467,10 +467,11 @@ class LeRobotSource:
                 clips={view: clip for view, clip in views.items() if clip is not None},
                 absent=absent,
             )
-            if config.calibration is not None and not faults:
+            if config.calibration is not None:
                 name = fill_template(config.calibration, episode_index=index)
                 read_feature = partial(dataset.column, index)
-                loaded = calibrated(loaded, self._calibration(name), f"{self._root}, {name}", read_feature)
+                entries, where = self._calibration(name), f"{self._root}, {name}"
+                loaded = calibrated(loaded, entries, where, config.views.values(), read_feature)
             if not faults:
                 return loaded
         raise all_of([*faults, *absent.values()], f"episode {episode_id}")

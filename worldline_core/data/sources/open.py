@@ -175,10 +175,10 @@ class _RepairedSource:
     def load(self, episode_id: str) -> LoadedEpisode:
         loaded = self._source.load(episode_id)
         name = getattr(self._config, "calibration", None)
-        if name is not None and not isinstance(
-            self._config, LeRobotSourceConfig
-        ):  # which may have a file for each episode
-            loaded = calibrated(loaded, self._calibration(name), f"{self._root}, {name}")
+        # LeRobot's sources read it themselves: it may be a file of each episode, and name columns.
+        if name is not None and not isinstance(self._config, LeRobotSourceConfig):
+            read = {*loaded.views, *loaded.absent, *(getattr(self._config, "views", None) or ())}
+            loaded = calibrated(loaded, self._calibration(name), f"{self._root}, {name}", read)
         loaded = repair(loaded, self._config.conventions)
         loaded = undistorted(loaded.with_mounted(loaded))
         source = self._config.name or loaded.episode.source
