@@ -115,9 +115,12 @@ def test_unitrees_other_arms(tmp_path: Path) -> None:
     assert {question.name for question in found.questions} == {
         f"gripper_{track}_{end}" for track in ("state", "command") for end in ("closed", "open")
     }
-    write_hdf5(tmp_path / "two", robot="aloha")
-    found = look(tmp_path / "two")
-    assert (found.source["robot"], found.source["channels"], found.source["fps"]) == ("aloha", "as_written", 50)
+    for name in ("two", "tmp.KnOv7pHKz1/two"):  # a folder's letters are no robot
+        write_hdf5(tmp_path / name, robot="aloha")
+        found = look(tmp_path / name)
+        assert (found.source["robot"], found.source["channels"], found.source["fps"]) == ("aloha", "as_written", 50)
+    write_hdf5(tmp_path / "Z1_Dual_Dex1_StackBox", robot="z1_dual")
+    assert look(tmp_path / "Z1_Dual_Dex1_StackBox").source["robot"] == "z1_dual"
 
 
 def test_robomind(tmp_path: Path) -> None:

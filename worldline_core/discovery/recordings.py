@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,7 +18,7 @@ from worldline_core.data.sources.robomind import ROBOMIND_LAYOUTS, LayoutName
 from worldline_core.data.sources.unitree_h5 import ROBOTS, check_columns
 from worldline_core.data.video.clip import video_size
 from worldline_core.discovery.cameras import name_views
-from worldline_core.discovery.columns import Side, words_of
+from worldline_core.discovery.columns import Side
 from worldline_core.discovery.findings import Discovery, Question, named, stated_licence
 from worldline_core.discovery.units import gripper_readings
 from worldline_core.errors import DataError
@@ -344,10 +345,12 @@ def _pixels(file: Hdf5File) -> bool:
     return all(file.holds_pixels(f"observations/images/{camera}") for camera in file.names("observations/images"))
 
 
+_Z1 = re.compile(r"(?<![a-z0-9])(unitree)?z1(?![a-z0-9])", re.IGNORECASE)  # and not a name that ends so by chance
+
+
 def _unitree_robot(found: Discovery, values: np.ndarray, trained: bool, root: AnyPath) -> Any:
     """The robot whose columns these are; asked where two would do."""
     width = values.shape[1]
-    said = "".join(words_of(str(root)))
     if width == 16:
         found.say(("robot",), "g1_dex1", "16 columns: 7 joints of each arm, then both grippers")
         found.say(("embodiment",), "unitree_g1_29dof", "the G1's arms have 7 joints")
@@ -359,7 +362,7 @@ def _unitree_robot(found: Discovery, values: np.ndarray, trained: bool, root: An
             fitting.append(robot)
         except RejectedInputError:
             continue
-    if width == 14 and (not fitting or (not trained and "z1" not in said)):
+    if width == 14 and (not fitting or (not trained and not _Z1.search(str(root)))):
         found.say(
             ("robot",),
             "aloha",
