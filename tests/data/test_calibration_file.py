@@ -13,6 +13,7 @@ import pytest
 from tests.data import published_robomind, test_source_unitree_h5
 from tests.data.curating import reasons, run
 from tests.data.published_lerobot import HEIGHT, WIDTH, write_robocoin
+from tests.data.test_source_agibot_world import write_episode
 from tests.data.test_source_lerobot_layouts import robocoin, write_calibration
 from worldline_core.calibration.estimate.estimate import estimate_cameras
 from worldline_core.calibration.estimate.estimate_config import CAMERAS, EstimateConfig
@@ -131,3 +132,8 @@ def test_only_unknown_cameras_are_estimated_while_fitting(tmp_path: Path) -> Non
     config = EstimateConfig.model_validate({"source": {**source, "calibration": str(file)}})
     assert estimate_cameras(config, {}, tmp_path / "estimate") == {"views": {}, "reasons": {}}
     assert not (tmp_path / "estimate" / CAMERAS).exists()
+    # Recordings that hold their cameras, of a robot whose description is not here.
+    for n in range(2):
+        write_episode(tmp_path / "agibot", 327, 648642 + n, 20 * n)
+    config = EstimateConfig.model_validate({"source": {"kind": "agibot_world", "path": str(tmp_path / "agibot")}})
+    assert estimate_cameras(config, {}, tmp_path / "agibot_estimate") == {"views": {}, "reasons": {}}

@@ -7,7 +7,7 @@ backward pass, as the tokenizers and Stage III do.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
@@ -53,7 +53,9 @@ class _Tracker(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.live = self.most = self.operations = 0
-        self._mode: Any = detect_fake_mode()
+        mode: Any = detect_fake_mode()
+        # Fields that FakeTensor's constructor gives to a tensor on a device; the constructor itself takes three times as long.
+        self._fields = cache(lambda device: vars(FakeTensor(mode, torch.empty(0, device="meta"), device)))
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
@@ -109,11 +111,6 @@ class _Tracker(TorchDispatchMode):
             return made
 
         return make
-
-    @cache  # noqa: B019 - of one trace
-    def _fields(self, device: torch.device) -> Mapping[str, Any]:
-        """Fields that FakeTensor's constructor gives to a tensor on a device; the constructor itself takes three times as long."""
-        return vars(FakeTensor(self._mode, torch.empty(0, device="meta"), device))
 
     def _follow(self, tensor: FakeTensor) -> None:
         storage = tensor.untyped_storage()

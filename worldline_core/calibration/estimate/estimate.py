@@ -178,6 +178,8 @@ def _estimate_source(
                 progress.advance()
 
     robot, base = load_embodiment(first.episode.embodiment, descriptions.get(first.episode.embodiment)), None
+    if not wanted and robot.description.unknown_mount is None:
+        return SourceEstimate(chosen[0].source, (), folder, None)  # also of robots whose description is not here
     if robot.description.unknown_mount is not None:
         robot, base = place_second_arm(loaded(first.views), robot, len(chosen))
     kinematics = ArmKinematics(robot)
