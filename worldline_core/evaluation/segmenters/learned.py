@@ -40,6 +40,7 @@ from worldline_core.training.trainer import Objective, ParameterGroup, step_gene
 
 DESCRIPTION_FILE = "segmenter.json"
 _BATCH = 64
+_BATCH_ON_CPU = 8  # what a layer writes stays in the processor's cache: half the time of 32
 _GROUPS = 8
 
 
@@ -82,9 +83,11 @@ class UNet(nn.Module):
 
 
 class _GroupNorm(nn.GroupNorm):
-    """Group norm in contiguous memory format: on a CPU in bfloat16, channels-last (as the convolutions run) takes 15 times as long."""
+    """Group norm, in bfloat16 in contiguous memory format: a CPU takes 15 times as long in channels-last (as the convolutions run)."""
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - the base class's name
+        if input.dtype == torch.float32:
+            return super().forward(input)
         return super().forward(input.contiguous()).contiguous(memory_format=torch.channels_last)
 
 
@@ -128,9 +131,10 @@ class LearnedSegmenter:
     def segment(self, video: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
         """Bool masks (n, h, w) of uint8 frames (n, h, w, 3); ``points`` are not used."""
         device = next(self.network.parameters()).device
+        batch = _BATCH_ON_CPU if device.type == "cpu" else _BATCH
         masks = []
-        for start in range(0, len(video), _BATCH):
-            frames = torch.from_numpy(np.ascontiguousarray(video[start : start + _BATCH])).to(device)
+        for start in range(0, len(video), batch):
+            frames = torch.from_numpy(np.ascontiguousarray(video[start : start + batch])).to(device)
             frames = frames_to_unit(frames).contiguous(memory_format=torch.channels_last)
             with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16_by_default({"device": device.type})):
                 logits = self.network(frames)
