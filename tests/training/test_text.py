@@ -15,11 +15,11 @@ from worldline_core.model.text import VISION_START, ClipFacts, Cosmos3Text, load
 from worldline_core.model.world_model_config import MixtureConfig, TextConfig
 from worldline_core.rehearsal.outside_models import write_qwen2_tokenizer
 from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.training import stored_text
+from worldline_core.training import stage1 as stage1_module
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch
 from worldline_core.training.clip_source import LatentStore
-from worldline_core.training.stage1 import train_stage1
+from worldline_core.training.stage1 import StoredText, train_stage1
 
 
 def test_stage1_feeds_the_chat_prompt_of_each_clip(world, tmp_path, seen):
@@ -68,7 +68,7 @@ def test_stored_prompts_are_read_as_the_text_tower_reads_them(base):
     """Alone or with a longer text, which moves them in time."""
     model, _ = load_checkpoint(base["base"])
     short, long = (7, 8, 9), (5, 4, 3, 11, 12, 13, 14)
-    stored = stored_text.StoredText(model, [short, long], "cpu")
+    stored = StoredText(model, [short, long], "cpu")
     latents, sigma = torch.randn(2, 1, 4, 3, 4, 4, generator=torch.Generator().manual_seed(3)), torch.tensor([0.3, 0.8])
     for prompts in ([short, short], [long, short]):
         texts = padded(prompts, 0)
@@ -93,7 +93,7 @@ def test_a_text_tower_that_is_not_trained_stays_as_it_is_and_may_be_left_out(bas
     train_stage1(without_text_training("stored"), base, tmp_path / "killed")
     files = [tmp_path / name / "model.safetensors" for name in ("killed", "stored")]
     assert files[0].read_bytes() == files[1].read_bytes()
-    monkeypatch.setattr(stored_text, "MOST_BYTES", 1000)
+    monkeypatch.setattr(stage1_module, "MOST_BYTES", 1000)
     for tower, inputs, message in (
         ("stored", base, r"too much to keep[\s\S]*8 prompts of up to 7 tokens[\s\S]*text_tower to frozen"),
         ("frozen", world_alone(base), r"comes from a checkpoint[\s\S]*--input base=FOLDER"),
