@@ -18,18 +18,18 @@ from tests.training.conftest import FRAME_INPUT, stage1, stage2, write_tokenizer
 from worldline_core.actions.episode_tracks import ActionTracks, write_index
 from worldline_core.config import load_config
 from worldline_core.data.episodes.episode import VIEWS
-from worldline_core.distillation import teacher_trajectories
+from worldline_core.distillation import trajectory_regression
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill import distill
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
-from worldline_core.distillation.teacher_trajectories import (
+from worldline_core.distillation.trajectory_regression import (
+    TrajectoryObjective,
     TrajectoryStore,
     robot_masks,
     substep_sigmas,
     write_trajectories,
 )
-from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint, write_weights
 from worldline_core.model.networks import build_world_model
@@ -211,7 +211,7 @@ def killing(function, at_call):
 @pytest.mark.slow
 def test_a_run_killed_anywhere_ends_with_the_same_bytes(finished, tmp_path, monkeypatch):
     for owner, name, call in (
-        (TeacherForcingObjective, "loss", 3), (teacher_trajectories, "write_bytes_atomic", 2),
+        (TeacherForcingObjective, "loss", 3), (trajectory_regression, "write_bytes_atomic", 2),
         (TrajectoryObjective, "loss", 3), (DistributionMatchingObjective, "loss", 8),
     ):  # fmt: skip
         with monkeypatch.context() as patch:

@@ -11,13 +11,15 @@ from worldline_core.distillation import causal_teacher_forcing
 from worldline_core.distillation.causal_objective import block_sigmas, frame_sigmas, maps_of, self_forced_rollout
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective, teacher_forcing_loss
 from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.distillation.teacher_trajectories import (
+from worldline_core.distillation.trajectory_regression import (
     TrajectoryBatch,
+    TrajectoryObjective,
+    draw_nodes,
     euler_nodes,
+    node_of_each_block,
     substep_sigmas,
     teacher_trajectories,
 )
-from worldline_core.distillation.trajectory_regression import TrajectoryObjective, draw_nodes, node_of_each_block
 from worldline_core.model.block_causal_attention import KVCache, block_bounds
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS as NODES

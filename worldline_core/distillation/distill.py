@@ -24,15 +24,15 @@ from worldline_core.distillation.causal_objective import CausalObjective
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
-from worldline_core.distillation.teacher_trajectories import (
+from worldline_core.distillation.trajectory_regression import (
     INDEX,
     TrajectoryBatch,
     TrajectoryLoader,
+    TrajectoryObjective,
     TrajectoryStore,
     trajectory_shard,
     write_trajectories,
 )
-from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import (
     CheckpointInfo,

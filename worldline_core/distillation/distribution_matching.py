@@ -28,7 +28,7 @@ from worldline_core.distillation.causal_objective import (
     with_observed_frame,
 )
 from worldline_core.distillation.distill_config import CYCLE, DistillConfig
-from worldline_core.distillation.teacher_trajectories import TrajectoryBatch
+from worldline_core.distillation.trajectory_regression import TrajectoryBatch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import add_noise, flow_matching_loss
