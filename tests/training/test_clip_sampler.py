@@ -207,10 +207,8 @@ def test_a_clip_is_trained_in_a_batch_as_it_would_be_alone(inputs, latents):
             torch.testing.assert_close(velocity(alone)[0], velocity(together)[number], rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["latents", "frames"])
-def test_stage2_trains_on_every_set_of_views(inputs, tmp_path, seen, kind):
-    source = {"kind": kind} | ({"image_size": SIZE} if kind == "frames" else {})
-    counts = train_stage2(stage2(input=source), inputs, tmp_path / "out")
+def test_stage2_trains_on_every_set_of_views(inputs, tmp_path, seen):
+    counts = train_stage2(stage2(), inputs, tmp_path / "out")
     assert counts["steps"] == 12
     assert {batch.views for batch in seen} == {VIEWS, RIGHT, HEAD}
     for batch in seen:
