@@ -87,11 +87,15 @@ ONE_STEP = {"sigmas": [1.0, 0.0], "trajectory_regression": {"trajectories": {"su
 
 @pytest.fixture
 def shown(monkeypatch):
-    """Makes the objective's loss of a batch, and returns what the loss is given."""
+    """Makes the objective's loss of a batch, and returns the latents that it asks for and the history that the model is shown."""
     given = {}
 
-    def loss(model, latents, maps, **named):
-        given.update(named, latents=latents)
+    def forward(model, noisy, history, sigma, **named):
+        given["history"] = history
+        return noisy
+
+    def loss(velocity, latents, *rest, **named):
+        given["latents"] = latents
         return latents.sum()
 
     def show(model, batch, *teacher, **forcing):
@@ -99,7 +103,8 @@ def shown(monkeypatch):
         objective.loss(batch, torch.Generator().manual_seed(5), 0)
         return given
 
-    monkeypatch.setattr(causal_teacher_forcing, "teacher_forcing_loss", loss)
+    monkeypatch.setattr(WorldModel, "forward_teacher_forcing", forward)
+    monkeypatch.setattr(causal_teacher_forcing, "flow_matching_loss", loss)
     return show
 
 

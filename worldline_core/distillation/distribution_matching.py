@@ -78,7 +78,7 @@ class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
         gradient = distribution_gradient(full_clip_score(self.real, batch), fake, generated, fresh, levels)
         matching = distribution_matching_loss(generated, gradient)
         auxiliary, values = auxiliary_losses(
-            generated, target, batch, self.spec.block_size, self.settings.auxiliary, self.perceptual
+            generated, target, batch.mask, batch.views, self.spec.block_size, self.settings.auxiliary, self.perceptual
         )
         measured = {"distribution_matching": matching, **values}
         return matching + auxiliary, {name: value.item() for name, value in measured.items()}

@@ -389,7 +389,9 @@ class TrajectoryObjective(CausalObjective[TrajectoryBatch]):
         # Frame 0 is the observation in both: it adds nothing and is left out of the means.
         next_loss = spec.steps * ((stepped - following)[..., 1:, :, :] ** 2).mean()
         terminal_loss = ((predicted - end)[..., 1:, :, :] ** 2).mean()
-        auxiliary, terms = auxiliary_losses(predicted, end, batch, spec.block_size, config.auxiliary, self.perceptual)
+        auxiliary, terms = auxiliary_losses(
+            predicted, end, batch.mask, batch.views, spec.block_size, config.auxiliary, self.perceptual
+        )
         total = config.next_weight * next_loss + config.terminal_weight * terminal_loss + auxiliary
         return total, {"next": next_loss.detach(), "terminal": terminal_loss.detach(), **terms}
 
