@@ -129,7 +129,7 @@ def robot_masks(loader: ClipLoader, clips: Sequence[Clip], views: Sequence[str])
     """
     if loader.tracks is None:
         raise ConfigError("Robot masks come from action tracks", next_step="give the tracks to the clip loader")
-    cut = [loader.tracks.tracks(clip.episode_id).clip(list(clip.frames)) for clip in clips]
+    cut = [loader.tracks.tracks(one.episode_id).clip(one.frames) for one in clips]  # pyright: ignore[reportUnknownMemberType]
     return clip_robot_masks(cut, views, loader.source.latent_shape[1:])
 
 
@@ -163,6 +163,7 @@ def trajectory_shard(
 
 
 INDEX = "trajectories.json"
+_opened: Any = safe_open  # it has no types
 
 MakeShard = Callable[[int], tuple[ClipBatch, Mapping[str, Tensor]]]
 """Clips of a shard by its number, and their ``nodes`` (n k v c u h w), robot ``mask`` (n v t h w) and perhaps ``latents``
@@ -237,9 +238,9 @@ class TrajectoryStore:
         """
         if not (folder / INDEX).is_file():
             raise ArtifactError("Not a folder of finished trajectories", where=folder, expected=INDEX)
-        shards = read_json(folder / INDEX).get("shards")
-        if not isinstance(shards, list) or not shards:
-            raise ArtifactError("The index lists no shards", where=folder / INDEX, got=type(shards).__name__)
+        shards: Any = read_json(folder / INDEX).get("shards")
+        if (kind := type(shards).__name__) != "list" or not shards:
+            raise ArtifactError("The index lists no shards", where=folder / INDEX, got=kind)
         return cls(folder, [_clips(shard_path(folder, number)) for number in range(len(shards))])
 
     def __len__(self) -> int:
@@ -252,11 +253,11 @@ class TrajectoryStore:
     def read(self, name: str, indices: Sequence[int]) -> Tensor:
         """``nodes`` (b k v c u h w), ``mask`` (b v t h w) or, where they are kept, ``latents`` (b v c t h w) of some
         trajectories, in single precision."""
-        rows = []
+        rows = list[Tensor]()
         for index in indices:
             number, row, _ = self._clips[index]
             path = shard_path(self.folder, number)
-            with safe_open(path, framework="pt") as shard:
+            with _opened(path, framework="pt") as shard:
                 if name not in shard.keys():  # noqa: SIM118  (no mapping)
                     raise ArtifactError("A shard of trajectories lacks a tensor", where=path, expected=name)
                 rows.append(shard.get_slice(name)[row : row + 1])
@@ -276,8 +277,8 @@ def _clips(path: Path) -> tuple[list[Clip], tuple[str, ...]]:
         ArtifactError: it is missing, damaged, or of another form.
     """
     try:
-        with safe_open(path, framework="pt") as shard:
-            header = shard.metadata() or {}
+        with _opened(path, framework="pt") as shard:
+            header: dict[str, str] = shard.metadata() or {}
             clips, views = _CLIPS.validate_json(header.get("clips", ""))
             forms = {name: shard.get_slice(name) for name in ("nodes", "mask")}
             found = {name: (form.get_dtype(), form.get_shape()) for name, form in forms.items()}

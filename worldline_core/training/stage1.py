@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Int
@@ -108,7 +108,11 @@ def prompts_of(loader: ClipLoader, rows: Sequence[ClipRow], clips: ClipSampling)
         for stride in clips.strides
     )
     found = (loader.text([instruction], [facts])[0][0] for instruction, facts in asked)
-    return list(dict.fromkeys(tuple(ids.tolist()) for ids in found))
+    return list(dict.fromkeys(map(_key, found)))
+
+
+def _key(ids: Tensor) -> tuple[int, ...]:
+    return tuple(cast("Any", ids).tolist())
 
 
 class StoredText:
@@ -145,7 +149,7 @@ class StoredText:
     def __call__(self, text_ids: Int[Tensor, "b m"], text_mask: Bool[Tensor, "b m"] | None = None) -> TextContext:
         """What the layers read of right-padded texts, each among the prompts."""
         mask = torch.ones_like(text_ids, dtype=torch.bool) if text_mask is None else text_mask
-        texts = [tuple(ids[real].tolist()) for ids, real in zip(text_ids, mask, strict=True)]
+        texts = [_key(ids[real]) for ids, real in zip(text_ids, mask, strict=True)]
         rows = torch.tensor([self._numbers[text] for text in texts])
         layers = tuple((keys[rows].to(self._device), values[rows].to(self._device)) for keys, values in self._layers)
         return TextContext(layers, self._mask[rows].to(self._device), self._mask.shape[1])
