@@ -31,7 +31,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput
 from worldline_core.training.clip_loader import ClipLoader, read_ahead
 from worldline_core.training.clip_sampler import Clip, ClipSampler
-from worldline_core.training.clip_source import FrameSource, LatentStore, ResidentLatents
+from worldline_core.training.clip_source import FrameSource, LatentStore, ResidentLatents, decoder
 from worldline_core.training.encode_latents import encode_latents
 
 TICK = os.sysconf("SC_CLK_TCK")
@@ -84,7 +84,7 @@ def decode_raw(source: FrameSource, clips: Sequence[Clip]) -> None:
     for clip in clips:
         position = source.episodes.position(clip.episode_id)
         for view in VIEWS:
-            for _ in source.decoder.frames(source.episodes.clip(position, view), clip.frames):
+            for _ in decoder().frames(source.episodes.clip(position, view), clip.frames):
                 pass
 
 
@@ -93,9 +93,7 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple
     config = FrameInput.model_validate({"image_size": case["size"]})
     source = FrameSource(episodes, TOKENIZER, config)
     sampling = ClipSampling.model_validate({"lengths": case["lengths"]})
-    sampler = ClipSampler(
-        source.rows, sampling, views=VIEWS, splits=["train"], start_step=1, batch_size=case["batch"], seed=0
-    )
+    sampler = ClipSampler(source.rows, sampling, views=VIEWS, start_step=1, batch_size=case["batch"], seed=0)
     steps = case["steps"]
     batches = [sampler.clips(index) for index in range(steps)]
     clips = [clip for batch in batches for clip in batch.clips]
@@ -122,7 +120,7 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple
             if turn:  # the first round opens files and touches memory for the first time
                 times[name].append(processor_seconds(everyone) - before)
     raw, loaded = (frames / statistics.median(spent) for spent in times.values())
-    return source.decoder.name, raw, loaded, loaded / raw
+    return decoder().name, raw, loaded, loaded / raw
 
 
 def latent_batches(root: Path) -> Iterator[tuple[str, float]]:
@@ -132,9 +130,7 @@ def latent_batches(root: Path) -> Iterator[tuple[str, float]]:
     encode_latents(EncodeLatentsConfig(), {"episodes": root / "set", "tokenizer": TOKENIZER}, root / "latents")
     store = LatentStore.open(root / "latents")
     sampling = ClipSampling.model_validate({"lengths": case["lengths"]})
-    sampler = ClipSampler(
-        store.rows, sampling, views=VIEWS, splits=["train"], start_step=store.start_step, batch_size=256, seed=0
-    )
+    sampler = ClipSampler(store.rows, sampling, views=VIEWS, start_step=store.start_step, batch_size=256, seed=0)
     for name, source in (("read", store), ("resident", ResidentLatents(store, "cpu"))):
         load, steps = ClipLoader(source, views=VIEWS).batches(sampler), count()
         yield name, 1000 * seconds_of(lambda load=load, steps=steps: load(next(steps)))

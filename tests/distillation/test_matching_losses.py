@@ -1,7 +1,6 @@
 """Distribution matching and the auxiliary losses beside it: who receives which gradient."""
 
 import inspect
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -199,14 +198,13 @@ def test_boundary_loss_looks_at_the_steps_between_blocks():
 
 
 def test_auxiliaries_are_weighted_as_configured():
-    batch = SimpleNamespace(views=VIEWS, mask=MASK)
     only_robot = AuxiliaryWeights(anchor=0, boundary=0, lpips=0, robot=0.5, robot_motion=0)
     every = {"anchor", "boundary", "lpips", "robot", "robot_motion"}
     for weights, perceptual, names, expected in (
         (only_robot, (), {"robot"}, 0.5),
         (AuxiliaryWeights(), (lambda a, b: (a - b).abs().mean(),), every, 0.005 + 0.0 + 0.005 + 0.005),
     ):
-        total, terms = auxiliary_losses(ZEROS + 1.0, ZEROS, batch, 2, weights, *perceptual)
+        total, terms = auxiliary_losses(ZEROS + 1.0, ZEROS, MASK, VIEWS, 2, weights, *perceptual)
         assert set(terms) == names
         assert total.item() == pytest.approx(expected)
 

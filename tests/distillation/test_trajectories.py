@@ -9,21 +9,23 @@ import torch
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.distillation import causal_teacher_forcing
 from worldline_core.distillation.causal_objective import block_sigmas, frame_sigmas, maps_of, self_forced_rollout
-from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective, teacher_forcing_loss
+from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.distillation.teacher_trajectories import (
+from worldline_core.distillation.trajectory_regression import (
     TrajectoryBatch,
+    TrajectoryObjective,
+    draw_nodes,
     euler_nodes,
+    node_of_each_block,
     substep_sigmas,
     teacher_trajectories,
 )
-from worldline_core.distillation.trajectory_regression import TrajectoryObjective, draw_nodes, node_of_each_block
 from worldline_core.model.block_causal_attention import KVCache, block_bounds
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS as NODES
 from worldline_core.pipeline.memory_estimate import Sources, Training, trainings
 from worldline_core.pipeline.memory_trace import Held
-from worldline_core.training.training_config import LossWeighting, SigmaSampling
+from worldline_core.training.training_config import SigmaSampling
 
 FPS = torch.tensor([8.0, 30.0])
 
@@ -63,7 +65,8 @@ def blockwise(model, config, given):
 )
 def test_an_objective_trains_on_what_a_rollout_sees(objective, make_model):
     """Six blocks, in a window of two."""
-    config, model, seen = config_of(13, window={"sink_blocks": 1, "recent_blocks": 1}), make_model(0, fps=15.0), []
+    window, disturbed = {"sink_blocks": 1, "recent_blocks": 1}, {"history_noise": 0.1}
+    config, model, seen = config_of(13, window=window, teacher_forcing=disturbed), make_model(0, fps=15.0), []
 
     def watched(*given, **named):
         velocity = WorldModel.forward_teacher_forcing(model, *given, **named)
@@ -71,8 +74,10 @@ def test_an_objective_trains_on_what_a_rollout_sees(objective, make_model):
         return velocity
 
     model.forward_teacher_forcing = watched
-    objective(model, config).loss(batch_of(13, config.spec.steps), torch.Generator().manual_seed(0), 5)
+    batch = batch_of(13, config.spec.steps)
+    objective(model, config).loss(batch, torch.Generator().manual_seed(0), 5)
     (given,) = seen
+    assert torch.equal(given[1], batch.latents) is (objective is not TeacherForcingObjective)
     torch.testing.assert_close(given[-1], blockwise(model, config, given), rtol=1e-5, atol=1e-5)
 
 
@@ -82,11 +87,15 @@ ONE_STEP = {"sigmas": [1.0, 0.0], "trajectory_regression": {"trajectories": {"su
 
 @pytest.fixture
 def shown(monkeypatch):
-    """Makes the objective's loss of a batch, and returns what the loss is given."""
+    """Makes the objective's loss of a batch, and returns the latents that it asks for and the history that the model is shown."""
     given = {}
 
-    def loss(model, latents, maps, **named):
-        given.update(named, latents=latents)
+    def forward(model, noisy, history, sigma, **named):
+        given["history"] = history
+        return noisy
+
+    def loss(velocity, latents, *rest, **named):
+        given["latents"] = latents
         return latents.sum()
 
     def show(model, batch, *teacher, **forcing):
@@ -94,7 +103,8 @@ def shown(monkeypatch):
         objective.loss(batch, torch.Generator().manual_seed(5), 0)
         return given
 
-    monkeypatch.setattr(causal_teacher_forcing, "teacher_forcing_loss", loss)
+    monkeypatch.setattr(WorldModel, "forward_teacher_forcing", forward)
+    monkeypatch.setattr(causal_teacher_forcing, "flow_matching_loss", loss)
     return show
 
 
@@ -204,26 +214,18 @@ def trajectories(model, clip, *, latents=None, maps=None):
     )  # fmt: skip
 
 
-def test_trajectories_start_at_the_noise_and_are_repeatable(make_model, clip):
+def test_trajectories_start_at_the_noise_and_see_the_recorded_history_alone(make_model, clip):
     model = make_model(0)
     nodes = trajectories(model, clip)
     assert nodes.shape == (2, 5, 3, 4, 4, 4, 4)
     assert torch.equal(nodes[:, 0], clip.noise[..., 1:, :, :])
-    assert torch.equal(nodes, trajectories(model, clip))
-
-
-@pytest.mark.parametrize(("name", "begins"), [("latents", 1), ("maps", 3)])
-def test_the_history_is_the_recorded_one_and_nothing_later_reaches_a_block(make_model, clip, name, begins):
-    model, other = make_model(0), getattr(clip, name).clone()
-    other[..., begins : begins + 2, :, :] += 1.0
-    nodes, changed = trajectories(model, clip), trajectories(model, clip, **{name: other})
-    assert torch.equal(nodes[..., :2, :, :], changed[..., :2, :, :])
-    assert not torch.allclose(nodes[:, -1, ..., 2:, :, :], changed[:, -1, ..., 2:, :, :])
-
-
-def test_cached_nodes_agree_with_the_teacher_forcing_pass(make_model, clip):
-    model = make_model(0)
-    nodes = trajectories(model, clip)
+    for name, begins in (("latents", 1), ("maps", 3)):
+        other = getattr(clip, name).clone()
+        other[..., begins : begins + 2, :, :] += 1.0
+        changed = trajectories(model, clip, **{name: other})
+        assert torch.equal(nodes[..., :2, :, :], changed[..., :2, :, :])  # nothing later reaches a block
+        assert not torch.allclose(nodes[:, -1, ..., 2:, :, :], changed[:, -1, ..., 2:, :, :])
+    # The first step is that of a teacher-forcing pass.
     noisy = torch.cat((clip.latents[..., :1, :, :], clip.noise[..., 1:, :, :]), dim=3)
     with torch.no_grad():
         velocity = model.forward_teacher_forcing(
@@ -257,7 +259,7 @@ def loss_of(student, nodes, clip, index, **options):
 
 
 @pytest.mark.parametrize("node", range(4))
-def test_a_perfect_student_has_no_loss(clip, node):
+def test_a_perfect_student_has_no_loss_and_parts_are_weighted(clip, node):
     nodes = straight_nodes(clip.latents, clip.noise)
     index = torch.full((2, 2), node)
     total, _ = loss_of(StraightStudent(clip.latents, clip.noise), nodes, clip, index)
@@ -266,14 +268,9 @@ def test_a_perfect_student_has_no_loss(clip, node):
     sigma, step = NODES[node], NODES[node] - NODES[node + 1]
     assert wrong["next"].item() == pytest.approx(4 * (0.1 * step) ** 2, rel=1e-3)
     assert wrong["terminal"].item() == pytest.approx((0.1 * sigma) ** 2, rel=1e-3)
-
-
-def test_parts_are_weighted(clip):
-    nodes = straight_nodes(clip.latents, clip.noise)
-    student = StraightStudent(clip.latents, clip.noise + 0.1)
     nothing = dict.fromkeys(("anchor", "boundary", "lpips", "robot", "robot_motion"), 0)
     options = {"next_weight": 3.0, "terminal_weight": 7.0, "auxiliary": nothing}
-    total, terms = loss_of(student, nodes, clip, torch.full((2, 2), 3), **options)
+    total, terms = loss_of(StraightStudent(clip.latents, clip.noise + 0.1), nodes, clip, index, **options)
     assert set(terms) == {"next", "terminal"}
     assert total.item() == pytest.approx((3 * terms["next"] + 7 * terms["terminal"]).item())
 
@@ -286,21 +283,3 @@ def test_every_node_is_drawn_and_every_block_has_its_noise_level():
     assert (sigma.shape, levels.shape) == ((8, 2), (8, 9))
     assert not torch.allclose(sigma[:, 0], sigma[:, 1])
     assert not levels[:, 0].any() and torch.equal(levels[:, 1:5], sigma[:, :1].expand(8, 4))
-
-
-def test_teacher_forcing_trains_every_block_on_recorded_history(make_model, clip):
-    model = make_model(0)
-
-    def loss(latents, maps, history=None):
-        return teacher_forcing_loss(
-            model, latents, maps, history=history, views=clip.views, spec=clip.spec, sampling=SigmaSampling(),
-            weighting=LossWeighting(), generator=torch.Generator().manual_seed(5),
-        )  # fmt: skip
-
-    value = loss(clip.latents, clip.maps)
-    value.backward()
-    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in model.parameters())
-    assert torch.equal(loss(clip.latents, clip.maps), value)
-    changed = clip.latents.clone()
-    changed[..., 1:3, :, :] += 0.5
-    assert not torch.allclose(loss(clip.latents, clip.maps, history=changed), value)

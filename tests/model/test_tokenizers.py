@@ -11,8 +11,7 @@ from worldline_core.errors import CheckpointError, ConfigError, DataError, Unava
 from worldline_core.model import tokenizers
 from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
-from worldline_core.training.clip_source import LoadedView
-from worldline_core.training.train_tokenizer import decoder_batch, disturb, train_decoder, train_small_decoder
+from worldline_core.training.train_tokenizer import decoder_batch, disturb, train_decoder
 from worldline_core.training.training_config import TokenizerConfig
 
 
@@ -32,7 +31,7 @@ def scenes(count=6, frames=9, seed=0):
 def views(seeds, count=6):
     """Scenes of several seeds as they are held in memory for training."""
     videos = [((v + 1) * 127.5).round().to(torch.uint8) for s in range(seeds) for v in scenes(count, seed=s)]
-    return [LoadedView(f"scene-{number}/head", video) for number, video in enumerate(videos)]
+    return [(f"scene-{number}/head", video) for number, video in enumerate(videos)]
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +95,7 @@ def test_a_short_training_improves_on_the_linear_decode_by_using_the_reference(t
     config = TokenizerConfig(
         steps=25, batch_size=2, clip_frames=9, warmup_steps=2, bfloat16=False, average_decay=0.8, learning_rate=1e-2
     )
-    train_decoder(tokenizer, videos, config, tmp_path)
+    train_decoder(tokenizer.refinement, tokenizer, videos, config, tmp_path)
     held_out = scenes(seed=11)
     latents = tokenizer.encode(held_out)
     decoded = (
@@ -316,7 +315,7 @@ def test_training_lowers_the_error_and_leaves_the_encoder_as_it_is(patch, wan, t
         decoder.fit([scenes(seed=seed) for seed in range(2)])
         measure()
         changes = {"steps": steps, "batch_size": 2, "learning_rate": 1e-2, "checkpoint_every": 500}
-        train_small_decoder(decoder, tokenizer, views(2), CONFIG.model_copy(update=changes), tmp_path / str(steps))
+        train_decoder(decoder, tokenizer, views(2), CONFIG.model_copy(update=changes), tmp_path / str(steps))
         measure()
         assert errors[2] < errors[1] < errors[0] or tokenizer is wan  # random weights: there is nothing to learn
         for name, value in tokenizer.state_dict().items():

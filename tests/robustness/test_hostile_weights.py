@@ -18,7 +18,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from worldline_core.distillation.teacher_trajectories import TrajectoryStore
+from worldline_core.distillation.trajectory_regression import TrajectoryStore
 from worldline_core.errors import ArtifactError, CheckpointError
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet, save_segmenter
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint

@@ -17,6 +17,8 @@ from safetensors.torch import save_file
 from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
+from worldline_core.model.checkpoint import save_checkpoint
+from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import PatchTokenizer, PatchTokenizerConfig
 from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.store.artifact_files import read_json_lines
@@ -151,6 +153,16 @@ def world(tmp_path_factory):
 def model_config():
     """Makes configurations of models that fit the world's latents."""
     return lambda **changes: MixtureConfig.model_validate(TINY_MODEL | changes)
+
+
+@pytest.fixture(scope="session")
+def base(tmp_path_factory):
+    """A base checkpoint of random weights that fits the world's latents."""
+    model, folder = build_world_model(MixtureConfig.model_validate(TINY_MODEL)), tmp_path_factory.mktemp("base")
+    model.initialise(torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(model.proj_out.weight, std=0.2)  # a head of zeros would teach no layer below it
+    save_checkpoint(folder, model, kind="base", action_contract=None)
+    return folder
 
 
 def trainer(steps, **changes):

@@ -22,7 +22,6 @@ from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.clip_source import FrameSource
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.stage1 import train_stage1
 from worldline_core.training.stage2 import train_stage2
 from worldline_core.training.training_config import ActionFollowingConfig, LossWeighting, SigmaSampling, TrainerConfig
 
@@ -124,12 +123,9 @@ def test_a_model_that_ignores_its_controls_is_stopped_from_the_given_step_on(wor
     assert not following.due(19 * following.spent) and following.due(21 * following.spent)  # its share of the time
 
 
-@pytest.fixture(scope="module")
-def inputs(world, tokenizer, tmp_path_factory):
-    made, folder = {**world.inputs, "tokenizer": tokenizer}, tmp_path_factory.mktemp("base")
-    values = {"kind": "base", "trainer": TRAINER, "input": FRAME_INPUT, "clips": {"lengths": [9]}}
-    train_stage1(conftest.stage1(**values), made, folder)
-    return made | {"stage1": folder}
+@pytest.fixture
+def inputs(world, tokenizer, base):
+    return {**world.inputs, "tokenizer": tokenizer, "stage1": base}
 
 
 def stage2(**changes):

@@ -7,10 +7,9 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.training.conftest import stage1, stage2, trainer
+from tests.training.conftest import stage2, trainer
 from worldline_core.errors import CheckpointError, ConfigError
-from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
-from worldline_core.model.networks import build_world_model
+from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.store.artifact_files import digest_folder
 from worldline_core.training.adapters import add_adapters, merge_adapter
 from worldline_core.training.processes import hold_weights
@@ -25,13 +24,8 @@ def adapted(**changes):
 
 
 @pytest.fixture(scope="module")
-def inputs(world, tmp_path_factory):
-    """Inputs of Stage II, with a base checkpoint of random weights."""
-    model, folder = build_world_model(stage1(trainer=trainer(1)).model), tmp_path_factory.mktemp("base")
-    model.initialise(torch.Generator().manual_seed(0))
-    torch.nn.init.normal_(model.proj_out.weight, std=0.2)  # a head of zeros, which is not adapted, would teach no layer
-    save_checkpoint(folder, model, kind="base", action_contract=None)
-    return {**world.inputs, "stage1": folder, "base": folder}
+def inputs(world, base):
+    return {**world.inputs, "stage1": base}
 
 
 @pytest.fixture(scope="module")

@@ -49,9 +49,8 @@ def scripted(world, behaviour=None):
 def sampler_of(source, **changes):
     values = {"lengths": (5, 9, 17), "view_weights": {"joint": 1.0, "primary": 1.0}, "single_view_factor": 2}
     config = ClipSampling.model_validate(changes or values)
-    return ClipSampler(
-        source.rows, config, views=VIEWS, splits=["train"], start_step=source.start_step, batch_size=2, seed=9
-    )
+    rows = [row for row in source.rows if row.split == "train"]
+    return ClipSampler(rows, config, views=VIEWS, start_step=source.start_step, batch_size=2, seed=9)
 
 
 def same(one, other):

@@ -192,24 +192,21 @@ def test_resident_bytes_are_those_on_the_device(world, native_size):
     assert memory_estimate.resident_bytes(stage2(2), world.inputs, model) == 0
 
 
-@pytest.mark.parametrize("resident", [False, True])
-def test_a_training_that_cannot_fit_its_card_is_refused_before_it_begins(world, tmp_path, monkeypatch, resident):
+def test_a_training_that_cannot_fit_its_card_is_refused_before_it_begins(world, tmp_path, monkeypatch):
     values = {"model": {"num_layers": 1}, "trainer": {"steps": 1, "batch_size": 1}, "clips": {"lengths": [9]}}
     config, inputs = Stage1Config.model_validate(values), {"episodes": world.episodes, "latents": world.latents}
-    if resident:
-        config = config.model_copy(update={"input": LatentInput(resident=True)})
     latents = LatentStore.open(world.latents)
     (training,) = trainings(config, config.model, Sources(None, None, latents.image_size, latents.latent_shape[1:]))
-    kept = memory_estimate.resident_bytes(config, inputs, config.model)
-    need = (training.estimate(1).total + kept) / memory_estimate.USABLE
-    monkeypatch.setattr(memory_estimate, "device_memory", lambda _device: 1.001 * need)
-    memory_estimate.require_memory(config, inputs)
-    monkeypatch.setattr(memory_estimate, "device_memory", lambda _device: 0.999 * need)
-    with pytest.raises(
-        ConfigError,
-        match=rf"stage I on cpu[\s\S]*weights[\s\S]*{'resident input[^;]*false' if resident else ''}[\s\S]*worldline plan",
-    ):
-        train_stage1.run(ArtifactStore(tmp_path), config, inputs)
+    alone = training.estimate(1).total
+    for resident, more in ((False, ""), (True, "resident input[^;]*false")):
+        config = config.model_copy(update={"input": LatentInput(resident=resident)})
+        need = (alone + memory_estimate.resident_bytes(config, inputs, config.model)) / memory_estimate.USABLE
+        monkeypatch.setattr(memory_estimate, "device_memory", lambda _device, need=need: 1.001 * need)
+        memory_estimate.require_memory(config, inputs)
+        monkeypatch.setattr(memory_estimate, "device_memory", lambda _device, need=need: 0.999 * need)
+        message = rf"stage I on cpu[\s\S]*weights[\s\S]*{more}[\s\S]*worldline plan"
+        with pytest.raises(ConfigError, match=message):
+            train_stage1.run(ArtifactStore(tmp_path), config, inputs)
 
 
 def test_what_does_not_fit_ends_with_status_one(capsys, monkeypatch):

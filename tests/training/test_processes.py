@@ -10,14 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import torch
 from safetensors.torch import load_file
 
 from tests.training import conftest
 from tests.training.conftest import TINY_MODEL, losses
 from worldline_core.model.checkpoint import save_checkpoint
-from worldline_core.model.networks import build_world_model
-from worldline_core.model.world_model_config import MixtureConfig
 from worldline_core.store.artifact_files import digest_folder, read_json_lines
 
 
@@ -66,13 +63,12 @@ def trainer(steps, batch_size, **changes):
 
 
 @pytest.fixture(scope="module")
-def inputs(world, teacher, make_model, tmp_path_factory):
-    model, folder = build_world_model(MixtureConfig.model_validate(TINY_MODEL)), tmp_path_factory.mktemp("base")
-    model.initialise(torch.Generator().manual_seed(0))
-    save_checkpoint(folder, model, kind="base", action_contract=None)
-    wan = make_model(network="wan")
-    save_checkpoint(folder / "wan", wan, kind="base", action_contract=None)  # with a prompt among its weights
-    return {**world.inputs, "stage1": folder, "teacher": teacher}
+def inputs(world, base, teacher, make_model, tmp_path_factory):
+    wan = tmp_path_factory.mktemp("wan")
+    save_checkpoint(
+        wan, make_model(network="wan"), kind="base", action_contract=None
+    )  # with a prompt among its weights
+    return {**world.inputs, "stage1": base, "teacher": teacher}, {**world.inputs, "stage1": wan}
 
 
 def stage2(output, inputs, name, *, steps=20, relational=None, **changes):
@@ -111,7 +107,7 @@ class Runs:
 @pytest.fixture(scope="module")
 def runs(inputs, run_processes, tmp_path_factory):
     """Every run that the tests below compare: starting processes costs more than the runs."""
-    folder = tmp_path_factory.mktemp("runs")
+    (inputs, wan), folder = inputs, tmp_path_factory.mktemp("runs")
     one, two, four = folder / "one", folder / "two", folder / "four"
     for path in (one, two, four):
         path.mkdir()
@@ -121,7 +117,7 @@ def runs(inputs, run_processes, tmp_path_factory):
         stage1(one, inputs, "text"),
         stage2(one, inputs, "plain"),
         stage2(one, inputs, "terms", relational=terms),
-        stage2(one, inputs | {"stage1": inputs["stage1"] / "wan"}, "wan"),
+        stage2(one, wan, "wan"),
     ]
     assert run_processes(one, alone, count=1) == [0], (one / "log").read_text()[-3000:]
     assert run_processes(one, [stage2(one, inputs, "half", kill_before=11)], count=1) == [-9]
@@ -130,7 +126,7 @@ def runs(inputs, run_processes, tmp_path_factory):
         stage1(two, inputs, "text"),
         stage2(two, inputs, "plain"),
         stage2(two, inputs, "terms", relational=terms),
-        stage2(two, inputs | {"stage1": inputs["stage1"] / "wan"}, "wan"),
+        stage2(two, wan, "wan"),
         stage2(two, inputs, "again", sharding={"checkpointing": "block", "reduce_every_micro_step": True}),
         stage2(two, inputs, "killed", kill_before=11),
     ]

@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -12,15 +11,11 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from flows.pipeline import chain
-from tasks.execution.chain import outline
 from tests.training.conftest import FRAME_INPUT, VIEWS, losses, stage1, stage2, trainer
-from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import NativeVectors
-from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.store.artifact_files import digest_folder, read_json_lines
 from worldline_core.training import stage as stage_module
 from worldline_core.training.clip_config import EncodeLatentsConfig
@@ -34,15 +29,41 @@ from worldline_core.training.stage2 import stage2_groups, train_stage2
 from worldline_core.training.training_config import RelationalConfig
 from worldline_core.training.video_teacher import load_teacher
 
+TRAINER = trainer(4, batch_size=2, log_every=1, save_every_steps=1)
+
+
+def short_stage1(**changes):
+    clips = {"lengths": [9, 13], "view_weights": {"primary": 1}}
+    return stage1(**{"trainer": TRAINER, "clips": clips, **changes})
+
+
+def short_stage2(**changes):
+    return stage2(4, **{"trainer": TRAINER, "clips": {"lengths": [9, 13, 17]}, "action_dropout": 0.0, **changes})
+
 
 @pytest.fixture(scope="module")
-def inputs(world, tmp_path_factory):
-    """What Stage II needs, with a Stage I checkpoint of a few steps."""
+def recorded(world, tokenizer):
+    return {"episodes": world.episodes, "tokenizer": tokenizer}
+
+
+@pytest.fixture(scope="module")
+def latents(recorded, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("latents")
+    encode_latents(EncodeLatentsConfig(image_size=(32, 32)), recorded, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def first_stage(recorded, tmp_path_factory):
     folder = tmp_path_factory.mktemp("stage1")
-    train_stage1(
-        stage1(trainer=trainer(6), clips={"lengths": [9], "view_weights": {"primary": 1}}), world.inputs, folder
-    )
-    return {**world.inputs, "stage1": folder}
+    train_stage1(short_stage1(input=FRAME_INPUT), recorded, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def inputs(world, first_stage):
+    """What Stage II needs, with a Stage I checkpoint of a few steps."""
+    return {**world.inputs, "stage1": first_stage}
 
 
 def fresh(model_config, **changes):
@@ -203,35 +224,25 @@ def test_stage2_goes_on_with_latents_and_maps_of_the_same_meaning_only(
         pytest.param({"embodiments": {"square": 1, "ur5e": 2}}, None, marks=pytest.mark.slow),
     ],
 )
-def test_stage2_goes_on_with_another_robot_and_says_so(
+def test_stage2_goes_on_with_another_robot_rate_and_controls_and_says_so(
     world, model_config, make_contract, tmp_path, caplog, facts, told
 ):
-    caplog.set_level("INFO")
-    model, contract = fresh(model_config, towers="generation"), make_contract(sigma_px_ref=60.0, tokenizer="synthetic")
-    save_checkpoint(tmp_path / "before", model, kind="stage2", action_contract=contract, metadata=facts)
-    train_stage2(stage2(2), {**world.inputs, "stage1": tmp_path / "before"}, tmp_path / "after")
-    after = read_checkpoint_info(tmp_path / "after").metadata
-    assert (after["start"]["kind"], set(after["embodiments"])) == ("stage2", {"square"})
-    assert ("it now learns" in caplog.text) is (told is not None)
-    assert told is None or told in caplog.text
-
-
-def test_stage2_goes_on_at_another_rate_with_other_controls_and_says_so(
-    world, model_config, make_contract, tmp_path, caplog
-):
     """A user's robot: another frame rate, commands instead of measured states, vectors instead of maps."""
-    other = make_contract(sigma_px_ref=60.0, tokenizer="synthetic", controls="state", fps=7.5)
-    save_checkpoint(tmp_path / "before", fresh(model_config, towers="generation"), kind="stage2", action_contract=other)
     caplog.set_level("INFO")
+    other = make_contract(sigma_px_ref=60.0, tokenizer="synthetic", controls="state", fps=7.5)
+    model = fresh(model_config, towers="generation")
+    save_checkpoint(tmp_path / "before", model, kind="stage2", action_contract=other, metadata=facts)
     vectors = stage2(2, native_size=3, vector_share=1.0, action_dropout=0.0)
     train_stage2(vectors, {**world.inputs, "stage1": tmp_path / "before"}, tmp_path / "after")
-    contract = read_checkpoint_info(tmp_path / "after").action_contract
+    after = read_checkpoint_info(tmp_path / "after")
+    assert (after.metadata["start"]["kind"], set(after.metadata["embodiments"])) == ("stage2", {"square"})
+    assert ("it now learns" in caplog.text) is (told is not None)
+    contract = after.action_contract
     assert (contract.controls, contract.fps, contract.sigma_px_ref) == ("action", 8.0, None)
     for change in (
-        "controls action, previously state",
-        "frames per second 8.0, previously 7.5",
+        told or "", "controls action, previously state", "frames per second 8.0, previously 7.5",
         "conditioning vectors, previously maps",
-    ):
+    ):  # fmt: skip
         assert change in caplog.text
 
 
@@ -262,37 +273,6 @@ def test_a_teacher_is_trained_and_frozen(world, teacher):
     features = loaded.features((frames.float() / 255).permute(0, 4, 1, 2, 3)).half().float()
     assert torch.equal(similarity_matrices(features[None], (3, 2, 2)).cross, first.cross)
     assert not any(parameter.requires_grad for parameter in loaded.parameters())
-
-
-TRAINER = trainer(4, batch_size=2, log_every=1, save_every_steps=1)
-
-
-def short_stage1(**changes):
-    clips = {"lengths": [9, 13], "view_weights": {"primary": 1}}
-    return stage1(**{"trainer": TRAINER, "clips": clips, **changes})
-
-
-def short_stage2(**changes):
-    return stage2(4, **{"trainer": TRAINER, "clips": {"lengths": [9, 13, 17]}, "action_dropout": 0.0, **changes})
-
-
-@pytest.fixture(scope="module")
-def recorded(world, tokenizer):
-    return {"episodes": world.episodes, "tokenizer": tokenizer}
-
-
-@pytest.fixture(scope="module")
-def latents(recorded, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("latents")
-    encode_latents(EncodeLatentsConfig(image_size=(32, 32)), recorded, folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def first_stage(recorded, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("stage1")
-    train_stage1(short_stage1(input=FRAME_INPUT), recorded, folder)
-    return folder
 
 
 def test_stage1_learns_the_same_from_frames_as_from_their_cached_latents(world, latents, first_stage, tmp_path):
@@ -376,13 +356,3 @@ def test_a_stage_is_given_what_it_reads(world, tmp_path):
     for values, name in (({}, "latents"), ({"input": FRAME_INPUT}, "tokenizer")):
         with pytest.raises(ConfigError, match=f"need the input {name}"):
             train_stage1(short_stage1(**values), {"episodes": world.episodes}, tmp_path / name)
-    config = load_config(PipelineConfig, preset="cosmos3-nano")
-    calls, tiny = outline(chain, config), outline(chain, load_config(PipelineConfig, preset="tiny"))
-    for name in ("train_stage1", "train_stage2"):
-        assert calls[name].inputs["tokenizer"] == Path.cwd() / config.models.tokenizer
-        assert "latents" not in calls[name].inputs
-        assert tiny[name].inputs["latents"] is tiny["encode_latents"]
-        lengths = getattr(config, name).clips.lengths
-        assert (lengths[0], lengths[-1]) == (33, 129)
-    # Stage I spans longer motion, Stage II is denser (method.md section 1).
-    assert min(config.train_stage1.clips.strides) > max(config.train_stage2.clips.strides)

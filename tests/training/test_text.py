@@ -7,19 +7,17 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from tests.training.conftest import TINY_MODEL, stage1, trainer
+from tests.training.conftest import TINY_MODEL, losses, stage1, trainer
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
-from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
-from worldline_core.model.networks import build_world_model
+from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.text import VISION_START, ClipFacts, Cosmos3Text, load_text_encoder, padded
 from worldline_core.model.world_model_config import MixtureConfig, TextConfig
 from worldline_core.rehearsal.outside_models import write_qwen2_tokenizer
-from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.training import stored_text
+from worldline_core.training import stage1 as stage1_module
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch
 from worldline_core.training.clip_source import LatentStore
-from worldline_core.training.stage1 import train_stage1
+from worldline_core.training.stage1 import StoredText, train_stage1
 
 
 def test_stage1_feeds_the_chat_prompt_of_each_clip(world, tmp_path, seen):
@@ -50,25 +48,16 @@ def test_a_stride_slows_the_frames_that_the_prompt_names(world):
     assert asked == [ClipFacts(9, 8.0, (32, 32))]
 
 
-@pytest.fixture(scope="module")
-def base(world, tmp_path_factory):
-    model, folder = build_world_model(stage1(trainer=trainer(1)).model), tmp_path_factory.mktemp("base")
-    model.initialise(torch.Generator().manual_seed(0))
-    torch.nn.init.normal_(model.proj_out.weight, std=0.2)
-    save_checkpoint(folder, model, kind="base", action_contract=None)
-    return {"base": folder, **world.inputs}
-
-
 def without_text_training(tower):
     clips = {"lengths": [9, 17], "view_weights": {"primary": 1}}
-    return stage1(trainer=trainer(4), text_tower=tower, text_dropout=0.0, clips=clips)
+    return stage1(trainer=trainer(2, save_every_steps=1), text_tower=tower, text_dropout=0.0, clips=clips)
 
 
 def test_stored_prompts_are_read_as_the_text_tower_reads_them(base):
     """Alone or with a longer text, which moves them in time."""
-    model, _ = load_checkpoint(base["base"])
+    model, _ = load_checkpoint(base)
     short, long = (7, 8, 9), (5, 4, 3, 11, 12, 13, 14)
-    stored = stored_text.StoredText(model, [short, long], "cpu")
+    stored = StoredText(model, [short, long], "cpu")
     latents, sigma = torch.randn(2, 1, 4, 3, 4, 4, generator=torch.Generator().manual_seed(3)), torch.tensor([0.3, 0.8])
     for prompts in ([short, short], [long, short]):
         texts = padded(prompts, 0)
@@ -78,34 +67,30 @@ def test_stored_prompts_are_read_as_the_text_tower_reads_them(base):
         torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
 
 
-def test_a_text_tower_that_is_not_trained_stays_as_it_is_and_may_be_left_out(base, tmp_path, killed_after, monkeypatch):
-    found = {}
+def test_a_text_tower_that_is_not_trained_stays_as_it_is_and_may_be_left_out(
+    world, base, tmp_path, killed_after, monkeypatch
+):
+    given, start = {"base": base, **world.inputs}, load_checkpoint(base, towers="both")[0].state_dict()
     for tower in ("frozen", "stored"):
-        train_stage1(without_text_training(tower), base, tmp_path / tower)
-        found[tower] = [row["loss"] for row in read_json_lines(tmp_path / tower / "metrics.jsonl") if "loss" in row]
-        weights, before = (load_checkpoint(folder, towers="both")[0] for folder in (tmp_path / tower, base["base"]))
-        start = before.state_dict()
+        train_stage1(without_text_training(tower), given, tmp_path / tower)
+        weights = load_checkpoint(tmp_path / tower, towers="both")[0]
         changed = {name for name, value in weights.state_dict().items() if not torch.equal(value, start[name])}
         assert changed and not any(weights.is_text_parameter(name) or "action" in name for name in changed)
-    assert found["stored"] == pytest.approx(found["frozen"], rel=1e-4)
-    with killed_after(2):
-        train_stage1(without_text_training("stored"), base, tmp_path / "killed")
-    train_stage1(without_text_training("stored"), base, tmp_path / "killed")
+    assert losses(tmp_path / "stored") == pytest.approx(losses(tmp_path / "frozen"), rel=1e-4)
+    with killed_after(1):
+        train_stage1(without_text_training("stored"), given, tmp_path / "killed")
+    train_stage1(without_text_training("stored"), given, tmp_path / "killed")
     files = [tmp_path / name / "model.safetensors" for name in ("killed", "stored")]
     assert files[0].read_bytes() == files[1].read_bytes()
-    monkeypatch.setattr(stored_text, "MOST_BYTES", 1000)
+    monkeypatch.setattr(stage1_module, "MOST_BYTES", 1000)
     for tower, inputs, message in (
-        ("stored", base, r"too much to keep[\s\S]*8 prompts of up to 7 tokens[\s\S]*text_tower to frozen"),
-        ("frozen", world_alone(base), r"comes from a checkpoint[\s\S]*--input base=FOLDER"),
+        ("stored", given, r"too much to keep[\s\S]*8 prompts of up to 7 tokens[\s\S]*text_tower to frozen"),
+        ("frozen", world.inputs, r"comes from a checkpoint[\s\S]*--input base=FOLDER"),
     ):
         with pytest.raises(ConfigError, match=message):
             train_stage1(without_text_training(tower), inputs, tmp_path / "refused")
     with pytest.raises(ValidationError, match="set text_tower to frozen"):
         stage1(trainer=trainer(1), lora={})
-
-
-def world_alone(inputs):
-    return {name: folder for name, folder in inputs.items() if name != "base"}
 
 
 def test_bytes_are_what_the_shipped_checkpoints_were_trained_on():

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -169,28 +169,20 @@ def boundary_loss(
     return ((step_predicted - step_target) ** 2).mean()
 
 
-class MaskedBatch(Protocol):
-    """Views of a batch, and where the robot is in them."""
-
-    @property
-    def views(self) -> Sequence[str]: ...
-    @property
-    def mask(self) -> Float[Tensor, "b v t h w"]: ...
-
-
 def auxiliary_losses(
     predicted: Float[Tensor, "b v c t h w"],
     target: Float[Tensor, "b v c t h w"],
-    batch: MaskedBatch,
+    mask: Float[Tensor, "b v t h w"],
+    views: Sequence[str],
     block_size: int,
     weights: AuxiliaryWeights,
     perceptual: PerceptualDistance | None = None,
 ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
     """Weighted sum of all auxiliaries of `predicted` against `target`, and the plain value of each for the metrics.
 
-    Both clips hold the observed frame. `perceptual` None leaves LPIPS out, which the caller reports.
+    Both clips hold the observed frame; `mask` is where the robot is in `views`. `perceptual` None leaves LPIPS out, which the caller reports.
     """
-    per_view = view_weights(batch.views).to(predicted)
+    per_view = view_weights(views).to(predicted)
     terms: dict[str, tuple[float, Tensor]] = {}
     if weights.anchor:
         terms["anchor"] = (weights.anchor, anchor_loss(predicted, target))
@@ -199,9 +191,9 @@ def auxiliary_losses(
     if weights.lpips and perceptual is not None:
         terms["lpips"] = (weights.lpips, perceptual(predicted, target))
     if weights.robot:
-        terms["robot"] = (weights.robot, robot_reconstruction_loss(predicted, target, batch.mask, per_view))
+        terms["robot"] = (weights.robot, robot_reconstruction_loss(predicted, target, mask, per_view))
     if weights.robot_motion:
-        terms["robot_motion"] = (weights.robot_motion, robot_motion_loss(predicted, target, batch.mask, per_view))
+        terms["robot_motion"] = (weights.robot_motion, robot_motion_loss(predicted, target, mask, per_view))
     total = (predicted * 0.0).sum()
     for weight, value in terms.values():
         total = total + weight * value

@@ -9,8 +9,6 @@ Axes: b clips, v views, c latent channels, t latent frames, h and w rows and col
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,11 +23,9 @@ from worldline_core.distillation.causal_objective import (
 )
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.rollout.samplers import euler_step
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import add_noise, flow_matching_loss
-from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 
 class TeacherForcingObjective(CausalObjective[Batch]):
@@ -45,26 +41,23 @@ class TeacherForcingObjective(CausalObjective[Batch]):
         self.teacher = None if teacher is None else teacher.eval().requires_grad_(False)
 
     def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Teacher-forcing loss of one batch."""
-        settings, latents, history = self.settings, batch.latents, None
+        """Flow-matching loss of every block, given the clean blocks that the window keeps before it.
+
+        Raises: DataError: the clip does not divide into blocks.
+        """
+        settings, size, latents = self.settings, self.spec.block_size, batch.latents
+        history = latents
         if settings.history_noise or settings.history == "generated" or self.teacher is not None:
             noise = torch.randn(latents.shape, generator=generator, device=latents.device)
-            latents = self.target(batch, noise)
-            history = self.history(batch, noise, generator)
-        loss = teacher_forcing_loss(
-            self.model,
-            latents,
-            maps_of(batch),
-            history=history,
-            views=batch.views,
-            fps=batch.fps,
-            spec=self.spec,
-            sampling=settings.sigma,
-            weighting=settings.weighting,
-            weights=batch.weights,
-            generator=generator,
+            latents, history = self.target(batch, noise), self.history(batch, noise, generator)
+        sigma = block_sigmas(settings.sigma, len(latents), latents.shape[3], size, generator).to(latents)
+        noise = torch.randn(latents.shape, generator=generator, device=generator.device).to(latents)
+        levels = frame_sigmas(sigma, size)
+        noisy = add_noise(latents, noise, levels)
+        velocity = self.model.forward_teacher_forcing(
+            noisy, history, sigma, action_maps=maps_of(batch), spec=self.spec, views=batch.views, fps=batch.fps
         )
-        return loss, {}
+        return flow_matching_loss(velocity, latents, noise, levels, settings.weighting, weights=batch.weights), {}
 
     def target(self, batch: Batch, noise: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b v c t h w"]:
         """Target of the blocks: the recording, in part what the teacher predicts in one step from this noise."""
@@ -94,42 +87,3 @@ class TeacherForcingObjective(CausalObjective[Batch]):
         maps = maps_of(batch)[..., :-size, :, :]
         generated = self.rollout(batch, maps, noise[..., :-size, :, :], self.spec.steps - 1, with_gradient=False)
         return torch.cat((generated.to(latents), latents[..., -size:, :, :]), dim=3)
-
-
-def teacher_forcing_loss(
-    model: WorldModel,
-    latents: Float[Tensor, "b v c t h w"],
-    action_maps: Float[Tensor, "b v a t #h #w"] | None,
-    *,
-    history: Float[Tensor, "b v c t h w"] | None = None,
-    views: Sequence[str],
-    fps: Float[Tensor, " b"] | None = None,
-    spec: CausalSpec,
-    sampling: SigmaSampling,
-    weighting: LossWeighting,
-    weights: Float[Tensor, "b v 1 t h w"] | None = None,
-    generator: torch.Generator,
-) -> Float[Tensor, ""]:
-    """Flow-matching loss of every block of `latents`, given the clean blocks that `spec` keeps before it.
-
-    Args:
-        history: clean blocks the model sees instead of `latents` themselves.
-        weights: further ones of the squared error, as `Batch` carries them.
-
-    Raises:
-        DataError: the clip does not divide into blocks.
-    """
-    sigma = block_sigmas(sampling, len(latents), latents.shape[3], spec.block_size, generator)
-    noise = torch.randn(latents.shape, generator=generator, device=generator.device)
-    sigma, noise = sigma.to(latents), noise.to(latents)
-    levels = frame_sigmas(sigma, spec.block_size)
-    velocity = model.forward_teacher_forcing(
-        add_noise(latents, noise, levels),
-        latents if history is None else history,
-        sigma,
-        action_maps=action_maps,
-        spec=spec,
-        views=views,
-        fps=fps,
-    )
-    return flow_matching_loss(velocity, latents, noise, levels, weighting, weights=weights)

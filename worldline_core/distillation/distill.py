@@ -24,15 +24,15 @@ from worldline_core.distillation.causal_objective import CausalObjective
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
-from worldline_core.distillation.teacher_trajectories import (
+from worldline_core.distillation.trajectory_regression import (
     INDEX,
     TrajectoryBatch,
     TrajectoryLoader,
+    TrajectoryObjective,
     TrajectoryStore,
     trajectory_shard,
     write_trajectories,
 )
-from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import (
     CheckpointInfo,
@@ -241,8 +241,9 @@ class DistillationRun:
 
     def _sampler(self, trainer: TrainerConfig, clips: ClipSampling, plan: BatchPlan) -> ClipSampler:
         """Clips of the training splits."""
+        rows = [row for row in self.rows if row.split in self.config.splits]
         return ClipSampler(
-            self.rows, clips, views=self.config.views, splits=self.config.splits, start_step=self.source.start_step,
+            rows, clips, views=self.config.views, start_step=self.source.start_step,
             batch_size=trainer.batch_size, seed=trainer.seed, plan=plan, vector_share=self.vector_share,
         )  # fmt: skip
 
@@ -296,7 +297,9 @@ class DistillationRun:
         if (folder / "checkpoint.json").is_file() and log.is_file():
             return {f"{step}/{name}": value for name, value in read_checkpoint_info(folder).metadata["metrics"].items()}
         config, work, model = self.config, self._work(step), objective.model
-        held_out = HeldOutClips(config, self.loader, self.rows, self.episodes, self.vector_share)
+        held_out = HeldOutClips(
+            config.clips, config.validation_splits, self.loader, self.rows, self.episodes, self.vector_share
+        )
         sampler = self._sampler(trainer, config.clips, ALONE)
         result = train(
             trainer,
@@ -320,7 +323,7 @@ class DistillationRun:
                 "config": config.model_dump(mode="json"),
                 "parent": parent.weights_sha256,
                 "stage2": self.info.weights_sha256,
-                "episodes": [row.identity() for row in self.rows],
+                "episodes": [vars(row) for row in self.rows],
             },
             title=step.replace("_", " "),
             models=(model, *(other for _, other in others)),

@@ -28,7 +28,7 @@ from worldline_core.distillation.causal_objective import (
     with_observed_frame,
 )
 from worldline_core.distillation.distill_config import CYCLE, DistillConfig
-from worldline_core.distillation.teacher_trajectories import TrajectoryBatch
+from worldline_core.distillation.trajectory_regression import TrajectoryBatch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import add_noise, flow_matching_loss
@@ -78,7 +78,7 @@ class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
         gradient = distribution_gradient(full_clip_score(self.real, batch), fake, generated, fresh, levels)
         matching = distribution_matching_loss(generated, gradient)
         auxiliary, values = auxiliary_losses(
-            generated, target, batch, self.spec.block_size, self.settings.auxiliary, self.perceptual
+            generated, target, batch.mask, batch.views, self.spec.block_size, self.settings.auxiliary, self.perceptual
         )
         measured = {"distribution_matching": matching, **values}
         return matching + auxiliary, {name: value.item() for name, value in measured.items()}

@@ -25,8 +25,7 @@ from worldline_core.distillation.causal_objective import maps_of
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import CYCLE, DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
-from worldline_core.distillation.teacher_trajectories import TrajectoryBatch, teacher_trajectories
-from worldline_core.distillation.trajectory_regression import TrajectoryObjective
+from worldline_core.distillation.trajectory_regression import TrajectoryBatch, TrajectoryObjective, teacher_trajectories
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import read_checkpoint_info
 from worldline_core.model.lpips import LPIPS

@@ -11,12 +11,9 @@ from pydantic import AfterValidator, BeforeValidator, ByteSize, Field, model_val
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import ImageSize, StrictModel
 
-JOINT = "joint"
-"""In place of a view's name: all views of the model together."""
-SUBSET = "subset"
-"""In place of a view's name: some of an episode's views, the first one among them (view dropout)."""
-PRIMARY = "primary"
-"""In place of a view's name: the task-facing view of each episode (Stage I)."""
+JOINT, SUBSET, PRIMARY = "joint", "subset", "primary"
+"""In place of a view's name: all views of the model together; some of an episode's views, the first one among them (view dropout);
+the task-facing view of each episode (Stage I)."""
 
 
 def view_subsets(views: Sequence[str]) -> list[tuple[str, ...]]:
@@ -52,11 +49,7 @@ class ClipSampling(StrictModel):
     ``view_weights``: None trains all views of an episode jointly (Stage II); otherwise what a step trains on is drawn by these
     weights: "joint" (all views), "subset" (some of them, the first among them: such sets can then be predicted, too), the
     name of a view, or "primary" (each episode's own task-facing view; Stage I).
-    Steps on one view cost a fraction of joint ones and teach most of what controls look like: where compute is short,
-    a mixture learns faster. ``single_view_factor`` multiplies the batch of such steps.
-
-    A batch holds clips of episodes that have the same views, so that nothing is padded and a clip is trained as it would be
-    alone.
+    ``single_view_factor``: multiplies the batch of steps on one view, which cost a fraction of joint ones.
     """
 
     lengths: Annotated[tuple[ClipFrames, ...], BeforeValidator(_expand_range)] = Field(default=(33,), min_length=1)
@@ -71,19 +64,16 @@ class ClipSampling(StrictModel):
         return tuple(view for view in views if drawn & {JOINT, SUBSET, view})
 
 
-Workers = Annotated[int, Field(ge=0)]
-"""Processes that read two micro-batches ahead each; 0 reads in the training process when a batch is needed."""
-
-
 class LatentInput(StrictModel):
     """Latents cached by encode_latents.
 
+    ``workers``: processes that read two micro-batches ahead each; 0 reads in the training process when a batch is needed.
     ``resident``: keep latents, action tracks and shares of things of all episodes on the training device, for sets that fit
     there: a small model then never waits for reading.
     """
 
     kind: Literal["latents"] = "latents"
-    workers: Workers = 0
+    workers: int = Field(default=0, ge=0)
     resident: bool = False
 
     @model_validator(mode="after")
@@ -97,10 +87,11 @@ class FrameInput(StrictModel):
     """Frames straight from the EpisodeSet, which the tokenizer encodes during training.
 
     ``image_size``: (H, W) that frames are resized to, as in encode_latents. ``start_step``: clips start at multiples of it.
+    ``workers``: as for latents.
     """
 
     kind: Literal["frames"] = "frames"
-    workers: Workers = 0
+    workers: int = Field(default=0, ge=0)
     image_size: ImageSize = (64, 96)
     start_step: int = Field(default=1, ge=1)
 

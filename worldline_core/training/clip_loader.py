@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import count
 
@@ -81,18 +81,15 @@ class ClipLoader:
 
     Attributes:
         source: where clips are read from. With resident latents, action tracks are resident, too.
-        views: the model's slots.
         tracks: controls; the maps get the width that the tracks were made for.
         text: turns instructions into ids; its prompts may name a clip's duration and size.
         frame_rates: of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own rate.
         action_frames: control frames that a latent frame takes.
         native_size: of the control vectors of a model that takes these.
-        maps: the model takes maps.
         object_weights: loss weights of clips, given their recorded views; None: all places count alike.
     """
 
     source: ClipSource
-    _: KW_ONLY
     views: tuple[str, ...]
     tracks: ActionTracks | None = None
     text: TextEncoder | None = None
@@ -114,8 +111,7 @@ class ClipLoader:
         """Returns a function from the number of a micro-step to its batch. It raises as `load`, and TrainingError where one of the
         ``workers``, processes that read ahead, has ended. Another order than the numbers' own starts reading anew.
 
-        Raises:
-            ConfigError: the source has no clips of this length.
+        Raises: ConfigError: the source has no clips of this length.
         """
         self.source.require_length(sampler.longest, "clips.lengths")
         if self.source.resident or not workers:
@@ -155,22 +151,19 @@ class ClipLoader:
         """Latents of a batch's clips, with the conditions that this loader adds. Raises: ArtifactError: the tracks lack an episode."""
         clips, views = batch.clips, batch.views
         ids = mask = fps = weights = None
+        facts = [self.clip_facts(clip) for clip in clips] if self.frame_rates else []
         if self.text is not None:
-            facts = [self.clip_facts(clip) for clip in clips]
-            ids, mask = self.text([self.source.row(clip.episode_id).instruction for clip in clips], facts)
-            ids, mask = (on_device(values, self.device) for values in (ids, mask))
-        if self.frame_rates:
-            fps = on_device(np.array([self._rate(clip) for clip in clips], np.float32), self.device)
+            texts = [self.source.row(clip.episode_id).instruction for clip in clips]
+            ids, mask = (on_device(values, self.device) for values in self.text(texts, facts))
+        if facts:
+            fps = on_device(np.array([fact.fps for fact in facts], np.float32), self.device)
         if self.object_weights is not None:
             weights = self.object_weights(clips, self.source.recorded_views(batch))
         return Batch(clips, views, latents, self.action_maps(clips, views), ids, mask, frames, fps, weights)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
         """Facts that a prompt may state about a clip; a stride lowers its rate."""
-        return ClipFacts(clip.num_frames, self._rate(clip), self.source.image_size)
-
-    def _rate(self, clip: Clip) -> float:
-        return self.frame_rates[clip.episode_id] / clip.stride
+        return ClipFacts(clip.num_frames, self.frame_rates[clip.episode_id] / clip.stride, self.source.image_size)
 
     def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v a t h w"] | None:
         """Controls that each latent frame takes (docs/method.md section 2): in each view the map at latent resolution, or the

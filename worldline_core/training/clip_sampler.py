@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress, product
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -23,10 +23,8 @@ LEAST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Clip:
-    """``num_frames`` frames at ``start``, ``start + stride``, ... of an episode.
-
-    ``vectors``: views that take control vectors though their cameras may be known.
-    """
+    """``num_frames`` frames at ``start``, ``start + stride``, ... of an episode. ``vectors``: views that take control vectors
+    though their cameras may be known."""
 
     episode_id: str
     start: int
@@ -80,15 +78,10 @@ class ClipRow:
         named = {name: getattr(row, name) for name in copied}
         return cls(num_frames=row.video_frames, views=tuple(views), shard=shard, **named)
 
-    def identity(self) -> list[Any]:
-        """JSON values that clips are drawn by: two runs whose rows differ here train on other clips."""
-        return [self.episode_id, self.num_frames, list(self.views), self.source, self.split, self.instruction]
-
 
 def longest_clip(num_frames: int, start: int, stride: int) -> int:
     """Most frames, 4 k + 1, of a clip at ``start`` with ``stride`` in an episode of ``num_frames``."""
-    steps = (num_frames - 1 - start) // stride
-    return 1 + TEMPORAL_FACTOR * (steps // TEMPORAL_FACTOR)
+    return 1 + TEMPORAL_FACTOR * ((num_frames - 1 - start) // (TEMPORAL_FACTOR * stride))
 
 
 @dataclass(frozen=True)
@@ -106,15 +99,11 @@ class ClipSampler:
     """Draws batches of clips of one length, stride and set of views. Every process draws the same and takes its own part.
 
     Args:
-        rows: the episodes to draw from, of those in ``splits``.
         views: the model's slots.
         start_step: clips start at multiples of it.
-        batch_size: clips of a micro-batch.
-        plan: which micro-batches are this process's, and how many are drawn as one.
         vector_share: how often a view of a clip takes the control vector, whether its camera is known or not.
 
-    Raises:
-        DataError: no episode is long enough for any clip.
+    Raises: DataError: no episode is long enough for any clip.
     """
 
     def __init__(
@@ -123,39 +112,38 @@ class ClipSampler:
         config: ClipSampling,
         *,
         views: Sequence[str],
-        splits: Sequence[str],
         start_step: int,
         batch_size: int,
         seed: int,
         plan: BatchPlan = ALONE,
         vector_share: float = 0.0,
     ) -> None:
-        self.vector_share = vector_share
+        self.vector_share, self.single_view_factor = vector_share, config.single_view_factor
         self.views, self.start_step, self.batch_size, self.seed, self.plan = views, start_step, batch_size, seed, plan
-        self.single_view_factor = config.single_view_factor
         self._view_weights = dict(sorted((config.view_weights or {JOINT: 1.0}).items()))
-        candidates = [row for row in rows if row.split in splits]
-        slots = {row.episode_id: tuple(view for view in views if view in row.views) for row in candidates}
-        row_weights = {row.episode_id: config.source_weights.get(row.source, 1.0) for row in candidates}
+        slots = {row.episode_id: tuple(view for view in views if view in row.views) for row in rows}
+        row_weights = {row.episode_id: config.source_weights.get(row.source, 1.0) for row in rows}
         self._kinds: list[_Kind] = []
         kind_weights: list[float] = []
         for length, stride in product(config.lengths, config.strides):
-            fitting = [row for row in candidates if longest_clip(row.num_frames, 0, stride) >= length]
+            fitting = [row for row in rows if longest_clip(row.num_frames, 0, stride) >= length]
             total = sum(row_weights[row.episode_id] for row in fitting)
             for shared in sorted({slots[row.episode_id] for row in fitting}, reverse=True):
                 alike = [row for row in fitting if slots[row.episode_id] == shared]
                 weights = [row_weights[row.episode_id] for row in alike]
                 if sum(weights) > 0:
-                    self._kinds.append(_Kind(length, stride, shared, alike, np.cumsum(_normalised(weights))))
+                    self._kinds.append(
+                        _Kind(length, stride, shared, alike, np.cumsum(np.divide(weights, np.sum(weights))))
+                    )
                     kind_weights.append(sum(weights) / total)
         if not self._kinds:
-            longest = max((row.num_frames for row in candidates), default=0)
+            longest = max((row.num_frames for row in rows), default=0)
             raise DataError(
-                "No episode is long enough for any clip length.", where=f"clips of the splits {list(splits)}",
+                "No episode is long enough for any clip length.", where="clips and splits of the step",
                 expected=f"clips of {config.lengths} frames at strides {config.strides}",
-                got=f"{len(candidates)} episodes, the longest with {longest} frames",
+                got=f"{len(rows)} episodes, the longest with {longest} frames",
             )  # fmt: skip
-        self._kind_weights = _normalised(kind_weights)
+        self._kind_weights = np.divide(kind_weights, np.sum(kind_weights))
         self.longest = max(kind.length for kind in self._kinds)
         """Frames of the longest clips that are drawn."""
 
@@ -187,7 +175,8 @@ class ClipSampler:
         sets = {PRIMARY: [(self.views[0],)], **{view: [(view,)] for view in views}}
         if views:
             sets |= {JOINT: [views], SUBSET: view_subsets(views)}
-        shares = _normalised([weight * (name in sets) for name, weight in self._view_weights.items()])
+        weights = [weight * (name in sets) for name, weight in self._view_weights.items()]
+        shares = np.divide(weights, np.sum(weights))
         return [(name, share, sets.get(name, [])) for name, share in zip(self._view_weights, shares, strict=True)]
 
     def view_sets(self, slots: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
@@ -204,8 +193,3 @@ class ClipSampler:
         strides = tuple(sorted({kind.stride for kind in self._kinds}))
         found = TrainedClips(view_sets=self.view_sets(slots), strides=strides)
         return None if found == TrainedClips(view_sets=(slots,), strides=(1,)) else found
-
-
-def _normalised(weights: Sequence[float]) -> np.ndarray:
-    values = np.asarray(weights, dtype=np.float64)
-    return values / values.sum()

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -48,7 +47,7 @@ INDEX, DESCRIPTION = "index.parquet", "store.json"
 _VIEWS_LEFT_OUT = "views without a camera, which take train_stage2.native_size, in"
 
 
-class ClipSource(Dataset[Tensor | WorldLineError], ABC):
+class ClipSource(Dataset[Tensor | WorldLineError]):
     """Episodes whose clips can be read, in any process (an item of this dataset is a batch), and made into latents where a model is.
 
     Attributes:
@@ -58,6 +57,7 @@ class ClipSource(Dataset[Tensor | WorldLineError], ABC):
         image_size: (H, W) of the frames that the latents are of.
         clip_frames: most frames of a clip; None: all that the episode has.
         description: at least ``tokenizer`` (its fingerprint).
+        resident: clips are kept on the training device.
     """
 
     root: Path
@@ -66,6 +66,7 @@ class ClipSource(Dataset[Tensor | WorldLineError], ABC):
     image_size: tuple[int, int]
     clip_frames: int | None = None
     description: dict[str, Any]
+    resident = False
 
     def __init__(self, rows: Sequence[ClipRow]) -> None:
         self.rows = list(rows)
@@ -88,9 +89,6 @@ class ClipSource(Dataset[Tensor | WorldLineError], ABC):
                 got=f"{frames} frames", next_step=f"set encode_latents.clip_frames to {frames} and encode again, or ask for shorter ones",
             )  # fmt: skip
 
-    resident = False
-    """True where clips are kept on the training device."""
-
     def __getitem__(self, batch: ClipBatch) -> Tensor | WorldLineError:
         """As `read_batch`, but an error is an item like any other, and reaches the training process as it is."""
         try:
@@ -98,14 +96,9 @@ class ClipSource(Dataset[Tensor | WorldLineError], ABC):
         except WorldLineError as error:
             return error
 
-    @abstractmethod
     def read(self, clip: Clip, views: tuple[str, ...]) -> Shaped[Tensor, "v ..."]:
-        """Some views of a clip.
-
-        Raises:
-            DataError: the clip is damaged; the message names it, and where it is of frames the view and the file.
-            ArtifactError: the clip does not belong to this source.
-        """
+        """Some views of a clip. Raises: DataError: the clip is damaged; ArtifactError: it does not belong to this source."""
+        raise NotImplementedError
 
     def recorded_views(self, batch: ClipBatch) -> list[tuple[str, ...]]:
         """The recorded views that fill each clip's slots: the task-facing one has a name of its own."""
@@ -140,9 +133,7 @@ class LatentStore(ClipSource):
     def __init__(self, root: Path, description: dict[str, Any], rows: Sequence[ClipRow]) -> None:
         super().__init__(rows)
         self.root, self.description = root, description
-        self.layout: Layout = description["layout"]
         self.start_step = description["start_step"]
-        self.strides: tuple[int, ...] = tuple(description["strides"])
         self.latent_shape = tuple(description["latent_shape"])
         self.image_size = tuple(description["image_size"])
         self.clip_frames = description["clip_frames"]
@@ -179,7 +170,7 @@ class LatentStore(ClipSource):
     def _parts(self, clip: Clip) -> list[tuple[str, int, int]]:
         """Tensors that a clip's latent frames are in, in order: (name, first latent frame, stop)."""
         frames = len(latent_frame_indices(clip.num_frames))
-        if self.layout == "clips":
+        if self.description["layout"] == "clips":
             return [(latent_key(clip.episode_id, "clips", clip.stride, clip.start), 0, frames)]
         index = clip.start // self.start_step
         single = (latent_key(clip.episode_id, "single"), index, index + 1)
@@ -193,8 +184,11 @@ class LatentStore(ClipSource):
         row = self.row(clip.episode_id)
         most = self.clip_frames or row.num_frames
         fits = clip.start >= 0 and clip.num_frames <= min(longest_clip(row.num_frames, clip.start, clip.stride), most)
-        if clip.stride not in self.strides or not fits or clip.start % self.start_step or not {*views} <= {*row.views}:
-            held = f"strides {self.strides}, a start divisible by {self.start_step}, at most {most} of {row.num_frames} frames"
+        strides = self.description["strides"]
+        if clip.stride not in strides or not fits or clip.start % self.start_step or not {*views} <= {*row.views}:
+            held = (
+                f"strides {strides}, a start divisible by {self.start_step}, at most {most} of {row.num_frames} frames"
+            )
             raise ArtifactError(
                 "The latents do not hold this clip.", where=self.root, expected=f"{held}, views {row.views}",
                 got=f"{clip}, views {views}", next_step="encode the latents with these settings, or ask for other clips",
@@ -262,12 +256,16 @@ class ResidentLatents(LatentStore):
         return place + first, frames
 
 
+@cache
+def decoder() -> FrameDecoder:
+    """This process's decoder of clips, which keeps files open."""
+    return FrameDecoder()
+
+
 class FrameSource(ClipSource):
     """Frames of an EpisodeSet, decoded and encoded when they are needed.
 
-    Raises:
-        CheckpointError: the folder holds no tokenizer.
-        ConfigError: it does not take pictures of this size.
+    Raises: CheckpointError: the folder holds no tokenizer. ConfigError: it does not take pictures of this size.
     """
 
     def __init__(self, episodes: EpisodeSet, tokenizer: Path, config: FrameInput, device: str = "cpu") -> None:
@@ -287,14 +285,7 @@ class FrameSource(ClipSource):
 
     def __getstate__(self) -> dict[str, Any]:
         # Loader processes read frames: they open files themselves and have no use for the tokenizer.
-        episodes = EpisodeSet(self.episodes.root, self.episodes.rows)
-        own = {name: value for name, value in self.__dict__.items() if name != "decoder"}
-        return {**own, "episodes": episodes, "_tokenizer": None}
-
-    @cached_property
-    def decoder(self) -> FrameDecoder:
-        """This process's decoder."""
-        return FrameDecoder()
+        return {**self.__dict__, "episodes": EpisodeSet(self.root, self.episodes.rows), "_tokenizer": None}
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> UInt8[Tensor, "v n h w 3"]:
         """The clip's frames at the training size, RGB."""
@@ -303,7 +294,7 @@ class FrameSource(ClipSource):
         for pictures, view in zip(frames, views, strict=True):
             try:
                 video = self.episodes.clip(position, view)
-                for target, picture in zip(pictures, self.decoder.frames(video, clip.frames), strict=True):
+                for target, picture in zip(pictures, decoder().frames(video, clip.frames), strict=True):
                     resize_frame(picture, self.image_size, out=target)
             except DataError as error:
                 raise DataError(
@@ -326,24 +317,16 @@ class FrameSource(ClipSource):
         return rearrange(torch.stack(encoded).float(), "(b v) c t h w -> b v c t h w", b=read.shape[0])
 
 
-@dataclass(frozen=True)
-class LoadedView:
-    """One view of one episode at the training size; ``name`` is episode/view."""
-
-    name: str
-    frames: UInt8[Tensor, "3 n h w"]
-
-
 def load_views(
     episodes: EpisodeSet, positions: Sequence[int], image_size: tuple[int, int], minimum: int
-) -> list[LoadedView]:
-    """All views, in memory, of those episodes with ``minimum`` frames or more. Raises: DataError: there is none."""
-    views: list[LoadedView] = []
-    for position in with_progress(positions, "reading episodes", "episode"):
-        row = episodes.rows[position]
-        for view in row.views if row.video_frames >= minimum else ():
-            frames = resized_video(VideoFrames(episodes.clip(position, view)), image_size)
-            views.append(LoadedView(f"{row.episode_id}/{view}", frames))
+) -> list[tuple[str, UInt8[Tensor, "3 n h w"]]]:
+    """All views, named episode/view, of those episodes with ``minimum`` frames or more. Raises: DataError: there is none."""
+    views = [
+        (f"{row.episode_id}/{view}", resized_video(VideoFrames(episodes.clip(position, view)), image_size))
+        for position in with_progress(positions, "reading episodes", "episode")
+        if (row := episodes.rows[position]).video_frames >= minimum
+        for view in row.views
+    ]
     if not views:
         raise DataError("No episode is long enough to train on", where=episodes.root, expected=f">= {minimum} frames")
     return views
@@ -364,22 +347,20 @@ def training_rows(
     Stage I needs the task-facing view. Stage II needs controls and one of ``views``; without ``vectors`` (the model knows control
     vectors) one with a camera, and its clips show no others.
 
-    Raises:
-        DataError: if none is left.
+    Raises: DataError: none is left.
     """
     held = {row.episode_id: row for row in source.rows}
     rows, left_out = list[ClipRow](), Counter[str]()
     for episode in episodes.rows:
         row, controlled = held.get(episode.episode_id), tracks is None or episode.episode_id in tracks
-        shown = () if row is None else row.views
-        if tracks is not None and controlled and not vectors:
-            calibrated = tracks.calibrated_views(episode.episode_id)
-            shown = tuple(view for view in shown if view in calibrated)
-        by_vector = vectors and episode.stage2_reason == "missing_calibration"
+        known = None if vectors or tracks is None or not controlled else tracks.calibrated_views(episode.episode_id)
+        shown = tuple(view for view in (row.views if row else ()) if known is None or view in known)
+        without_camera = vectors and episode.stage2_reason == "missing_calibration"
+        fit = episode.stage1_ok if stage == 1 else episode.stage2_ok or without_camera
         wanted = {episode.primary_view} if stage == 1 else {*views}
         if outcomes is not None and episode.outcome not in outcomes:
             left_out[f"outcome {episode.outcome}"] += 1
-        elif not (episode.stage1_ok if stage == 1 else episode.stage2_ok or by_vector):
+        elif not fit:
             left_out[(stage == 2 and episode.stage2_reason) or f"not fit for Stage {stage}"] += 1
         elif row is None:
             left_out[f"split {episode.split}: not among the clips"] += 1
@@ -399,11 +380,9 @@ def training_rows(
             next_step="docs/filters.md says what each reason asks for; other episodes are in the quarantine tables of earlier steps",
         )  # fmt: skip
     if reasons:
-        unexpected = left_out["no controls"] or left_out[_VIEWS_LEFT_OUT]
-        logger.log(
-            logging.WARNING if unexpected else logging.INFO,
-            "Stage %d: clips of %d of %d episodes; left out: %s.", stage, len(rows), len(episodes), reasons,
-        )  # fmt: skip
+        level = logging.WARNING if left_out["no controls"] or left_out[_VIEWS_LEFT_OUT] else logging.INFO
+        counts = stage, len(rows), len(episodes), reasons
+        logger.log(level, "Stage %d: clips of %d of %d episodes; left out: %s.", *counts)
     return rows
 
 

@@ -11,7 +11,6 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -124,26 +123,7 @@ class RelationalScales:
             self.ratios[name] = self.config.ema_decay * before + (1 - self.config.ema_decay) * ratio
 
 
-class ClipSimilarities(Protocol):
-    """Source of the teacher's similarity matrices of clips."""
-
-    def similarities(
-        self,
-        clips: Sequence[Clip],
-        views: Sequence[str],
-        grid: tuple[int, int, int],
-        frames: UInt8[Tensor, "b v n height width 3"] | None = None,
-    ) -> SimilarityMatrices:
-        """Similarity matrices of every clip.
-
-        Args:
-            grid: the student's (t, h, w) of these clips.
-            frames: frames of these clips where they are at hand.
-        """
-        ...
-
-
-class TeacherSimilarities(ClipSimilarities):
+class TeacherSimilarities:
     """The teacher's similarity matrices, computed from the recordings' frames and kept in memory."""
 
     def __init__(self, teacher: VideoTeacher, episodes: Path, config: RelationalConfig) -> None:
@@ -159,6 +139,12 @@ class TeacherSimilarities(ClipSimilarities):
         grid: tuple[int, int, int],
         frames: UInt8[Tensor, "b v n height width 3"] | None = None,
     ) -> SimilarityMatrices:
+        """Similarity matrices of every clip.
+
+        Args:
+            grid: the student's (t, h, w) of these clips.
+            frames: frames of these clips where they are at hand.
+        """
         given = [None] * len(clips) if frames is None else list(frames)
         each = [self._clip(clip, tuple(views), grid, read) for clip, read in zip(clips, given, strict=True)]
         # Half precision does not survive a concatenation under CPU autocast.
@@ -194,7 +180,7 @@ class TeacherSimilarities(ClipSimilarities):
 class RelationalTerm:
     """Weighted relational losses of a student's middle block, with running scales."""
 
-    def __init__(self, config: RelationalConfig, teacher: ClipSimilarities, num_layers: int) -> None:
+    def __init__(self, config: RelationalConfig, teacher: TeacherSimilarities, num_layers: int) -> None:
         self.config = config
         self.teacher = teacher
         self.layer = config.student_layer or max(1, num_layers // 2)

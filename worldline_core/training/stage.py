@@ -121,10 +121,9 @@ class Stage:
         """Sampler of the clips of every micro-step."""
         trainer = self.config.trainer
         return ClipSampler(
-            self.rows,
+            self.training_rows,
             self.config.clips,
             views=self.model.config.views,
-            splits=self.config.splits,
             start_step=self.source.start_step,
             batch_size=trainer.batch_size,
             seed=trainer.seed,
@@ -155,7 +154,9 @@ class Stage:
 
     def held_out(self, loader: ClipLoader) -> HeldOutClips:
         """Clips that the run is measured on."""
-        return HeldOutClips(self.config, loader, self.rows, self.episodes, self.vector_share)
+        return HeldOutClips(
+            self.config.clips, self.config.validation_splits, loader, self.rows, self.episodes, self.vector_share
+        )
 
     def train(
         self,
@@ -183,7 +184,7 @@ class Stage:
                 "config": config.model_dump(mode="json"),
                 "start": self.start,
                 "tokenizer": self.source.description["tokenizer"],
-                "episodes": [row.identity() for row in self.rows],
+                "episodes": [vars(row) for row in self.rows],
             },
             title=self.title,
             models=(self.model,),
@@ -261,20 +262,12 @@ class MeasuredObjective(ClipPredictor, Protocol):
     def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]: ...
 
 
-class HeldOutConfig(Protocol):
-    """Settings of held-out clips, of a stage or of the distillation."""
-
-    @property
-    def clips(self) -> ClipSampling: ...
-    @property
-    def validation_splits(self) -> Sequence[str]: ...
-
-
 @dataclass(frozen=True)
 class HeldOutClips:
-    """Clips that a run is measured on."""
+    """Clips of ``splits`` that a run is measured on."""
 
-    config: HeldOutConfig
+    clips: ClipSampling
+    splits: Sequence[str]
     loader: ClipLoader
     rows: Sequence[ClipRow]
     episodes: EpisodeSet
@@ -286,7 +279,7 @@ class HeldOutClips:
         The clips are of recordings long enough for every length and stride that is trained; where there are none, of all, at the
         lengths and strides that fit. None where no clip fits. Both are logged.
         """
-        clips, splits = self.config.clips, self.config.validation_splits
+        clips, splits = self.clips, self.splits
         shortest, longest = ((pick(clips.lengths) - 1) * pick(clips.strides) + 1 for pick in (min, max))
         split_rows = [row for row in self.rows if row.split in splits and row.num_frames >= shortest]
         if not split_rows or not trainer.validation_batches:
@@ -308,7 +301,7 @@ class HeldOutClips:
         if clips.view_weights is not None and JOINT in clips.view_weights:
             clips = clips.model_copy(update={"view_weights": None})
         sampler = ClipSampler(
-            held_out, clips, views=self.loader.views, splits=splits, start_step=self.loader.source.start_step,
+            held_out, clips, views=self.loader.views, start_step=self.loader.source.start_step,
             batch_size=size, seed=VALIDATION_SEED, vector_share=self.vector_share,
         )  # fmt: skip
         load = self.loader.batches(sampler)
@@ -326,7 +319,7 @@ class HeldOutClips:
         """The measurement, where it is asked for, on views that ``sampler`` shows together."""
         if config is None:
             return None
-        rows = [row for row in self.rows if row.split in self.config.validation_splits]
+        rows = [row for row in self.rows if row.split in self.splits]
         return ActionFollowing(
             config, objective, self.loader, rows, self.episodes, tokenizer,
             view_sets=sampler.view_sets(self.loader.views), frames_per_unit=frames_per_unit, trainer=trainer,

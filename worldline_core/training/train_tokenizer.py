@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from einops import rearrange, repeat
 from jaxtyping import Float, UInt8
-from torch import Tensor, nn
+from torch import Tensor
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig, windows
@@ -31,10 +31,12 @@ from worldline_core.model.tokenizers import (
     tokenizer_fingerprint,
 )
 from worldline_core.store.atomic import write_json_atomic
-from worldline_core.training.clip_source import LoadedView, load_views
+from worldline_core.training.clip_source import load_views
 from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
 from worldline_core.training.training_config import TokenizerConfig
 
+Views = Sequence[tuple[str, Tensor]]
+"""Names, episode/view, and uint8 (3, n, h, w) frames of videos that are held in memory."""
 BASES = Path("run") / "bases"
 _SHORTEST = 5  # frames: a first frame and one group
 
@@ -63,20 +65,18 @@ class DrawnClip:
     picked: Float[Tensor, "3 t h w"]
 
 
-def drawn_clips(
-    views: Sequence[LoadedView], config: TokenizerConfig, step: int, temporal: int = 4
-) -> Iterator[DrawnClip]:
+def drawn_clips(views: Views, config: TokenizerConfig, step: int, temporal: int = 4) -> Iterator[DrawnClip]:
     """Clips of one step, a function of the step."""
     generator = np.random.default_rng((config.seed, 1, step))
     for _ in range(config.batch_size):
-        view = views[int(generator.integers(len(views)))]
-        count = view.frames.shape[1]
+        name, video = views[int(generator.integers(len(views)))]
+        count = video.shape[1]
         groups = min((count - 1) // temporal, (config.clip_frames - 1) // temporal)
         start = int(generator.integers(count - groups * temporal))
         picked = np.sort(generator.integers(groups, size=3))
-        frames = view.frames[:, start : start + 1 + groups * temporal]
+        frames = video[:, start : start + 1 + groups * temporal]
         index = [0, *(1 + group * temporal + k for group in picked for k in range(temporal))]
-        yield DrawnClip(view.name, frames, picked, to_video(frames[:, index]))
+        yield DrawnClip(name, frames, picked, to_video(frames[:, index]))
 
 
 def disturb(latents: Tensor, amount: float, generator: torch.Generator) -> Tensor:
@@ -113,7 +113,7 @@ class DecoderBatch:
 
 @torch.no_grad()
 def decoder_batch(
-    tokenizer: VideoTokenizer, views: Sequence[LoadedView], config: TokenizerConfig, step: int, *, small: bool = False
+    tokenizer: VideoTokenizer, views: Views, config: TokenizerConfig, step: int, *, small: bool = False
 ) -> DecoderBatch:
     """Clips of one step, coded and disturbed, for a patch tokenizer's own decoder or a small one; a function of the step."""
     clips = list(drawn_clips(views, config, step, tokenizer.temporal_compression))
@@ -166,47 +166,27 @@ class DecoderObjective(Objective[DecoderBatch]):
 
 
 def train_decoder(
-    tokenizer: PatchTokenizer, views: Sequence[LoadedView], config: TokenizerConfig, output: Path
+    decoder: Refinement | SmallDecoder, tokenizer: VideoTokenizer, views: Views, config: TokenizerConfig, output: Path
 ) -> None:
-    """Train the decoder in place (its average is kept); continues from ``output/run`` if training was cut short.
+    """Train a decoder of a tokenizer's latents in place (its average is kept): a patch tokenizer's own, or a small one, which
+    leaves the tokenizer as it is. Continues from ``output/run`` if training was cut short.
 
     Raises:
         TrainingError: the loss or the gradient is not finite.
     """
-    load = partial(decoder_batch, tokenizer, views, config)
-    begun = {"encoder": tokenizer.encoder_digest, "episodes": [view.name for view in views]}
-    _train(tokenizer.refinement, DecoderObjective(tokenizer.refine), load, config, output, begun)
-
-
-def train_small_decoder(
-    decoder: SmallDecoder,
-    tokenizer: VideoTokenizer,
-    views: Sequence[LoadedView],
-    config: TokenizerConfig,
-    output: Path,
-) -> None:
-    """As :func:`train_decoder`, for a decoder of this tokenizer's latents; the tokenizer stays as it is."""
-    objective = DecoderObjective(partial(decode_windows, decoder))
-    load = partial(decoder_batch, tokenizer, views, config, small=True)
-    begun = {"decoder": decoder.config.model_dump(mode="json"), "episodes": [view.name for view in views]}
-    _train(decoder, objective, load, config, output, begun)
-
-
-def _train(
-    decoder: nn.Module,
-    objective: DecoderObjective,
-    load: Callable[[int], DecoderBatch],
-    config: TokenizerConfig,
-    output: Path,
-    begun: Mapping[str, Any],
-) -> None:
+    begun: dict[str, Any] = {"episodes": [name for name, _ in views]}
+    if small := isinstance(decoder, SmallDecoder):
+        decode, begun["decoder"] = partial(decode_windows, decoder), decoder.config.model_dump(mode="json")
+    else:
+        own = cast("PatchTokenizer", tokenizer)
+        decode, begun["encoder"] = own.refine, own.encoder_digest
     decoder.train().requires_grad_(True)
     if config.steps:
         result = train(
             config.trainer,
             groups=[ParameterGroup("decoder", dict(decoder.named_parameters()))],
-            objective=objective,
-            load=load,
+            objective=DecoderObjective(decode),
+            load=partial(decoder_batch, tokenizer, views, config, small=small),
             output=output,
             identity={"config": config.model_dump(mode="json"), **begun},
             title="tokenizer",
@@ -216,17 +196,17 @@ def _train(
     decoder.eval().requires_grad_(False)
 
 
-def fitted_clips(config: TokenizerConfig, views: Sequence[LoadedView]) -> Iterator[Float[Tensor, "1 3 t h w"]]:
+def fitted_clips(config: TokenizerConfig, views: Views) -> Iterator[Float[Tensor, "1 3 t h w"]]:
     """Clips that linear parts are fitted to."""
     generator = np.random.default_rng(config.seed)
     for _ in range(config.fit_clips):
-        frames = views[int(generator.integers(len(views)))].frames
+        _, frames = views[int(generator.integers(len(views)))]
         length = min(config.clip_frames, 1 + (frames.shape[1] - 1) // 4 * 4)
         start = int(generator.integers(frames.shape[1] - length + 1))
         yield to_video(frames[None, :, start : start + length])
 
 
-def _fitted(config: TokenizerConfig, views: Sequence[LoadedView], folder: Path) -> PatchTokenizer:
+def _fitted(config: TokenizerConfig, views: Views, folder: Path) -> PatchTokenizer:
     """Bases fitted now, or by the call that was interrupted (eigenvectors are not the same bits on another machine)."""
     if not (folder / DESCRIPTION).is_file():
         fit_patch_tokenizer(
@@ -303,7 +283,7 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
         torch.manual_seed(config.seed)
         decoder = SmallDecoder(SmallDecoderConfig.of(encoder, name, **size), encoder).to(config.device)
         decoder.fit(fitted_clips(config, views))
-        train_small_decoder(decoder, encoder, views, config, output)
+        train_decoder(decoder, encoder, views, config, output)
         decoder.save(output, metadata)
         measured = {"held_out": SmallDecoder.load(output, encoder, name, config.device), "own_decoder": encoder}
     else:
@@ -312,7 +292,7 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
         tokenizer.refinement = Refinement(
             tokenizer.temporal_compression, config.refinement_width, config.refinement_depth
         )
-        train_decoder(tokenizer.to(config.device), views, config, output)
+        train_decoder(tokenizer.to(config.device).refinement, tokenizer, views, config, output)
         tokenizer.save(output, metadata)
         measured = {"held_out": PatchTokenizer.load(output).to(config.device)}
     if "held_out" in inputs:
@@ -320,13 +300,13 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     held_out = select_episodes(episodes, config.held_out_splits, config.held_out_episodes, config.seed)
     metrics: dict[str, Any] = dict(metadata)
     if held_out:
-        videos = [view.frames for view in load_views(episodes, held_out, config.image_size, _SHORTEST)]
+        videos = [video for _, video in load_views(episodes, held_out, config.image_size, _SHORTEST)]
         metrics["held_out_episodes"] = len(held_out)
         for name, codec in measured.items():
             metrics[name] = reconstruction_metrics(codec, videos, config.clip_frames, config.device)
     write_json_atomic(output / "metrics.json", metrics)
     fitting = sum(row.split in config.splits for row in rows)
-    used = len({view.name.rpartition("/")[0] for view in views})
+    used = len({name.rpartition("/")[0] for name, _ in views})
     left_out = {
         "in other splits": len(rows) - fitting,
         "beyond max_episodes": fitting - len(chosen),

@@ -25,7 +25,7 @@ from worldline_core.errors import CheckpointError, DataError, UnavailableError
 from worldline_core.model.checkpoint import described, fill, read_weights
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-from worldline_core.training.clip_source import LoadedView, load_views
+from worldline_core.training.clip_source import load_views
 from worldline_core.training.trainer import Objective, ParameterGroup, held_out_losses, train
 from worldline_core.training.training_config import BLOCKS, SmallTeacherShape, TeacherConfig
 
@@ -281,15 +281,15 @@ class MaskedVideoObjective(Objective[FrameBatch]):
         return self.teacher.masked_loss(batch.frames, hidden), {}
 
 
-def teacher_batch(views: Sequence[LoadedView], config: TeacherConfig, seed: int, index: int) -> FrameBatch:
+def teacher_batch(views: Sequence[tuple[str, Tensor]], config: TeacherConfig, seed: int, index: int) -> FrameBatch:
     """Batch ``index``: a pure function of the seed and the index."""
     random = np.random.Generator(np.random.Philox(key=[seed, index]))
     names, frames = [], []
     for _ in range(config.trainer.batch_size):
-        view = views[int(random.integers(len(views)))]
-        start = int(random.integers(view.frames.shape[1] - config.clip_frames + 1))
-        names.append(view.name)
-        frames.append(view.frames[:, start : start + config.clip_frames])
+        name, video = views[int(random.integers(len(views)))]
+        start = int(random.integers(video.shape[1] - config.clip_frames + 1))
+        names.append(name)
+        frames.append(video[:, start : start + config.clip_frames])
     return FrameBatch(tuple(names), torch.stack(frames).to(config.trainer.device).float() / 255.0)
 
 
@@ -333,7 +333,7 @@ def train_teacher(config: TeacherConfig, inputs: Mapping[str, Path], output: Pat
             VALIDATION_SEED,
         ),
         output=output,
-        identity={"config": config.model_dump(mode="json"), "episodes": [view.name for view in training]},
+        identity={"config": config.model_dump(mode="json"), "episodes": [name for name, _ in training]},
         title="teacher",
     )
     weights = {name: value.to("cpu", torch.float16).contiguous() for name, value in sorted(result.average.items())}
