@@ -16,7 +16,7 @@ from flows.command_line import main
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.calibration import check as check_module
-from worldline_core.calibration import check_report
+from worldline_core.calibration import check as check_report
 from worldline_core.calibration.check import ListedEpisode, check_calibration, repairing_lines
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SourceDiagnosis
 from worldline_core.data.episodes.conventions import RecordedConventions

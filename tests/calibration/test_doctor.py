@@ -16,8 +16,7 @@ from benchmarks import calibration as benchmark
 from tools.corrupted.conventions import corrupt
 from worldline_core.calibration import calibration_doctor
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.check import ListedEpisode, repairing_lines
-from worldline_core.calibration.check_report import verdict_text
+from worldline_core.calibration.check import ListedEpisode, repairing_lines, verdict_text
 from worldline_core.calibration.diagnosis import MAX_GAIN, MIN_MARGIN, Diagnosis, diagnose_source
 from worldline_core.data.episodes.conventions import RecordedConventions, along_tool_z
 from worldline_core.data.episodes.episode import Episode
