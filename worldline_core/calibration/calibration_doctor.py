@@ -458,10 +458,8 @@ def notes_on(observation: Observation, recorded: Reading) -> list[str]:
         poses = camera.poses(np.arange(len(commands)))
         states_m, commands_m = (rms_hand_eye(tools[:, i], poses)[1] for tools in (recorded.tools, commands))
         if states_m > NOTICEABLE_M and states_m > COMMANDS_FIT_RATIO * commands_m:
-            notes.append(
-                f"{view}: the camera poses follow the commands ({1e3 * commands_m:.1f} mm), "
-                f"not the states ({1e3 * states_m:.1f} mm)"
-            )
+            fits = f"follow the commands ({1e3 * commands_m:.1f} mm), not the states ({1e3 * states_m:.1f} mm)"
+            notes.append(f"{view}: the camera poses {fits}")
     if recorded.gripper is None:
         return [*notes, "gripper: the state names no gripper columns, polarity is not judged"]
     for i, arm in enumerate(observation.arms):
