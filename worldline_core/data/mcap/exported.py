@@ -340,7 +340,7 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         topic = f"/{view}/calibration"
         (calibration,) = _all_of(streams, topic, 1, file).values
         camera_poses = _poses(poses, f"{view}_camera", num_frames if moving[view] else 1, file)
-        add_camera(cameras, view, calibration, camera_poses, where=f"{file.path}, topic {topic}")
+        add_camera(cameras, view, calibration, camera_poses, f"{file.path}, topic {topic}")
     tools = [_poses(poses, frame, num_frames, file) for frame in _tool_frames(int(about["num_arms"]))]
     state, action = (
         np.array([value.position for value in joints[name].values], dtype=ARRAYS["state"].dtype)

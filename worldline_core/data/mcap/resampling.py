@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -51,13 +51,10 @@ class Clocks:
         # A simulated clock is 0 once, a driver that sets none writes 0 always.
         unset = {topic: count for topic, stream in streams.items() if (count := _without_time(stream)) > 1}
         if unset:
-            raise RejectedInputError(
-                "clock_skew",
-                "Messages have no header time",
-                where=f"{where}, topic {', '.join(unset)}",
-                got=", ".join(f"0 in {count} of {len(streams[topic].log_ns)}" for topic, count in unset.items()),
-                next_step="set time: log",
-            )
+            where = f"{where}, topic {', '.join(unset)}"
+            got = ", ".join(f"0 in {count} of {len(streams[topic].log_ns)}" for topic, count in unset.items())
+            what, next_step = "Messages have no header time", "set time: log"
+            raise RejectedInputError("clock_skew", what, where=where, got=got, next_step=next_step)
         least_ms: dict[str, float] = {}
         for stream in streams.values():
             if stream.has_header and stream.kind != "calibration":
@@ -65,15 +62,12 @@ class Clocks:
                 least_ms[stream.topic] = float(delay.min() - config.offset_ns(stream.topic)) / 1e6
         skew_ms = max(least_ms.values(), default=0.0) - min(least_ms.values(), default=0.0)
         if skew_ms > config.max_clock_skew_ms:
+            got = ", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items()))
             raise RejectedInputError(
-                "clock_skew",
-                "Clocks of topics disagree",
-                where=where,
+                "clock_skew", "Clocks of topics disagree", where=where, got=got, evidence={"skew_ms": skew_ms},
                 expected=f"least delays within {config.max_clock_skew_ms} ms of each other",
-                got=", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items())),
                 next_step="declare time_offsets_ms, or set time: log",
-                evidence={"skew_ms": skew_ms},
-            )
+            )  # fmt: skip
         joints = config.arms[0].state.joints.topic if config.arms else ""
         self.header_to_log_ns = round(least_ms.get(joints, min(least_ms.values(), default=0.0)) * 1e6)
 
@@ -105,15 +99,12 @@ def in_order(times_ns: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     back_s = (np.maximum.accumulate(times_ns) - times_ns) / 1e9
     if back_s.max() > MAX_DISORDER_S:
         first = int(np.argmax(back_s > MAX_DISORDER_S))
+        what, expected = "Times of a topic jump back", f"at most {MAX_DISORDER_S} s out of order"
         raise RejectedInputError(
-            "clock_jump",
-            "Times of a topic jump back",
-            where=f"{where}, message {first}",
-            expected=f"at most {MAX_DISORDER_S} s out of order",
-            got=f"{back_s.max():.3f} s",
+            "clock_jump", what, where=f"{where}, message {first}", expected=expected, got=f"{back_s.max():.3f} s",
             next_step="set time: log, if the recorder's clock is sound, or cut the recording at the jump",
             evidence={"message": first, "jump_s": float(back_s.max())},
-        )
+        )  # fmt: skip
     return np.unique(times_ns, return_index=True)
 
 
@@ -203,14 +194,9 @@ def check_gaps(
         ((stop_ns - times_ns[-1]) / 1e9, max_trim_s, "Topic ends too early", int(times_ns[-1])),
     ):
         if seconds > allowed:
-            raise RejectedInputError(
-                "time_gap",
-                what,
-                where=where,
-                expected=f"at most {allowed:.3f} s",
-                got=f"{seconds:.3f} s from {(at_ns - start_ns) / 1e9:.3f} s on",
-                evidence={"gap_s": float(seconds)},
-            )
+            expected, got = f"at most {allowed:.3f} s", f"{seconds:.3f} s from {(at_ns - start_ns) / 1e9:.3f} s on"
+            evidence = {"gap_s": float(seconds)}
+            raise RejectedInputError("time_gap", what, where=where, expected=expected, got=got, evidence=evidence)
 
 
 def instants(start_ns: int, stop_ns: int, fps: float) -> np.ndarray:
@@ -299,9 +285,8 @@ class TransformTree:
             parent, child = transform.parent, transform.child
             edge = self._edges.setdefault(child, _Edge(parent, f"{self._where}, transform {parent} -> {child}"))
             if edge.parent != parent:
-                raise RejectedInputError(
-                    "invalid_extrinsics", "A frame has two parents", where=edge.where, expected=edge.parent, got=parent
-                )
+                what, expected = "A frame has two parents", edge.parent
+                raise RejectedInputError("invalid_extrinsics", what, where=edge.where, expected=expected, got=parent)
             edge.static = edge.static and static
             edge.times_ns.append(time_ns)
             edge.values.append(transform.values)
@@ -316,9 +301,8 @@ class TransformTree:
         while found[-1] in self._edges:
             above = self._edges[found[-1]].parent
             if above in found:
-                raise RejectedInputError(
-                    "invalid_extrinsics", "Transforms form a ring", where=self._where, got=" -> ".join([*found, above])
-                )
+                what, got = "Transforms form a ring", " -> ".join([*found, above])
+                raise RejectedInputError("invalid_extrinsics", what, where=self._where, got=got)
             found.append(above)
         return found
 
@@ -369,13 +353,7 @@ def uncalibrated(calibration: Calibration, *, rectified: bool) -> str | None:
 
 
 def add_camera(
-    cameras: RecordedCameras,
-    view: str,
-    calibration: Calibration,
-    poses: np.ndarray,
-    *,
-    where: object,
-    rectified: bool = False,
+    cameras: RecordedCameras, view: str, message: Calibration, poses: np.ndarray, where: str, *, rectified: bool = False
 ) -> None:
     """Adds a view from its calibration message and its poses (n or 1, 4, 4) in the base.
 
@@ -383,34 +361,31 @@ def add_camera(
 
     Raises: RejectedInputError: singular_intrinsics, invalid_extrinsics, invalid_distortion.
     """
-    K, size = _intrinsics(calibration, rectified=rectified, where=where)
+    K, size = _intrinsics(message, rectified=rectified, where=where)
     pose = camera_pose(view, poses, where=where)
     with rejected_as("invalid_distortion", where):
-        lens = None if rectified else distortion_from_ros(calibration.model, calibration.D)
+        lens = None if rectified else distortion_from_ros(message.model, message.D)
     cameras.add(view, K, pose, size, lens)
 
 
-def _intrinsics(calibration: Calibration, *, rectified: bool, where: object) -> tuple[np.ndarray, tuple[int, int]]:
+def _intrinsics(calibration: Calibration, *, rectified: bool, where: str) -> tuple[np.ndarray, tuple[int, int]]:
     """K (3, 3) of the published image, and its size (height, width), after region of interest and binning.
 
     K and P belong to the whole sensor (ROS REP 104); a region is cut out first, then binned.
     """
-
-    def refused(what: str, got: object) -> RejectedInputError:
-        return RejectedInputError("singular_intrinsics", what, where=where, got=got)
-
+    refused = partial(RejectedInputError, "singular_intrinsics", where=where)
     numbers, count = (calibration.P, 12) if rectified else (calibration.K, 9)
     if len(numbers) != count:
-        raise refused(f"Calibration has not {count} values of {'P' if rectified else 'K'}", len(numbers))
+        raise refused(f"Calibration has not {count} values of {'P' if rectified else 'K'}", got=len(numbers))
     K = np.array(numbers, np.float64).reshape(3, -1)[:, :3]
     height, width = calibration.height, calibration.width
     transform = ImageTransform.of((height, width))
     x, y, region_width, region_height = calibration.roi
     if region_width and region_height:
         if x + region_width > width or y + region_height > height:
-            raise refused(f"Region of interest leaves the image of {width}x{height}", calibration.roi)
+            raise refused(f"Region of interest leaves the image of {width}x{height}", got=calibration.roi)
         transform = transform.crop(y, x, (region_height, region_width))
-    across, down = max(calibration.binning[0], 1), max(calibration.binning[1], 1)
+    across, down = (max(each, 1) for each in calibration.binning)
     if (across, down) != (1, 1):
         height, width = transform.image_size
         transform = transform.resize((height // down, width // across))
