@@ -14,7 +14,6 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.file import ImageTrack, McapFile, Stream, frames_after_loss
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Calibration, Joints, Kind
 from worldline_core.data.mcap.resampling import (
-    Clocks,
     TransformTree,
     add_camera,
     check_alternation,
@@ -28,6 +27,7 @@ from worldline_core.data.mcap.resampling import (
     nearest,
     resampled,
     resampled_poses,
+    times_by_topic,
     uncalibrated,
 )
 from worldline_core.data.mcap.topics_config import ArmReadings, McapTopicsSourceConfig, TopicReadings
@@ -81,8 +81,8 @@ class _Recording:
         self.absent: dict[str, RejectedInputError] = {}
         self.streams = self._read_streams()
         config = self.config  # without the views that have no images
-        self.clocks = clocks = Clocks(config, self.streams, file.path)
-        self.start_ns, self.stop_ns = (None if t is None else t - clocks.header_to_log_ns for t in (start, stop))
+        self.times_ns, header_to_log_ns = times_by_topic(config, self.streams, file.path)
+        self.start_ns, self.stop_ns = (None if t is None else t - header_to_log_ns for t in (start, stop))
         self.signals = {readings: self._signal(readings) for readings in config.readings}
         self.tools = {arm.tool_pose: self._tool(arm.tool_pose) for arm in config.arms if arm.tool_pose is not None}
         """By topic: times and poses (n, 7), and the frame that these are given in."""
@@ -90,8 +90,7 @@ class _Recording:
         self.tool_frames = [frame.lstrip("/") for frame in frames if frame is not None]
         """For each arm, the frame that is its tool, or the one that its recorded poses are given in."""
         self.images = {
-            view: in_order(clocks.times_ns(self.streams[each.image]), self.at(each.image))
-            for view, each in config.views.items()
+            view: in_order(self.times_ns[each.image], self.at(each.image)) for view, each in config.views.items()
         }
         """Times (n,) [ns] of each view's images, and the index of each in the order of the file."""
         read = {view: self._calibration(each.calibration) for view, each in config.views.items() if each.calibration}
@@ -157,7 +156,7 @@ class _Recording:
             expected = ", ".join(readings.names or map(str, readings.columns or ()))
             got = ", ".join(sorted({name for v in stream.values for name in getattr(v, "names", ())})) or "an array"
             raise RejectedInputError("missing_column", what, where=self.at(stream.topic), expected=expected, got=got)
-        times = self.clocks.times_ns(stream)[taken]
+        times = self.times_ns[stream.topic][taken]
         return in_order_with_values(times, np.array(rows, np.float64), self.at(stream.topic))
 
     def _tool(self, topic: str) -> tuple[_Signal, str]:
@@ -168,7 +167,7 @@ class _Recording:
         if len(frames) != 1:
             what = "Tool poses change their frame"
             raise RejectedInputError("invalid_tool_pose", what, where=where, got=", ".join(frames))
-        return in_order_with_values(self.clocks.times_ns(stream), values, where), frames[0]
+        return in_order_with_values(self.times_ns[topic], values, where), frames[0]
 
     def _calibration(self, topic: str) -> Calibration:
         """The calibration around the episode, or in the whole file where it was sent only once."""
@@ -203,7 +202,7 @@ class _Recording:
 
         tree = read_static(config.static_transforms, None)
         for stream in (self.streams[topic] for topic in config.transforms if topic in self.streams):
-            for transforms, time_ns in zip(stream.values, self.clocks.times_ns(stream), strict=True):
+            for transforms, time_ns in zip(stream.values, self.times_ns[stream.topic], strict=True):
                 times = [int(time_ns)] * len(transforms)
                 if config.time == "header":  # every transform of a message has its own
                     times = [transform.stamp_ns + config.offset_ns(stream.topic) for transform in transforms]

@@ -34,48 +34,43 @@ MAX_DISORDER_S = 1.0
 """A message that comes later than this behind a younger one was stamped by a clock that was set back."""
 
 
-class Clocks:
-    """Clocks of one episode's topics, compared by their least delays (log time minus header time).
+def times_by_topic(
+    config: McapTopicsSourceConfig, streams: Mapping[str, Stream], where: object
+) -> tuple[dict[str, np.ndarray], int]:
+    """Times (n,) of each topic's messages [ns] on the configured clock, and what leads from a log time to it.
+
+    The latter is subtracted: the least delay (log time minus header time) of the joints' topic, which commands must fit; where
+    the joints have no header, the least of all topics.
 
     Raises: RejectedInputError (clock_skew) where header times count, and disagree by more than allowed or are not set.
-
-    Attributes:
-        header_to_log_ns: subtracted from a log time to get a time on the clock of the headers: the least delay of the
-            joints' topic, which commands must fit; where the joints have no header, the least of all topics.
     """
-
-    def __init__(self, config: McapTopicsSourceConfig, streams: Mapping[str, Stream], where: object) -> None:
-        self.config, self.header_to_log_ns = config, 0
-        if config.time == "log":
-            return
-        # A simulated clock is 0 once, a driver that sets none writes 0 always.
-        unset = {topic: count for topic, stream in streams.items() if (count := _without_time(stream)) > 1}
-        if unset:
-            where = f"{where}, topic {', '.join(unset)}"
-            got = ", ".join(f"0 in {count} of {len(streams[topic].log_ns)}" for topic, count in unset.items())
-            what, next_step = "Messages have no header time", "set time: log"
-            raise RejectedInputError("clock_skew", what, where=where, got=got, next_step=next_step)
-        least_ms: dict[str, float] = {}
-        for stream in streams.values():
-            if stream.has_header and stream.kind != "calibration":
-                delay = np.array(stream.log_ns, np.int64) - np.array(stream.stamps_ns, np.int64)
-                least_ms[stream.topic] = float(delay.min() - config.offset_ns(stream.topic)) / 1e6
-        skew_ms = max(least_ms.values(), default=0.0) - min(least_ms.values(), default=0.0)
-        if skew_ms > config.max_clock_skew_ms:
-            got = ", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items()))
-            raise RejectedInputError(
-                "clock_skew", "Clocks of topics disagree", where=where, got=got, evidence={"skew_ms": skew_ms},
-                expected=f"least delays within {config.max_clock_skew_ms} ms of each other",
-                next_step="declare time_offsets_ms, or set time: log",
-            )  # fmt: skip
-        joints = config.arms[0].state.joints.topic if config.arms else ""
-        self.header_to_log_ns = round(least_ms.get(joints, min(least_ms.values(), default=0.0)) * 1e6)
-
-    def times_ns(self, stream: Stream) -> np.ndarray:
-        """(n,) times of a topic's messages [ns] on the configured clock."""
-        if self.config.time == "header" and stream.has_header:
-            return np.array(stream.stamps_ns, np.int64) + self.config.offset_ns(stream.topic)
-        return np.array(stream.log_ns, np.int64) - self.header_to_log_ns
+    log_ns = {topic: np.array(stream.log_ns, np.int64) for topic, stream in streams.items()}
+    if config.time == "log":
+        return log_ns, 0
+    # A simulated clock is 0 once, a driver that sets none writes 0 always.
+    unset = {topic: count for topic, stream in streams.items() if (count := _without_time(stream)) > 1}
+    if unset:
+        where = f"{where}, topic {', '.join(unset)}"
+        got = ", ".join(f"0 in {count} of {len(log_ns[topic])}" for topic, count in unset.items())
+        what, next_step = "Messages have no header time", "set time: log"
+        raise RejectedInputError("clock_skew", what, where=where, got=got, next_step=next_step)
+    headed = [topic for topic, stream in streams.items() if stream.has_header]
+    stamps_ns = {topic: np.array(streams[topic].stamps_ns, np.int64) + config.offset_ns(topic) for topic in headed}
+    delays = {
+        topic: log_ns[topic] - times for topic, times in stamps_ns.items() if streams[topic].kind != "calibration"
+    }
+    least_ms = {topic: float(delay.min()) / 1e6 for topic, delay in delays.items()}
+    least, skew_ms = min(least_ms.values(), default=0.0), np.ptp(list(least_ms.values()) or [0.0])
+    if skew_ms > config.max_clock_skew_ms:
+        got = ", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items()))
+        raise RejectedInputError(
+            "clock_skew", "Clocks of topics disagree", where=where, got=got, evidence={"skew_ms": float(skew_ms)},
+            expected=f"least delays within {config.max_clock_skew_ms} ms of each other",
+            next_step="declare time_offsets_ms, or set time: log",
+        )  # fmt: skip
+    joints = config.arms[0].state.joints.topic if config.arms else ""
+    header_to_log_ns = round(least_ms.get(joints, least) * 1e6)
+    return {topic: stamps_ns.get(topic, times - header_to_log_ns) for topic, times in log_ns.items()}, header_to_log_ns
 
 
 def _without_time(stream: Stream) -> int:
