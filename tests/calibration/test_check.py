@@ -65,6 +65,8 @@ def test_an_episode_that_ends_in_a_bug_does_not_cost_the_others_their_reports(
             raise ValueError("At least one stride is negative")
         return np.zeros((8, 8, 3), np.uint8)
 
+    fine = diagnosis_of(RecordedConventions())
+    monkeypatch.setattr(check, "diagnose", lambda episode, *_: replace(fine, episode_id=episode.episode_id))
     monkeypatch.setattr(check, "diagnosis_picture", draw)
     names = ["synthetic/0", "synthetic/1"]
     found = check_calibration([listed(episode, images, name) for name in names], tmp_path)
@@ -82,6 +84,7 @@ def test_a_full_disk_ends_the_check(episode, images, tmp_path, monkeypatch):
     def full(path: Path, data: bytes) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
+    monkeypatch.setattr(check, "diagnose", lambda *_: diagnosis_of(RecordedConventions()))
     monkeypatch.setattr(check, "write_bytes_atomic", full)
     with pytest.raises(OSError, match="No space left"):
         check_calibration([listed(episode, images)], tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from fractions import Fraction
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -51,12 +52,14 @@ def messages(codec: str, **parameters: str) -> tuple[list[bytes], list[int]]:
     return [bytes(packet) for packet in packets], [packet.pts for packet in packets]
 
 
+@cache
 def annex_b(codec: str = "libx264") -> list[bytes]:
     """One message a frame, without B-frames, as Foxglove wants it."""
     x265 = {"x265-params": "log-level=none:bframes=0:keyint=15"} if codec == "libx265" else {}
     return messages(codec, bf="0", g="15", tune="zerolatency", **x265)[0]
 
 
+@cache
 def with_b_frames(codec: str, parameters: str) -> tuple[list[bytes], list[int]]:
     name = codec.removeprefix("lib") + "-params"
     found, shown = messages(codec, **{name: f"keyint=15:min-keyint=15:scenecut=0:b-adapt=0:{parameters}"})
