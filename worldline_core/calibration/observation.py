@@ -290,7 +290,8 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
         radii = np.full(points.shape[1], _TOOL_RADIUS_M)
     blocks = arm_blocks(episode)
     columns = [block[-1] for block in blocks] if len(blocks) == tools.shape[1] else []
-    openings = [each[:, columns].astype(np.float64) if columns else None for each in (episode.state, episode.action)]
+    arrays = episode.state, episode.action
+    opening, command = (each[:, columns].astype(np.float64) if columns else None for each in arrays)
     cameras = dict(episode.cameras)
     for view in cameras.keys() & observation.gray.keys():
         height, width = observation.gray[view].shape[1:]
@@ -298,7 +299,7 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
     poses = tools, tool_travel(tools), action, kinematic
     on_arms = points, radii, shape, (along[0], along[1])
     first = frames_with_all(observation.episode.num_frames, conventions)[0]
-    return Reading(conventions, episode, *poses, cameras, *openings, *on_arms, first)
+    return Reading(conventions, episode, *poses, cameras, opening, command, *on_arms, first)
 
 
 def _moved_arms(observation: Observation, kinematics: ArmKinematics, episode: Episode) -> tuple[np.ndarray, ...]:
