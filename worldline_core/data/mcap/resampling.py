@@ -54,12 +54,9 @@ def times_by_topic(
         got = ", ".join(f"0 in {count} of {len(log_ns[topic])}" for topic, count in unset.items())
         what, next_step = "Messages have no header time", "set time: log"
         raise RejectedInputError("clock_skew", what, where=where, got=got, next_step=next_step)
-    headed = [topic for topic, stream in streams.items() if stream.has_header]
+    headed = [topic for topic, stream in streams.items() if stream.has_header and stream.kind != "calibration"]
     stamps_ns = {topic: np.array(streams[topic].stamps_ns, np.int64) + config.offset_ns(topic) for topic in headed}
-    delays = {
-        topic: log_ns[topic] - times for topic, times in stamps_ns.items() if streams[topic].kind != "calibration"
-    }
-    least_ms = {topic: float(delay.min()) / 1e6 for topic, delay in delays.items()}
+    least_ms = {topic: float((log_ns[topic] - times).min()) / 1e6 for topic, times in stamps_ns.items()}
     least, skew_ms = min(least_ms.values(), default=0.0), np.ptp(list(least_ms.values()) or [0.0])
     if skew_ms > config.max_clock_skew_ms:
         got = ", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items()))
