@@ -191,8 +191,8 @@ def in_json(message: Any) -> dict[str, Any]:
             values["timestamp"] = {"sec": time.seconds, "nsec": time.nanos}
         return values
 
-    options = {"preserving_proto_field_name": True, "always_print_fields_with_no_presence": True}
-    return json.loads(MessageToJson(message, **options), object_hook=timed)
+    text = MessageToJson(message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+    return json.loads(text, object_hook=timed)
 
 
 CODECS = pytest.mark.parametrize(("codec", "name"), [("libx264", "h264"), ("libx265", "h265")])
