@@ -251,11 +251,13 @@ def avcc(packet: bytes, size: int = 4) -> bytes:
     return b"".join(len(unit).to_bytes(size) + unit for unit in units)
 
 
-@pytest.mark.parametrize("codec", ["libx264", "libx265"])
-def test_video_that_does_not_decode_is_refused(tmp_path: Path, codec: str) -> None:
-    name, packets = {"libx264": "h264", "libx265": "h265"}[codec], annex_b(codec)
+@pytest.mark.parametrize(
+    ("codec", "name", "delimiter"), [("libx264", "h264", b"\x09"), ("libx265", "h265", b"\x46\x01")]
+)
+def test_video_that_does_not_decode_is_refused(tmp_path: Path, codec: str, name: str, delimiter: bytes) -> None:
+    packets = annex_b(codec)
     for content, said, message in (
-        ([*packets[:20], b"\x00\x00\x01\x09", *packets[21:]], name, "depend on a message that is missing"),
+        ([*packets[:20], b"\x00\x00\x01" + delimiter, *packets[21:]], name, "depend on a message that is missing"),
         (packets, "vp9", r"(?s)codec is not supported.*h264 or h265.*vp9"),
         ([packet for packet in packets[1:15] for _ in range(5)][:60], name, "No key frame comes before"),
         *(([avcc(packet, size) for packet in packets], name, r"(?s)Annex B.*AVCC.*mp4toannexb") for size in (4, 2)),
