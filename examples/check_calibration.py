@@ -8,8 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from worldline_core.calibration.check import check_command
-from worldline_core.calibration.check_report import table_text
+from worldline_core.calibration.check import check_command, table_text
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.shipped import shipped_folder
 

@@ -307,8 +307,7 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
     from worldline_core.store.store import clear_full_disk
 
     with _unusable_is_2():  # 1 says that something was found
-        from worldline_core.calibration.check import check_command
-        from worldline_core.calibration.check_report import as_json, table_text
+        from worldline_core.calibration.check import as_json, check_command, table_text
 
         with clear_full_disk():
             found = check_command(

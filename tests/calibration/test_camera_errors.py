@@ -22,7 +22,7 @@ from worldline_core.calibration.camera_errors import (
     moved_camera,
     significant,
 )
-from worldline_core.calibration.check_report import diagnosis_picture
+from worldline_core.calibration.check import diagnosis_picture
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, Explanation, diagnose_source
 from worldline_core.calibration.observation import Motion
 from worldline_core.data.episodes.conventions import RecordedConventions

@@ -15,8 +15,7 @@ import yaml
 from flows.command_line import main
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.calibration import check as check_module
-from worldline_core.calibration import check_report
+from worldline_core.calibration import check
 from worldline_core.calibration.check import ListedEpisode, check_calibration, repairing_lines
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SourceDiagnosis
 from worldline_core.data.episodes.conventions import RecordedConventions
@@ -41,9 +40,7 @@ def listed(episode: Episode, images: Images, name: str = "synthetic/0") -> Liste
 
 def diagnosis_of(conventions: RecordedConventions) -> Diagnosis:
     none = Explanation(RecordedConventions(), -80.0, {"hand_eye right_wrist": -80.0})
-    if not conventions.departures:
-        return Diagnosis(episode_id="synthetic/0", verdict="too_little_evidence", best=none, ranked=(none,))
-    best = Explanation(conventions, -1.0, {})
+    best = Explanation(conventions, -1.0, {}) if conventions.departures else none
     return Diagnosis(episode_id="synthetic/0", verdict="explained", best=best, ranked=(best, none))
 
 
@@ -68,16 +65,18 @@ def test_an_episode_that_ends_in_a_bug_does_not_cost_the_others_their_reports(
             raise ValueError("At least one stride is negative")
         return np.zeros((8, 8, 3), np.uint8)
 
-    monkeypatch.setattr(check_module, "diagnosis_picture", draw)
+    fine = diagnosis_of(RecordedConventions())
+    monkeypatch.setattr(check, "diagnose", lambda episode, *_: replace(fine, episode_id=episode.episode_id))
+    monkeypatch.setattr(check, "diagnosis_picture", draw)
     names = ["synthetic/0", "synthetic/1"]
-    check = check_calibration([listed(episode, images, name) for name in names], tmp_path)
-    assert [episode.episode_id for episode in check.episodes] == names
-    assert [episode.reason for episode in check.episodes] == ["crashed", None]
-    assert not check.consistent  # the command's exit status
+    found = check_calibration([listed(episode, images, name) for name in names], tmp_path)
+    assert [episode.episode_id for episode in found.episodes] == names
+    assert [episode.reason for episode in found.episodes] == ["crashed", None]
+    assert not found.consistent  # the command's exit status
     stored = json.loads((tmp_path / "diagnoses.json").read_text())["episodes"]
     pictures = [entry["picture"] and (tmp_path / entry["picture"]).is_file() for entry in stored]
     assert pictures == [None, True]
-    for shown in (check_report.table_text(check), (tmp_path / "index.html").read_text()):
+    for shown in (check.table_text(found), (tmp_path / "index.html").read_text()):
         assert "At least one stride is negative" in shown
 
 
@@ -85,7 +84,8 @@ def test_a_full_disk_ends_the_check(episode, images, tmp_path, monkeypatch):
     def full(path: Path, data: bytes) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(check_module, "write_bytes_atomic", full)
+    monkeypatch.setattr(check, "diagnose", lambda *_: diagnosis_of(RecordedConventions()))
+    monkeypatch.setattr(check, "write_bytes_atomic", full)
     with pytest.raises(OSError, match="No space left"):
         check_calibration([listed(episode, images)], tmp_path)
     assert not (tmp_path / "diagnoses.json").exists()
@@ -102,13 +102,13 @@ def test_a_bad_episode_is_listed_and_the_rest_goes_on(episode: Episode, images: 
     # One arm is recorded, the robot has two; and `listed` names a robot that is not known at all.
     pair = listed(replace(episode, embodiment="ur5e_pair"), images, "synthetic/pair")
     given = [broken, short, listed(holes, images, "synthetic/nan"), listed(episode, images), pair]
-    check = check_calibration(given, tmp_path)
+    found = check_calibration(given, tmp_path)
     reasons = ["truncated_video", "length_mismatch", "nan_state", None, None]
-    assert [episode.reason for episode in check.episodes] == reasons
-    assert "no_such_robot" in check.episodes[3].notes[0]
-    assert "ur5e_pair" in check.episodes[4].notes[0]
-    assert not check.consistent
-    assert "truncated_video: The file ends early; expected 24; got 12" in check_report.table_text(check)
+    assert [episode.reason for episode in found.episodes] == reasons
+    assert "no_such_robot" in found.episodes[3].notes[0]
+    assert "ur5e_pair" in found.episodes[4].notes[0]
+    assert not found.consistent
+    assert "truncated_video: The file ends early; expected 24; got 12" in check.table_text(found)
     stored = json.loads((tmp_path / "diagnoses.json").read_text())
     assert [entry["reason"] for entry in stored["episodes"]] == reasons
 
@@ -124,7 +124,7 @@ def test_recordings_are_read_in_a_process_with_limits_first(project_root: Path) 
     assert caught.value.reason == "out_of_memory"
 
 
-def made_up() -> check_report.CalibrationCheck:
+def made_up() -> check.CalibrationCheck:
     """Three verdicts, with names that would break a page that does not escape them."""
     none = Explanation(RecordedConventions(), np.nan, {})
     best = Explanation(RecordedConventions(camera_axes="opengl"), -1.0, {})
@@ -135,47 +135,40 @@ def made_up() -> check_report.CalibrationCheck:
         votes={"camera_axes": 1, "consistent": 1}, notes=("of the set",), config_lines=("line three",),
     )  # fmt: skip
     episodes = (
-        check_report.EpisodeCheck(f"a {HOSTILE}", "s", fine, picture="pictures/a.jpg", notes=("set Y",)),
-        check_report.EpisodeCheck("b", "s", broken, config_lines=("line one", "line two")),
-        check_report.EpisodeCheck("c", "s", None, "missing_file", f"why {HOSTILE}\n" + 40 * "   where: /x "),
+        check.EpisodeCheck(f"a {HOSTILE}", "s", fine, picture="pictures/a.jpg", notes=("set Y",)),
+        check.EpisodeCheck("b", "s", broken, config_lines=("line one", "line two")),
+        check.EpisodeCheck("c", "s", None, "missing_file", f"why {HOSTILE}\n" + 40 * "   where: /x "),
     )
-    return check_report.CalibrationCheck(episodes, (summed,), Path("out"))
+    return check.CalibrationCheck(episodes, (summed,), Path("out"))
 
 
 def test_the_page_escapes_what_it_shows_and_json_holds_only_its_own_numbers() -> None:
-    html = check_report.page(made_up())
+    html = check.page(made_up())
     assert HOSTILE not in html
     assert html.count("&lt;script&gt;") >= 3
     assert html.index('id="b"') < html.index('id="a ')  # the worst first
-    text = check_report.table_text(made_up())
+    text = check.table_text(made_up())
     assert {"    line one", "    line two", "    line three"} <= set(text.splitlines())
     assert max(map(len, text.splitlines())) < 250
-    content = json.loads(json.dumps(check_report.as_json(made_up()), allow_nan=False))
-    assert [content["episodes"][1][name] for name in ("mistake", "score", "score_as_recorded")] == [
-        "camera_axes",
-        -1,
-        None,
-    ]
+    content = json.loads(json.dumps(check.as_json(made_up()), allow_nan=False))
+    shown = [content["episodes"][1][name] for name in ("mistake", "score", "score_as_recorded")]
+    assert shown == ["camera_axes", -1, None]
     assert content["sources"][0]["config_lines"] == ["line three"]
-
-
-def by_hand(episode: Episode, view: str, n: int) -> np.ndarray:
-    camera = episode.cameras[view]
-    pose = camera.T_base_camera[n if camera.moving else 0]
-    x, y, z = pose[:3, :3].T @ (episode.T_base_ee[n, 0, :3, 3] - pose[:3, 3])
-    return np.array([camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]])
 
 
 @pytest.mark.parametrize("lag", [0, 3])
 def test_tools_are_drawn_where_the_recorded_camera_puts_them(episode: Episode, lag: int) -> None:
     """The wrist camera's own poses are used, not those that follow from kinematics and a mount."""
     recorded = corrupt(episode, RecordedConventions(camera_lag_frames=lag))
-    for view in ("head", "right_wrist"):
-        tracks = check_report.recorded_tracks(recorded, view, None)
+    for view, camera in recorded.cameras.items():
+        tracks = check.recorded_tracks(recorded, view, None)
         assert lag or tracks.valid.all()
         for n in (0, 10):
-            assert np.allclose(tracks.uv[n, 0, 0], by_hand(recorded, view, n), atol=1e-3)
-    moved = check_report.recorded_tracks(episode, "head", None, tool_offset_z_m=0.1)
+            pose = camera.T_base_camera[n if camera.moving else 0]
+            x, y, z = pose[:3, :3].T @ (recorded.T_base_ee[n, 0, :3, 3] - pose[:3, 3])
+            by_hand = camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]
+            assert np.allclose(tracks.uv[n, 0, 0], by_hand, atol=1e-3)
+    moved = check.recorded_tracks(episode, "head", None, tool_offset_z_m=0.1)
     expected = episode.T_base_ee[:, :, :3, 3] + 0.1 * episode.T_base_ee[:, :, :3, 2]
     assert np.allclose(moved.T_base_tool[:, :, :3, 3], expected, atol=1e-6)
 
@@ -195,11 +188,11 @@ def test_the_repaired_side_draws_each_image_with_its_own_tools(episode, lags, mo
         drawn.append((int(frame[0, 0, 0]) // 10, shown(tracks, n)))
         return frame
 
-    monkeypatch.setattr(check_report, "draw_overlay", record)
-    monkeypatch.setattr(check_report, "TILE_HEIGHT", 60)
+    monkeypatch.setattr(check, "draw_overlay", record)
+    monkeypatch.setattr(check, "TILE_HEIGHT", 60)
     wrong = corrupt(episode, conventions)
-    check_report.diagnosis_picture(diagnosis_of(conventions), wrong, {"right_wrist": late}, None)
-    healthy = check_report.recorded_tracks(episode, "right_wrist", None)
+    check.diagnosis_picture(diagnosis_of(conventions), wrong, {"right_wrist": late}, None)
+    healthy = check.recorded_tracks(episode, "right_wrist", None)
     assert len(drawn) == 6
     assert all(np.allclose(poses, shown(healthy, number), atol=1e-6) for number, poses in drawn[3:])
     number, poses = drawn[0]  # as recorded they do not belong together
@@ -209,10 +202,10 @@ def test_the_repaired_side_draws_each_image_with_its_own_tools(episode, lags, mo
 def test_what_cannot_be_drawn_says_why(episode: Episode, images: Images) -> None:
     plain = diagnosis_of(RecordedConventions())
     with pytest.raises(DataError, match="Nothing to draw"):
-        check_report.diagnosis_picture(plain, replace(episode, cameras={}), images, None)
+        check.diagnosis_picture(plain, replace(episode, cameras={}), images, None)
     joints = replace(episode, T_base_ee=None, gripper=None, state_kind="joints")
     with pytest.raises(DataError, match=r"(?s)No tools to draw.*joints and kinematics"):
-        check_report.diagnosis_picture(plain, joints, images, None)
+        check.diagnosis_picture(plain, joints, images, None)
 
 
 def run(*arguments: str) -> int:

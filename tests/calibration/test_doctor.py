@@ -16,8 +16,7 @@ from benchmarks import calibration as benchmark
 from tools.corrupted.conventions import corrupt
 from worldline_core.calibration import calibration_doctor
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.check import ListedEpisode, repairing_lines
-from worldline_core.calibration.check_report import verdict_text
+from worldline_core.calibration.check import ListedEpisode, repairing_lines, verdict_text
 from worldline_core.calibration.diagnosis import MAX_GAIN, MIN_MARGIN, Diagnosis, diagnose_source
 from worldline_core.data.episodes.conventions import RecordedConventions, along_tool_z
 from worldline_core.data.episodes.episode import Episode
@@ -99,8 +98,10 @@ def test_poses_without_pictures_still_show_what_poses_can_show(healthy: list) ->
     assert all("too few to compare motion" in why for why in diagnosis.not_judged.values())
 
 
-def test_images_of_a_wrong_kind_are_refused(healthy: list) -> None:
+def test_images_of_a_wrong_kind_are_refused_and_a_single_one_is_not_judged(healthy: list) -> None:
     item = healthy[0]
+    diagnosis = diagnose(item.joints, {**item.gray, "head": item.gray["head"][:1]}, item.kinematics)
+    assert diagnosis.not_judged.keys() == {"head"}
     with pytest.raises(DataError, match="wrong shape"):
         diagnose(item.joints, {"head": item.gray["head"].astype(np.float32)}, item.kinematics)
     with pytest.raises(DataError, match="number of arms"):
@@ -110,12 +111,6 @@ def test_images_of_a_wrong_kind_are_refused(healthy: list) -> None:
 def test_quick_search_finds_the_same(healthy: list) -> None:
     conventions = RecordedConventions(gripper="inverted")
     assert benchmark.examine(healthy[0], healthy[0].joints, conventions, quick=True).best.conventions == conventions
-
-
-def test_a_view_of_one_picture_is_not_judged(healthy: list) -> None:
-    item = healthy[0]
-    diagnosis = diagnose(item.joints, {**item.gray, "head": item.gray["head"][:1]}, item.kinematics)
-    assert diagnosis.not_judged.keys() == {"head"}
 
 
 @pytest.mark.slow
@@ -201,12 +196,9 @@ def declared_as(item, name: str) -> Diagnosis:
 
 
 def with_exchanged_extrinsics(episode: Episode) -> Episode:
-    left, right = episode.cameras["left_wrist"], episode.cameras["right_wrist"]
-    exchanged = {
-        "left_wrist": replace(left, T_base_camera=right.T_base_camera),
-        "right_wrist": replace(right, T_base_camera=left.T_base_camera),
-    }
-    return replace(episode, cameras=dict(episode.cameras) | exchanged)
+    one, two = (episode.cameras[view] for view in ("left_wrist", "right_wrist"))
+    exchanged = [replace(a, T_base_camera=b.T_base_camera) for a, b in ((one, two), (two, one))]
+    return replace(episode, cameras=dict(episode.cameras) | {camera.view: camera for camera in exchanged})
 
 
 @pytest.mark.slow
@@ -298,16 +290,8 @@ AXES, UNIT, ANGLES = (
     ("first", "second"),
     [
         (ANGLES, None),
-        *slow(
-            (UNIT, INVERSE),
-            (AXES, INVERSE),
-            (ANGLES, INVERSE),
-            (AXES, UNIT),
-            (AXES, ANGLES),
-            (UNIT, ANGLES),
-            (AXES, None),
-            (UNIT, None),
-        ),
+        *slow((UNIT, INVERSE), (AXES, INVERSE), (ANGLES, INVERSE), (AXES, UNIT), (AXES, ANGLES), (UNIT, ANGLES)),
+        *slow((AXES, None), (UNIT, None)),
     ],
 )
 def test_two_errors_at_once_are_judged(healthy, first, second):
@@ -345,10 +329,8 @@ def test_a_lag_at_the_edge_of_the_search_explains_nothing(healthy: list) -> None
 )
 def test_a_frozen_video_is_no_consistent_one(healthy: list, kind: str, begins: int, quick: bool) -> None:
     item = of_robot(healthy, "ur5e")
-    changes = {view: np.abs(np.diff(gray.astype(float), axis=0)).sum() for view, gray in item.gray.items()}
-    view = max(
-        (view for view in changes if view.endswith(kind)), key=changes.__getitem__
-    )  # the head, or a lively wrist
+    views = [view for view in item.gray if view.endswith(kind)]  # the head, or the liveliest wrist
+    view = max(views, key=lambda view: np.abs(np.diff(item.gray[view].astype(float), axis=0)).sum())
     frozen = item.gray[view].copy()
     frozen[begins:] = frozen[begins]
     diagnosis = diagnose(item.joints, {**item.gray, view: frozen}, item.kinematics, quick=quick)

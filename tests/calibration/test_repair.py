@@ -17,7 +17,6 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.geometry.embodiment import load_embodiment
@@ -85,17 +84,6 @@ def test_curate_with_the_printed_line(tmp_path: Path, shipped: EpisodeSet, mista
     assert repaired.conventions[f"declared_{next(iter(mistake))}"] == str(next(iter(mistake.values())))
     passed = filter_episodes(FilterConfig(), {"episodes": tmp_path / "curated"}, tmp_path / "passed")
     assert passed["stage2_ok"] == passed["found"] == 1
-
-
-def test_a_declaration_that_does_not_apply_is_quarantined(tmp_path: Path, shipped: EpisodeSet) -> None:
-    source = {
-        "kind": "episode_set",
-        "path": str(shipped.root),
-        "include": [NAME],
-        "conventions": {"quaternion": "wxyz"},
-    }
-    with pytest.raises(DataError, match=r"1 quarantined \(1 convention_not_applicable\)"):
-        curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "curated")
 
 
 @pytest.mark.slow

@@ -85,7 +85,6 @@ def test_a_split_bag_is_one_recording(tmp_path: Path, place: str, prefix: str) -
     ("listed", "reason", "named"),
     [
         ("relative_file_paths: [run_0.mcap, run_1.mcap, run_3.mcap]", "missing_file", "run_3.mcap"),
-        ("relative_file_paths: [run_0.mcap, run_1.db3]", "missing_file", "run_1.db3"),
         ("relative_file_paths: 7", "unreadable", "relative_file_paths"),
         ("relative_file_paths: [1, 2]", "unreadable", "relative_file_paths"),
         ("relative_file_paths: [a, a", "unreadable", "ros2 bag reindex"),
@@ -245,12 +244,9 @@ def test_markers_bound_episodes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fps": 0}, r"fps\n  Input should be greater"),
         ({"arms": [], "embodiment": "so101"}, "the arms of so101 are not declared"),
         ({"primary_view": "top"}, "primary_view top is none of head, right_wrist"),
-        ({"rate": 30}, "Extra inputs are not permitted"),
         ({"transforms": ["/joint_states"]}, "declared both as readings and as transforms"),
-        ({"episodes": {"by": "markers", "topic": "/x", "start": "("}}, "valid regular expression"),
     ],
 )
 def test_the_configuration_is_strict(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

@@ -88,24 +88,6 @@ def test_a_few_lost_messages_are_counted_and_bridged(tmp_path: Path) -> None:
     assert np.abs(loaded.episode.state[:, :2] - toy.joints(loaded.episode.timestamps)).max() < 0.02
 
 
-@pytest.mark.parametrize(
-    ("topic", "keep", "what", "gap_s"),
-    [
-        (HEAD, lambda sent: sent[:40] + sent[45:], "Images are missing", 0.2),
-        (STATES, lambda sent: sent[:100] + sent[125:], "Messages are missing", 0.26),
-        ("/command", lambda sent: sent[:50] + sent[70:], "Messages are missing", 0.42),
-        ("/tf", lambda sent: sent[:50] + sent[70:], "Messages are missing", 0.42),
-        (WRIST, lambda sent: sent[:40], "Topic ends too early", 1.66),
-        (STATES, lambda sent: sent[150:], "Topic begins too late", 1.5),
-    ],
-)
-def test_gaps_are_refused(tmp_path: Path, topic: str, keep: Change, what: str, gap_s: float) -> None:
-    error = rejection(changed(tmp_path, {topic: keep}))
-    assert (error.reason, error.what) == ("time_gap", what)
-    assert topic in str(error) or topic == "/tf"
-    assert error.evidence["gap_s"] == pytest.approx(gap_s, abs=0.04)
-
-
 def test_clocks_that_disagree_are_measured_corrected_or_refused(tmp_path: Path) -> None:
     declared = changed(tmp_path, {WRIST: lambda sent: [toy.shifted(each, 0.5) for each in sent]})
     error = rejection(declared)
@@ -147,26 +129,6 @@ def test_stamps_of_zero_are_not_taken_for_times(tmp_path: Path, topics: tuple[st
     assert (error.reason, error.what) == ("clock_skew", "Messages have no header time")
     assert all(topic in str(error.where) for topic in topics)
     assert "set time: log" in str(error)
-
-
-@pytest.mark.parametrize(
-    ("joint", "value", "seconds", "kept"),
-    [(2, np.nan, 1.0, False), (1, np.inf, 1.51, False), (0, np.nan, 2.0, False), (2, np.nan, 9.0, True)],
-)
-def test_readings_between_frames_are_finite(
-    tmp_path: Path, joint: int, value: float, seconds: float, kept: bool
-) -> None:
-    def change(sent: list[Sent]) -> list[Sent]:
-        sent[min(int(seconds * 100), len(sent) - 1)].message["position"][joint] = value
-        return sent
-
-    declared = changed(tmp_path, {STATES: change})
-    if kept:  # after the last frame's neighbours
-        assert np.isfinite(load(declared | {"fps": 10}).episode.state).all()
-        return
-    error = rejection(declared)
-    assert error.reason == "nan_state"
-    assert error.evidence["at_s"] == pytest.approx(seconds, abs=0.02)
 
 
 def test_a_slow_camera_is_refused(tmp_path: Path) -> None:
@@ -356,23 +318,54 @@ def stale(sent: list[Sent]) -> list[Sent]:
     return sent
 
 
+def reading(joint: int, value: float, seconds: float) -> Change:
+    """One joint's reading at a time is another."""
+
+    def change(sent: list[Sent]) -> list[Sent]:
+        sent[min(int(seconds * 100), len(sent) - 1)].message["position"][joint] = value
+        return sent
+
+    return change
+
+
+GAP, TWO = "time_gap", "conflicting_messages"
+
+
 @pytest.mark.parametrize(
-    ("topic", "among", "what"),
+    ("topic", "change", "reason", "what", "numbers"),
     [
-        (STATES, lambda sent: [x for s in sent for x in (s, zeroed(s))], "Messages of one time"),
-        (STATES, lambda sent: [x for s in sent for x in (s, toy.shifted(zeroed(s), 0.005))], "to and fro"),
-        (STATES, zeroed_where(lambda i: i % 4 == 1), "to and fro"),
-        (STATES, zeroed_where(lambda i: i % 4 > 1), "to and fro"),
-        ("/command", zeroed_where(lambda i: i % 2 == 1), "to and fro"),
-        ("/command", zeroed_where(lambda i: i % 9 == 3), "to and fro"),
-        (STATES, jumping, "cannot be interpolated"),
-        ("/tf", stale, ""),
+        (HEAD, lambda sent: sent[:40] + sent[45:], GAP, "Images are missing", {"gap_s": 0.2}),
+        (STATES, lambda sent: sent[:100] + sent[125:], GAP, "Messages are missing", {"gap_s": 0.26}),
+        ("/command", lambda sent: sent[:50] + sent[70:], GAP, "Messages are missing", {"gap_s": 0.42}),
+        ("/tf", lambda sent: sent[:50] + sent[70:], GAP, "Messages are missing", {"gap_s": 0.42}),
+        (WRIST, lambda sent: sent[:40], GAP, "Topic ends too early", {"gap_s": 1.66}),
+        (STATES, lambda sent: sent[150:], GAP, "Topic begins too late", {"gap_s": 1.5}),
+        (STATES, reading(2, np.nan, 1.0), "nan_state", "not finite", {"at_s": 1.0}),
+        (STATES, reading(1, np.inf, 1.51), "nan_state", "not finite", {"at_s": 1.51}),
+        (STATES, reading(0, np.nan, 2.0), "nan_state", "not finite", {"at_s": 2.0}),
+        # Two publishers of one topic.
+        (STATES, lambda sent: [x for s in sent for x in (s, zeroed(s))], TWO, "Messages of one time", {}),
+        (STATES, lambda sent: [x for s in sent for x in (s, toy.shifted(zeroed(s), 0.005))], TWO, "to and fro", {}),
+        (STATES, zeroed_where(lambda i: i % 4 == 1), TWO, "to and fro", {}),
+        (STATES, zeroed_where(lambda i: i % 4 > 1), TWO, "to and fro", {}),
+        ("/command", zeroed_where(lambda i: i % 2 == 1), TWO, "to and fro", {}),
+        ("/command", zeroed_where(lambda i: i % 9 == 3), TWO, "to and fro", {}),
+        (STATES, jumping, TWO, "cannot be interpolated", {}),
+        ("/tf", stale, TWO, "", {}),
     ],
 )
-def test_two_publishers_of_one_topic_are_refused(tmp_path: Path, topic: str, among: Change, what: str) -> None:
-    error = rejection(changed(tmp_path, {topic: among}))
-    assert (error.reason, what in error.what) == ("conflicting_messages", True), str(error)
+def test_what_cannot_be_brought_to_instants_is_refused(
+    tmp_path: Path, topic: str, change: Change, reason: str, what: str, numbers: dict[str, float]
+) -> None:
+    error = rejection(changed(tmp_path, {topic: change}))
+    assert (error.reason, what in error.what) == (reason, True), str(error)
     assert ("base_link -> wrist" if topic == "/tf" else topic) in str(error)
+    assert {name: error.evidence[name] for name in numbers} == pytest.approx(numbers, abs=0.04)
+
+
+def test_readings_after_the_last_frame_need_not_be_finite(tmp_path: Path) -> None:
+    declared = changed(tmp_path, {STATES: reading(2, np.nan, 9.0)})
+    assert np.isfinite(load(declared | {"fps": 10}).episode.state).all()
 
 
 def test_one_publisher_is_not_taken_for_two(tmp_path: Path) -> None:

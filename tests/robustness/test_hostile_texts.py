@@ -24,8 +24,8 @@ from safetensors import SafetensorError
 from tasks.execution.command_line import exit_with_clear_errors, log_to_stderr
 from tasks.execution.run_page import write_progress_page
 from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImports]
-from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck
-from worldline_core.calibration.check_report import page as check_page
+from worldline_core.calibration.check import CalibrationCheck, EpisodeCheck
+from worldline_core.calibration.check import page as check_page
 from worldline_core.config import ConfigError, load_config
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig

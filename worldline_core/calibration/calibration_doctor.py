@@ -1,7 +1,5 @@
-"""The calibration doctor reads an episode under every usual mistake and names the one that explains what it shows.
-
-An episode is observed, read as recorded and under one mistake at a time, and every reading is scored by its evidence
-(`_Search`). Most mistakes have one fixed value; a lag, an image size or a tool offset is estimated first.
+"""The calibration doctor: an episode is read as recorded and under every usual mistake, every reading is scored by its evidence,
+and the mistake that explains the recording is named. Lags, an image size and a tool offset are estimated first.
 """
 
 from __future__ import annotations
@@ -92,8 +90,7 @@ def diagnose(
         kinematics: of the embodiment; None where unknown (tool poses must then be recorded).
         quick: try other readings only if the recorded one looks suspicious.
 
-    Raises:
-        DataError: images or kinematics do not fit the episode.
+    Raises: DataError: images or kinematics do not fit the episode.
     """
     observation = observe(episode, frames, kinematics)
     name = episode.episode_id
@@ -110,7 +107,8 @@ def diagnose(
     as_recorded, notes = search.as_recorded, notes_on(observation, recorded)
     ranked = sorted([as_recorded, *search.singles()], key=lambda e: -e.score)
     if bad_terms(as_recorded):
-        if search.is_suspicious(ranked[0]):
+        limits = ((value, TERM_LIMITS.get(name.split(" ")[0], 0.0)) for name, value in ranked[0].evidence.items())
+        if any(value < SUSPICION and limit > -np.inf for value, limit in limits):
             beating = [pair for pair in search.pairs(ranked) if pair.score > ranked[0].score + MIN_MARGIN]
             ranked = sorted([*ranked, *beating], key=lambda e: -e.score)
         if bad_terms(ranked[0], as_recorded):
@@ -150,12 +148,10 @@ class _Search:
 
     def terms(self, reading: Reading, poses: Mapping[str, float] | None = None) -> dict[str, float]:
         """All evidence of a reading; `poses` where its pose terms are known, since image lags do not change them."""
-        return {
-            **(pose_terms(self.observation, reading) if poses is None else poses),
-            **image_terms(self.observation, reading),
-            **gripper_terms(self.observation, reading),
-            **dict.fromkeys((f"frozen {view}" for view in frozen_views(self.observation, reading)), WORST_TERM),
-        }
+        observation = self.observation
+        terms = dict(pose_terms(observation, reading) if poses is None else poses)
+        terms |= image_terms(observation, reading) | gripper_terms(observation, reading)
+        return terms | {f"frozen {view}": WORST_TERM for view in frozen_views(observation, reading)}
 
     def explain(self, reading: Reading, terms: dict[str, float], other: tuple[str, str] | None = None) -> Explanation:
         """A reading with its score: the sum of its terms, less the cost of departing from the contract."""
@@ -203,10 +199,9 @@ class _Search:
 
     def read(self, conventions: RecordedConventions) -> Reading | None:
         """The episode under these conventions; None where they do not apply."""
-        try:
+        with suppress(RejectedInputError):
             return read(self.observation, conventions)
-        except RejectedInputError:
-            return None
+        return None
 
     def singles(self) -> list[Explanation]:
         """Every usual mistake, one at a time."""
@@ -225,13 +220,9 @@ class _Search:
         better = [(view,) for view in views if gains[view] > 1.0]
         clearly = tuple(view for view in views if gains[view] > MIN_MARGIN)
         for chosen in dict.fromkeys([*better, clearly]):
-            if not chosen or len(chosen) == len(views):
-                continue
-            own = tuple(f" {view}" for view in chosen)
-            merged = {name: value for name, value in written.items() if not name.endswith(own)}
-            merged |= {name: value for name, value in terms.items() if name.endswith(own)}
-            conventions = late.conventions.model_copy(update={"views": chosen})
-            yield self.explain(replace(late, conventions=conventions), merged)
+            if chosen and len(chosen) < len(views):
+                conventions = late.conventions.model_copy(update={"views": chosen})
+                yield self.explain(replace(late, conventions=conventions), _exchanged(written, terms, chosen))
 
     def exchanged_wrist_cameras(self) -> Iterator[Explanation]:
         """Two wrist cameras with each other's poses, or each other's videos."""
@@ -280,33 +271,21 @@ class _Search:
         better = tuple(view for view in views if _of_view(terms, view) > _of_view(written, view) + 1.0)
         if not better or len(better) == len(views):
             return self.explain(reading, terms)
-        others = tuple(f" {view}" for view in views if view not in better)
-        merged = {name: value for name, value in terms.items() if not name.endswith(others)}
-        merged |= {name: value for name, value in written.items() if name.endswith(others)}
         partial = self.read(reading.conventions.model_copy(update={"views": better}))
+        merged = _exchanged(terms, written, [view for view in views if view not in better])
         return self.explain(reading if partial is None else partial, merged)
-
-    def is_suspicious(self, explanation: Explanation) -> bool:
-        return any(
-            value < SUSPICION and TERM_LIMITS.get(name.split(" ")[0], 0.0) > -np.inf
-            for name, value in explanation.evidence.items()
-        )
 
     def pairs(self, ranked: list[Explanation]) -> list[Explanation]:
         """Two mistakes at once: one of the best single ones, with another or with the numbers estimated beside it."""
-        first: dict[str, Explanation] = {}
+        first: dict[str, RecordedConventions] = {}
         for explanation in ranked:
             if explanation.departures and explanation.other is None:
-                first.setdefault(explanation.mistake, explanation)
+                first.setdefault(explanation.mistake, explanation.conventions)
         ones = list(first.values())[:PAIRED_MISTAKES]
         found: dict[RecordedConventions, Explanation] = {}
         for number, one in enumerate(ones):
-            undone = self.read(one.conventions)
-            if undone is None:
-                continue
-            others = [two.conventions for two in ones[number + 1 :]]
-            for conventions in (*others, *self.numbers_beside(undone)):
-                both = _together(one.conventions, conventions)
+            beside = () if (undone := self.read(one)) is None else (*ones[number + 1 :], *self.numbers_beside(undone))
+            for both in (_together(one, conventions) for conventions in beside):
                 if both is not None and both not in found and (reading := self.read(both)) is not None:
                     found[both] = self.explain(reading, self.terms(reading))
         return list(found.values())
@@ -332,6 +311,13 @@ class _Search:
 def _of_view(evidence: Mapping[str, float], view: str) -> float:
     """Sum of the terms of a view."""
     return sum(value for name, value in evidence.items() if name.endswith(f" {view}"))
+
+
+def _exchanged(evidence: Mapping[str, float], other: Mapping[str, float], views: Iterable[str]) -> dict[str, float]:
+    """The evidence, in which the terms of some views are those of another reading."""
+    ends = tuple(f" {view}" for view in views)
+    kept = {name: value for name, value in evidence.items() if not name.endswith(ends)}
+    return kept | {name: value for name, value in other.items() if name.endswith(ends)}
 
 
 def _together(one: RecordedConventions, two: RecordedConventions) -> RecordedConventions | None:
@@ -365,9 +351,9 @@ def conventions_to_try(observation: Observation, recorded: Reading) -> list[Reco
     """One mistake each, without image lags (see `image_lags`), most of them with a fixed value."""
     episode, kinematics = observation.episode, observation.kinematics
     found = [c for c in _FIXED_MISTAKES if applicable(episode, c.departures[0])]
-    if kinematics is not None and episode.state_kind == "joints":
-        unequal = len({len(arm.joints) for arm in kinematics.embodiment.arms}) > 1
-        found = [c for c in found if not (unequal and c.arms == "exchanged")]
+    arms = kinematics.embodiment.arms if kinematics is not None and episode.state_kind == "joints" else ()
+    if len({len(arm.joints) for arm in arms}) > 1:
+        found = [c for c in found if c.arms != "exchanged"]
     found += [RecordedConventions(intrinsics_size=size) for size in intrinsics_sizes(episode.cameras)]
     found += [RecordedConventions(camera_lag_frames=lag) for lag in camera_lags(observation, recorded)]
     if (offset := tool_offset(observation, recorded)) is not None:
@@ -400,12 +386,10 @@ def _camera_lag_scores(observation: Observation, recorded: Reading, tools: np.nd
     largest = min(MAX_LAG_FRAMES, len(tools) // 3)
     scores: dict[int, float] = {}
     for view, i in observation.wrists.items():
-        camera = recorded.cameras.get(view)
-        if camera is None or not camera.moving:
-            continue
-        for lag in range(-largest, largest + 1):
-            _, metres, degrees = rms_hand_eye(*lagged(tools[:, i], camera.T_base_camera, lag))
-            scores[lag] = scores.get(lag, 0.0) + hand_eye_log_likelihood(metres, degrees)
+        if (camera := recorded.cameras.get(view)) is not None and camera.moving:
+            for lag in range(-largest, largest + 1):
+                _, metres, degrees = rms_hand_eye(*lagged(tools[:, i], camera.T_base_camera, lag))
+                scores[lag] = scores.get(lag, 0.0) + hand_eye_log_likelihood(metres, degrees)
     return scores
 
 
@@ -424,10 +408,8 @@ def intrinsics_sizes(cameras: Mapping[str, CameraTrack]) -> list[tuple[int, int]
             continue
         common = [s for s in _COMMON_SIZES if max(abs(s[0] / height - 1), abs(s[1] / width - 1)) < INTRINSICS_SNAP]
         size = min(common, key=lambda s: abs(s[0] / height - 1) + abs(s[1] / width - 1), default=None)
-        size = size or (round(height), round(width))
-        if size not in sizes:
-            sizes.append(size)
-    return sizes
+        sizes.append(size or (round(height), round(width)))
+    return list(dict.fromkeys(sizes))
 
 
 def tool_offset(observation: Observation, recorded: Reading) -> float | None:
@@ -440,17 +422,13 @@ def tool_offset(observation: Observation, recorded: Reading) -> float | None:
     offsets: list[float] = []
     if recorded.kinematic_tools is not None:
         apart = rigid_inverse(recorded.tools) @ recorded.kinematic_tools
-        offsets = [float(np.median(apart[:, i, 2, 3])) for i in range(apart.shape[1])]
+        offsets = np.median(apart[:, :, 2, 3], axis=0).tolist()
     else:
         for i, arm in enumerate(observation.arms):
-            camera = recorded.cameras.get(arm.wrist_view)
-            if arm.T_tool_mount is None or camera is None:
-                continue
-            mount, _, _ = rms_hand_eye(recorded.tools[:, i], camera.poses(np.arange(len(recorded.tools))))
-            offsets.append(float(mount[2, 3] - arm.T_tool_mount[2, 3]))
-    if not offsets:
-        return None
-    offset = float(np.median(offsets))
+            if arm.T_tool_mount is not None and (camera := recorded.cameras.get(arm.wrist_view)) is not None:
+                mount, _, _ = rms_hand_eye(recorded.tools[:, i], camera.poses(np.arange(len(recorded.tools))))
+                offsets.append(float(mount[2, 3] - arm.T_tool_mount[2, 3]))
+    offset = float(np.median(offsets)) if offsets else 0.0
     return round(offset, 4) if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None
 
 
@@ -480,10 +458,8 @@ def notes_on(observation: Observation, recorded: Reading) -> list[str]:
         poses = camera.poses(np.arange(len(commands)))
         states_m, commands_m = (rms_hand_eye(tools[:, i], poses)[1] for tools in (recorded.tools, commands))
         if states_m > NOTICEABLE_M and states_m > COMMANDS_FIT_RATIO * commands_m:
-            notes.append(
-                f"{view}: the camera poses follow the commands ({1e3 * commands_m:.1f} mm), "
-                f"not the states ({1e3 * states_m:.1f} mm)"
-            )
+            fits = f"follow the commands ({1e3 * commands_m:.1f} mm), not the states ({1e3 * states_m:.1f} mm)"
+            notes.append(f"{view}: the camera poses {fits}")
     if recorded.gripper is None:
         return [*notes, "gripper: the state names no gripper columns, polarity is not judged"]
     for i, arm in enumerate(observation.arms):

@@ -147,10 +147,6 @@ class CameraError:
         return self.information / (1 + self.episodes * self.shared) + _PRIOR
 
     @cached_property
-    def covariance(self) -> np.ndarray:
-        return np.linalg.inv(self.posterior)
-
-    @cached_property
     def estimate(self) -> np.ndarray:
         """(8,) in the units of KINDS: `solved`, drawn to zero where little is known."""
         pull = (self.information + _PRIOR) @ self.solved / (1 + self.episodes * self.shared)
@@ -159,7 +155,7 @@ class CameraError:
     @cached_property
     def kinds(self) -> tuple[KindOfError, ...]:
         """Each kind whatever the others are; beside them where it moves the robot in the picture, if that is known."""
-        return kinds_of_error(self.estimate, self.covariance, self.shown)
+        return kinds_of_error(self.estimate, np.linalg.inv(self.posterior), self.shown)
 
     @property
     def squares(self) -> float:
@@ -668,8 +664,7 @@ def combine(episodes: Sequence[Sequence[CameraError]]) -> tuple[CameraError, ...
 
 def significant(errors: Sequence[CameraError], *, together: bool = False) -> tuple[CameraError, ...]:
     """The cameras that are certainly off; `together`: the errors are those of a source, not of one episode."""
-    limit = SQUARES_TOGETHER if together else SQUARES_ALONE
-    return tuple(error for error in errors if error.squares > limit)
+    return tuple(error for error in errors if error.squares > (SQUARES_TOGETHER if together else SQUARES_ALONE))
 
 
 def corrected_camera(camera: CameraTrack, error: CameraError) -> CameraTrack:

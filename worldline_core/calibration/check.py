@@ -1,25 +1,43 @@
 """`worldline calibrate check`: every episode of a source or a set diagnosed, pictured, and summed up.
 
-Writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg` into one folder. Nothing is repaired here.
+Writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg` into one folder. Nothing is repaired here. Unlike action
+tracks, which let wrist cameras follow the kinematics, pictures use the camera poses *as recorded*. The arms' outline is drawn
+into the head view: beside the arm it is the plainest sign of a wrong calibration.
 """
 
 from __future__ import annotations
 
-import logging
+import json
+import textwrap
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+from markupsafe import Markup
+from pydantic import ConfigDict, TypeAdapter
 
+from worldline_core.actions.action_tracks import project_tools, tracks_of_projection
+from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
+from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip
+from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck, as_json, diagnosis_picture, page
-from worldline_core.calibration.diagnosis import Explanation, SourceDiagnosis, diagnose_source
+from worldline_core.calibration.camera_errors import corrected_camera
+from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, Explanation, SourceDiagnosis, diagnose_source
 from worldline_core.config import apply_overrides, load_config, read_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.episode_checks import check_camera, check_times, check_values
-from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.conventions import (
+    RecordedConventions,
+    along_tool_z,
+    apply_conventions,
+    frames_with_all,
+)
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
@@ -28,29 +46,100 @@ from worldline_core.data.guards.rejection import RejectedInputError, check_lengt
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.sources.guarded import GuardedSource
 from worldline_core.data.sources.open import SourceConfig
-from worldline_core.data.video.frames import MadeFrames
+from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
-from worldline_core.pictures import jpeg_bytes
+from worldline_core.pages.page import Table, render, words
+from worldline_core.pictures import (
+    INK,
+    MUTED,
+    Picture,
+    SheetRow,
+    contact_sheet,
+    draw_tag,
+    evenly_spaced,
+    jpeg_bytes,
+    text_strip,
+)
 from worldline_core.progress import Progress
 from worldline_core.scale.account import crash_evidence
 from worldline_core.scale.mapping import ends_the_run
 from worldline_core.store.artifact_files import verify_artifact
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
-logger = logging.getLogger(__name__)
-
 OUTPUT_ROOT = Path("artifacts") / "calibration"
+MEANINGS = {
+    "unexplained": "the recording disagrees with its calibration, and under no usual mistake it agrees",
+    "explained": "one usual mistake explains what is wrong; the line repairs it",
+    "off": "a camera is off: which one, in what and by how much is said beside it",
+    "unreadable": "the episode cannot be read",
+    "not_judged": "judging it failed",
+    "too_little_evidence": "too little moves, or too little is calibrated, to judge",
+    "consistent": "the recording agrees with its calibration, within what is said beside it",
+}
+"""By verdict, the worst first."""
+TONES = dict.fromkeys(MEANINGS, "bad") | {"too_little_evidence": "", "consistent": "good"}
+COLUMNS = ("Episode", "Verdict", "Best explanation")
+TILE_HEIGHT, MIN_WIDTH, MOMENTS = 256, 760, 3
+SIGMA_PX_REF = 18.0
+"""Wide enough to be seen at tile size, narrow enough to leave the gripper visible."""
+
+
+@dataclass(frozen=True)
+class EpisodeCheck:
+    """A diagnosis, or a reason code with its `detail`; `picture` is relative to the output folder."""
+
+    episode_id: str
+    source: str
+    diagnosis: Diagnosis | None
+    reason: str | None = None
+    detail: str = ""
+    config_lines: tuple[str, ...] = ()
+    picture: str | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        if self.diagnosis is not None:
+            return self.diagnosis.verdict
+        return "not_judged" if self.reason == "crashed" else "unreadable"
+
+    @property
+    def row(self) -> tuple[str, str, str]:
+        """Cells of COLUMNS."""
+        if self.diagnosis is not None:
+            return self.episode_id, verdict_text(self.diagnosis), self.diagnosis.best.mistake
+        why = textwrap.shorten(f"{self.reason}: {self.detail}", 160, placeholder=" ...")
+        return self.episode_id, self.verdict, why
+
+
+@dataclass(frozen=True)
+class CalibrationCheck:
+    """All results, and the folder that they were written to."""
+
+    episodes: tuple[EpisodeCheck, ...]
+    sources: tuple[SourceDiagnosis, ...]
+    output: Path
+
+    @property
+    def consistent(self) -> bool:
+        """True if some episode is consistent by its pictures, and nothing is wrong with any other."""
+        verdicts = {episode.verdict for episode in self.episodes}
+        seen = any(e.diagnosis is not None and e.diagnosis.camera_errors for e in self.episodes)
+        sound = not verdicts & {"off", "explained", "unexplained", "unreadable", "not_judged"}
+        together = all(s.verdict not in ("off", "explained", "mixed") for s in self.sources)
+        return sound and seen and "consistent" in verdicts and together
+
+    @property
+    def counted(self) -> dict[str, int]:
+        """Episodes by verdict, the worst first."""
+        counts = Counter(episode.verdict for episode in self.episodes)
+        return {name: counts[name] for name in MEANINGS if counts[name]}
 
 
 @dataclass(frozen=True)
 class ListedEpisode:
-    """An episode to check, and the configuration of its source.
-
-    Attributes:
-        declared: conventions that the configuration declares already.
-        declares_robot: whether the configuration names the robot, not the recording.
-    """
+    """An episode to check, and what its source's configuration declares: conventions, and whether it names the robot."""
 
     episode_id: str
     source: str
@@ -61,11 +150,11 @@ class ListedEpisode:
 
 
 def repairing_lines(item: ListedEpisode, explanation: Explanation) -> tuple[str, ...]:
-    """Lines for the source's configuration if the explanation holds; none for the recording as written, or where no line
-    repairs it."""
-    if explanation.other is not None and explanation.other[0] == "embodiment" and item.declares_robot:
-        return (f"{item.config_prefix.removesuffix('conventions')}{': '.join(explanation.other)}",)
-    if explanation.other is not None or not explanation.departures:
+    """Lines for the source's configuration if the explanation holds; none where no line repairs the recording."""
+    if explanation.other is not None:
+        line = f"{item.config_prefix.removesuffix('conventions')}{': '.join(explanation.other)}"
+        return (line,) if explanation.other[0] == "embodiment" and item.declares_robot else ()
+    if not explanation.departures:
         return ()
     if item.declared.departures:
         return (f"remove {item.config_prefix} and check again: beside them, {explanation.text} was found",)
@@ -86,14 +175,11 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
 def episodes_of_sources(sources: Iterable[SourceConfig], limits: ReaderLimits) -> list[ListedEpisode]:
     """The episodes of every source. One is first read through in a process with limits, then here."""
     listed: list[ListedEpisode] = []
-    for number, source_config in enumerate(sources):
-        source = GuardedSource(source_config, limits)
-        prefix = f"curate.sources[{number}].conventions"
-        declared, robot = source_config.conventions, "embodiment" in type(source_config).model_fields
-        listed += [
-            ListedEpisode(episode_id, source_config.label, partial(source.load, episode_id), prefix, declared, robot)
-            for episode_id in source.episode_ids()
-        ]
+    for number, config in enumerate(sources):
+        source, prefix = GuardedSource(config, limits), f"curate.sources[{number}].conventions"
+        declares = prefix, config.conventions, "embodiment" in type(config).model_fields
+        names = source.episode_ids()
+        listed += [ListedEpisode(name, config.label, partial(source.load, name), *declares) for name in names]
     return listed
 
 
@@ -115,8 +201,7 @@ def check_calibration(
 ) -> CalibrationCheck:
     """Diagnoses episodes one after another and writes the result; one that cannot be read or judged is listed with its reason.
 
-    Raises:
-        OSError: the disk is full or cannot be written, which no other episode would escape.
+    Raises: OSError: the disk is full or cannot be written, which no other episode would escape.
     """
     kinematics = KinematicsByName(descriptions or {})
     checked: list[EpisodeCheck] = []
@@ -151,8 +236,8 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName) 
         diagnosis = diagnose(episode, frames, arms)
     except DataError as error:
         reason = error.reason if isinstance(error, RejectedInputError) else "unreadable"
-        details = (("expected", error.expected), ("got", error.got))
-        said = "; ".join([error.what, *(f"{name} {value}" for name, value in details if value is not None)])
+        details = [f"{name} {value}" for name in ("expected", "got") if (value := getattr(error, name)) is not None]
+        said = "; ".join([error.what, *details])
         return EpisodeCheck(item.episode_id, item.source, None, reason, said)
     picture: str | None = f"pictures/{safe_stem(diagnosis.episode_id)}.jpg"
     try:
@@ -192,13 +277,14 @@ def episode_images(loaded: LoadedEpisode, view: str) -> MadeFrames:
 
 def _sum_up(listed: Sequence[ListedEpisode], checked: Sequence[EpisodeCheck]) -> Iterator[SourceDiagnosis]:
     """A conclusion for each source that more than one episode could be diagnosed of."""
-    for source in dict.fromkeys(item.source for item in listed):
-        of_source = next(item for item in listed if item.source == source)
+    first: dict[str, ListedEpisode] = {}
+    for item in listed:
+        first.setdefault(item.source, item)
+    for source, item in first.items():
         diagnoses = [f.diagnosis for f in checked if f.source == source and f.diagnosis is not None]
-        if len(diagnoses) < 2:
-            continue
-        summed = diagnose_source(source, diagnoses)
-        yield replace(summed, config_lines=repairing_lines(of_source, summed.best))
+        if len(diagnoses) > 1:
+            summed = diagnose_source(source, diagnoses)
+            yield replace(summed, config_lines=repairing_lines(item, summed.best))
 
 
 def check_command(
@@ -209,12 +295,9 @@ def check_command(
     episodes: Sequence[str] = (),
     output: Path | None = None,
 ) -> CalibrationCheck:
-    """Check the sources of a configuration file, or an EpisodeSet.
+    """Check the sources of a configuration file (`overrides`: `a.b=value`), or an EpisodeSet; of `episodes`, or of all.
 
-    Args:
-        overrides: `a.b=value`, changes of the file.
-        episodes: ids to look at; none: all.
-        output: default `artifacts/calibration/<name of the file or folder>`.
+    Writes into `artifacts/calibration/<name of the file or folder>` without `output`.
 
     Raises:
         ConfigError: neither or both of file and folder are given, or the file has a mistake.
@@ -236,3 +319,229 @@ def check_command(
         raise DataError("No such episode", expected=expected, got=", ".join(sorted(unknown)))
     chosen = [item for item in listed if not episodes or item.episode_id in episodes]
     return check_calibration(chosen, output or OUTPUT_ROOT / name, descriptions=descriptions)
+
+
+# Texts and pages
+
+
+def verdict_text(found: Conclusion) -> str:
+    """The verdict, with the cameras that are off or what could have gone unseen, and the views that nothing judges."""
+    said = words(found.verdict)
+    if found.verdict == "off":
+        said = f"off: {', '.join(map(str, found.off))}"
+    elif found.verdict == "consistent" and found.camera_errors:
+        # How far the robot may be from its place in the picture; of a wrist camera, by how much it may be turned.
+        shown = [(e.view, e.kinds[-1] if e.shown is not None else e.kinds[0]) for e in found.camera_errors]
+        said += f" within {', '.join(f'{kind.bound:.1f} {kind.unit} ({view})' for view, kind in shown)}"
+    elif found.verdict == "consistent":
+        said += " by its poses, but no picture says within what"
+    return f"{said}; not judged: {', '.join(found.not_judged)}" if found.not_judged else said
+
+
+def table_text(check: CalibrationCheck) -> str:
+    """The table of episodes, the conclusion over each source, and the lines that repair it."""
+    rows = [tuple(name.lower() for name in COLUMNS), *(episode.row for episode in check.episodes)]
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    return "\n".join([*lines, "", *conclusion_lines(check), "", f"pictures: {check.output / 'index.html'}"])
+
+
+def conclusion_lines(check: CalibrationCheck) -> list[str]:
+    """Conclusions over each source, then over the episodes that these do not cover."""
+    parts = [f"{count} {words(name)}" for name, count in check.counted.items()]
+    lines = [f"{len(check.episodes)} episodes: {', '.join(parts)}"]
+    for found in check.sources:
+        said = verdict_text(found)
+        if found.verdict == "mixed":
+            said += ": its episodes were not written the same way, no line is right for all of them"
+        elif found.verdict == "explained":
+            said += f" by {found.best.mistake if found.best.other is None else found.best.text}"
+        lines += ["", f"source {found.source}, {found.num_episodes} episodes together: {said}"]
+        votes = sorted(found.votes.items(), key=lambda item: (-item[1], item[0]))
+        lines.append(f"  single episodes say: {', '.join(f'{words(n)} {count}' for n, count in votes) or 'nothing'}")
+        for error in found.camera_errors:
+            bounds = [f"{each.kind} {each.bound:.1f} {each.unit}" for each in error.kinds]
+            lines.append(f"  {error.view} within: {', '.join(bounds)}")
+            if error.contradicting:
+                lines.append(f"  {error.view}: {error.contradicting} of {error.episodes} episodes say otherwise")
+        lines += [f"  {view} not judged: {why}" for view, why in found.not_judged.items()]
+        own = [note for episode in check.episodes if episode.source == found.source for note in episode.notes]
+        lines += [f"  note: {note}" for note in dict.fromkeys((*found.notes, *own))]
+        lines += [f"  near: {near}" for near in found.nearest]
+        if found.config_lines:
+            lines += ["  what repairs it, in the configuration of this source:"]
+            lines += [f"    {line}" for line in found.config_lines]
+    return [*lines, *_single_episodes(check)]
+
+
+def _single_episodes(check: CalibrationCheck) -> list[str]:
+    """Episodes that the conclusion over their source does not cover: what repairs them, what comes nearest, and notes."""
+    together = {found.source: found for found in check.sources}
+    lines = []
+    for episode in check.episodes:
+        found, diagnosis = together.get(episode.source), episode.diagnosis
+        if diagnosis is None or (found is not None and diagnosis.verdict not in ("explained", "unexplained")):
+            continue
+        if found is not None and (found.verdict, found.config_lines) == (diagnosis.verdict, episode.config_lines):
+            continue
+        notes = (*diagnosis.notes, *episode.notes) if found is None else ()  # else printed with the source
+        own = [f"    note: {note}" for note in notes]
+        own += [f"    near: {near}" for near in diagnosis.nearest]
+        own += [f"    {line}" for line in episode.config_lines]
+        lines += [f"  {episode.episode_id}:", *own] if own else []
+    header = ["", "single episodes (give those that differ a source of their own, by `include`):"]
+    return [*header, *lines] if lines else []
+
+
+def as_json(check: CalibrationCheck) -> dict[str, Any]:
+    """Everything in plain values; numbers that are not finite become null."""
+    episodes = []
+    for each in check.episodes:
+        content = {} if each.diagnosis is None else _conclusion_json(each.diagnosis)
+        content["notes"] = (*content.get("notes", ()), *each.notes)
+        names = ("episode_id", "source", "verdict", "reason", "detail", "config_lines", "picture")
+        episodes.append({name: getattr(each, name) for name in names} | content)
+    names = ("source", "num_episodes", "votes", "config_lines")
+    sources = [{name: getattr(found, name) for name in names} | _conclusion_json(found) for found in check.sources]
+    content = {"consistent": check.consistent, "episodes": episodes, "sources": sources}
+    return json.loads(TypeAdapter(Any, config=ConfigDict(ser_json_inf_nan="null")).dump_json(content))
+
+
+def _conclusion_json(found: Conclusion) -> dict[str, Any]:
+    return {
+        "verdict": found.verdict,
+        "mistake": found.best.mistake,
+        "score": found.best.score,
+        "score_as_recorded": found.as_recorded.score,
+        "notes": found.notes,
+        "nearest": found.nearest,
+        "camera_errors": [
+            {"view": e.view, "off": e in found.off, "kind": each.kind, "unit": each.unit, "bound": each.bound}
+            for e in found.camera_errors
+            for each in e.kinds
+        ],
+        "not_judged": found.not_judged,
+    }
+
+
+def page(check: CalibrationCheck) -> str:
+    """The page: conclusions first, then a table, then a picture of each episode, the worst first."""
+    order = list(MEANINGS)
+    episodes = sorted(check.episodes, key=lambda episode: (order.index(episode.verdict), episode.episode_id))
+    return render(
+        "calibration/check_page.html",
+        title="Calibration check",
+        subtitle=f"{len(episodes)} episodes, judged by what they show.",
+        check=check,
+        episodes=episodes,
+        meanings=MEANINGS,
+        tones=TONES,
+        conclusions="\n".join(conclusion_lines(check)),
+        table=Table(COLUMNS, [_page_row(episode) for episode in episodes]),
+    )
+
+
+def _page_row(episode: EpisodeCheck) -> list[object]:
+    name, verdict, *rest = episode.row
+    tag = Markup('<span class="tag {}">{}</span>').format(TONES[episode.verdict], verdict)
+    return [name if episode.diagnosis is None else Markup('<a href="#{0}">{0}</a>').format(name), tag, *rest]
+
+
+# Pictures
+
+
+def diagnosis_picture(
+    diagnosis: Diagnosis,
+    recorded: Episode,
+    frames: Mapping[str, Frames],
+    kinematics: ArmKinematics | None,
+) -> Picture:
+    """One picture per episode: left as recorded, right as repaired, the same frames on both sides.
+
+    Raises: DataError when nothing can be drawn in any view.
+    """
+    conventions = diagnosis.best.conventions
+    repaired, offset, first = None, 0.0, 0
+    if conventions.departures:
+        if recorded.T_base_ee is None:
+            # Tools come from kinematics: apply_conventions has no recorded poses to move.
+            offset = conventions.tool_offset_z_m
+            conventions = conventions.model_copy(update={"tool_offset_z_m": 0.0})
+        repaired = apply_conventions(recorded, conventions)
+        first = frames_with_all(recorded.num_frames, conventions)[0]
+    elif diagnosis.verdict == "off":
+        cameras = {e.view: corrected_camera(recorded.cameras[e.view], e) for e in diagnosis.off}
+        repaired = replace(recorded, cameras={**recorded.cameras, **cameras})
+    left: list[SheetRow] = []
+    right: list[SheetRow] = []
+    arms: Sequence[str] = ()
+    for view in (view for view in frames if view in recorded.cameras):
+        before = recorded_tracks(recorded, view, kinematics)
+        after = before if repaired is None else recorded_tracks(repaired, view, kinematics, offset)
+        # Image m belongs to state m as recorded, and to state m - lag of the repaired episode.
+        lag = 0 if repaired is None else first + conventions.image_lag(view)
+        common = [n for n in range(min(len(frames[view]), before.num_frames)) if 0 <= n - lag < after.num_frames]
+        chosen = [common[i] for i in evenly_spaced(len(common), 2 * MOMENTS if repaired is None else MOMENTS)]
+        if not chosen:
+            continue
+        arms = before.arms
+        shown = {n: image for n, image in enumerate(islice(frames[view], max(chosen) + 1)) if n in chosen}
+        left.append(SheetRow(words(view), _drawn(shown, before, view, 0)))
+        if repaired is not None:
+            right.append(SheetRow(words(view), _drawn(shown, after, view, lag)))
+    if not left:
+        expected = "a calibrated view with images"
+        raise DataError("Nothing to draw", where=f"episode {recorded.episode_id}", expected=expected)
+    best, verdict = diagnosis.best, verdict_text(diagnosis)
+    titles = "as recorded", f"repaired: {best.text if best.departures else verdict}"
+    rows = [each for each in zip((left, right), titles, strict=True) if each[0]]
+    sheets = [contact_sheet(row, tile_height=TILE_HEIGHT, title=title, min_width=MIN_WIDTH) for row, title in rows]
+    body = np.concatenate(sheets, axis=1)
+    width, heading = body.shape[1], f"{verdict} {best.mistake if best.departures else ''}"
+    return np.concatenate([
+        text_strip(f"{recorded.episode_id}  ·  {recorded.embodiment}", width, 34, size_px=21, ink=INK),
+        text_strip(heading, width, 24, size_px=15, ink=MUTED),
+        body,
+        legend_strip(arms, width, outline=HEAD_VIEW in frames),
+    ])  # fmt: skip
+
+
+def recorded_tracks(
+    episode: Episode, view: str, kinematics: ArmKinematics | None, tool_offset_z_m: float = 0.0
+) -> EpisodeTracks:
+    """The state's tools, moved along their +z, in one view with K and camera poses as the episode has them."""
+    camera = episode.cameras[view]
+    if episode.T_base_ee is not None:
+        tools = torch.tensor(episode.T_base_ee, dtype=torch.float64)
+        gripper = torch.zeros(tools.shape[:2]) if episode.gripper is None else torch.tensor(episode.gripper)
+        capsules, radii = tool_capsules(tools)
+    elif kinematics is not None and episode.state_kind == "joints":
+        state = np.array(episode.state, dtype=np.float64)
+        links = kinematics.link_poses(state)
+        tools, gripper = kinematics.tools_of(links), kinematics.gripper(state)
+        capsules, radii = robot_capsules(kinematics, links)
+    else:
+        expected = "recorded tool poses, or joints and kinematics"
+        raise DataError("No tools to draw", where=f"episode {episode.episode_id}", expected=expected)
+    tools = torch.from_numpy(along_tool_z(tools.numpy(), tool_offset_z_m))
+    poses = torch.tensor(camera.poses(np.arange(episode.num_frames)), dtype=torch.float64)[:, None]
+    K = torch.tensor(camera.K, dtype=torch.float64)[None]
+    size, count = (camera.height, camera.width), tools.shape[1]
+    return tracks_of_projection(
+        episode, project_tools(tools, gripper.double(), K, poses, size), tools, poses, K, capsules, radii,
+        views=(view,),
+        arms=("left", "right") if count == 2 else ("right",) if count == 1 else tuple(f"arm{i}" for i in range(count)),
+        image_size=size,
+        controls="state",
+        camera_motion=("recorded",),
+    )  # fmt: skip
+
+
+def _drawn(images: Mapping[int, np.ndarray], tracks: EpisodeTracks, view: str, lag: int) -> np.ndarray:
+    """Tiles of images by number."""
+    style = OverlayStyle(SIGMA_PX_REF, heat=0.5, outline=view == HEAD_VIEW)
+    tiles = []
+    for n, image in images.items():
+        tile = draw_overlay(image, tracks, n - lag, view, tile_height=TILE_HEIGHT, style=style)
+        tiles.append(draw_tag(tile, f"frame {n}", size_px=11))
+    return np.stack(tiles)

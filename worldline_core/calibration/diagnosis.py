@@ -1,6 +1,5 @@
-"""Diagnoses: the verdict from the scores of an episode's readings, and the verdict over the episodes of a source.
-
-The episodes of a source were written the same way, so their scores are added up.
+"""The verdict from the scores of an episode's readings, and over a source, whose episodes were written the same way: their
+scores are added up.
 """
 
 from __future__ import annotations
@@ -60,11 +59,9 @@ class Explanation:
     """One reading of the recording.
 
     Attributes:
-        score: log-likelihood of all evidence; 0 is as in a healthy recording, lower is worse. Differences between readings
-            of one episode are meaningful, and add up over episodes.
-        evidence: the terms of an episode's score by name ("hand-eye left_wrist", ...); each at most 0.
-        other: (name, value) of a mistake without a convention: ("embodiment", the robot that fits),
-            ("wrist_extrinsics", "exchanged"), ("wrist_videos", "exchanged").
+        score: log-likelihood of all evidence; 0 is as in a healthy recording, lower is worse.
+        evidence: the terms of an episode's score by name ("hand-eye left_wrist", ...).
+        other: a mistake without a convention: ("embodiment", robot), ("wrist_extrinsics" or "wrist_videos", "exchanged").
     """
 
     conventions: RecordedConventions
@@ -90,7 +87,6 @@ class Explanation:
 
     @property
     def lag_at_edge(self) -> bool:
-        """True for a lag at the edge of the search."""
         lags = self.conventions.camera_lag_frames, self.conventions.image_lag_frames
         return max(map(abs, lags)) >= MAX_LAG_FRAMES
 
@@ -110,12 +106,9 @@ NOTHING_TRIED = Explanation(RecordedConventions(), 0.0, {})
 
 @dataclass(frozen=True, kw_only=True)
 class Conclusion:
-    """Conclusion over an episode or a source.
+    """Conclusion over an episode or a source; docs/calibration.md says what each verdict means.
 
     Attributes:
-        verdict: consistent (good as recorded), off (`off` lists the cameras), explained (`best` is the mistake),
-            unexplained (bad as recorded, and in every reading), too_little_evidence; of a source also mixed (its episodes
-            contradict each other).
         best: the reading to believe; the recording as written unless the verdict is explained.
         ranked: all readings that were tried, best score first; of a source the one as written.
         notes: limits of the evidence, and other facts for a person.
@@ -141,10 +134,9 @@ class Conclusion:
         """With the cameras' errors; consistent becomes `off` where one is significant (`together`: over a source), and
         `mixed` where the episodes of a source contradict each other."""
         off, verdict = significant(errors, together=together), self.verdict
-        if verdict == "consistent" and any(e.contradicting > tolerated_episodes(e.episodes) for e in errors):
-            verdict = "mixed"
-        elif verdict == "consistent" and off:
-            verdict = "off"
+        if verdict == "consistent":
+            mixed = any(e.contradicting > tolerated_episodes(e.episodes) for e in errors)
+            verdict = "mixed" if mixed else "off" if off else verdict
         return replace(self, verdict=verdict, camera_errors=errors, off=off)
 
 
@@ -166,12 +158,9 @@ class SourceDiagnosis(Conclusion):
 
 
 def bad_terms(explanation: Explanation, as_recorded: Explanation | None = None) -> dict[str, float]:
-    """The terms that no healthy recording has, by name.
+    """The terms that no healthy recording has, by name. With `as_recorded` those of a departing explanation, which must leave
+    nothing suspicious but what is tolerated as written and did not get worse."""
 
-    Args:
-        as_recorded: the recording as written, for a departing explanation, which must leave nothing suspicious but what is
-            tolerated as written and did not get worse.
-    """
     bad = {}
     for name, value in explanation.evidence.items():
         kind = name.split(" ")[0]
@@ -199,14 +188,13 @@ def nearest_texts(ranked: Iterable[Explanation], as_recorded: Explanation) -> tu
     """The best readings without a common mistake, each with what is still wrong under it."""
     texts: list[str] = []
     shown: set[str] = set()
-    for explanation in ranked:
-        if explanation.score <= as_recorded.score or shown & set(explanation.departures):
-            continue
-        shown |= set(explanation.departures)
-        bad = sorted(bad_terms(explanation, as_recorded).items(), key=lambda item: item[1])
-        remains = ", ".join(f"{name} {value:.1f}" for name, value in bad[:TERMS_SHOWN]) or "nothing"
-        more = f" and {len(bad) - TERMS_SHOWN} more" if len(bad) > TERMS_SHOWN else ""
-        texts.append(f"{explanation.text} (score {explanation.score:.1f}): still wrong {remains}{more}")
+    for found in ranked:
+        if found.score > as_recorded.score and not shown & set(found.departures):
+            shown |= set(found.departures)
+            bad = sorted(bad_terms(found, as_recorded).items(), key=lambda item: item[1])
+            remains = ", ".join(f"{name} {value:.1f}" for name, value in bad[:TERMS_SHOWN]) or "nothing"
+            more = f" and {len(bad) - TERMS_SHOWN} more" if len(bad) > TERMS_SHOWN else ""
+            texts.append(f"{found.text} (score {found.score:.1f}): still wrong {remains}{more}")
     return tuple(texts[:NEAREST_SHOWN])
 
 
@@ -217,14 +205,9 @@ def decide(as_recorded: Explanation, ranked: Sequence[Explanation]) -> tuple[Ver
     if best is not as_recorded and gain >= MIN_MARGIN and not bad_terms(best, as_recorded):
         # Of mistakes that occur together, the one that explains most alone is compared with the others.
         alone = next((e for e in ranked if len(e.departures) == 1 and e.departures[0] in best.departures), best)
-        rivals = [
-            other.text
-            for other in ranked
-            if other.score > alone.score - RIVAL_MARGIN
-            and other is not as_recorded
-            and not set(other.departures) & set(best.departures)
-            and (len(best.departures) > 1 or not bad_terms(other, as_recorded))
-        ]
+        near = [e for e in ranked if e is not as_recorded and e.score > alone.score - RIVAL_MARGIN]
+        near = [e for e in near if not set(e.departures) & set(best.departures)]
+        rivals = [e.text for e in near if len(best.departures) > 1 or not bad_terms(e, as_recorded)]
         in_doubt = [o.text for o in ranked if _of_fewer_views(o, best) and best.score - o.score < VIEWS_COST]
         rivals += in_doubt
         if not rivals:
@@ -271,26 +254,17 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
         verdict = "unexplained"
     elif count - votes["consistent"] - votes["off"] <= tolerated_episodes(count):
         verdict = "consistent"
+    notes = tuple(dict.fromkeys(note for d in listed for note in d.notes))
+    nearest = _nearest(readings, count) if verdict == "unexplained" else ()
+    in_none = {view: why for view, why in listed[0].not_judged.items() if all(view in d.not_judged for d in listed)}
     found = SourceDiagnosis(
-        verdict=verdict,
-        best=best,
-        ranked=(as_recorded,),
-        notes=tuple(dict.fromkeys(note for d in listed for note in d.notes)),
-        nearest=_nearest(readings, count) if verdict == "unexplained" else (),
-        source=source,
-        num_episodes=count,
-        votes=dict(votes),
-        not_judged=_judged_in_none(listed),
-    )
+        verdict=verdict, best=best, ranked=(as_recorded,), notes=notes, nearest=nearest, not_judged=in_none,
+        source=source, num_episodes=count, votes=dict(votes),
+    )  # fmt: skip
     if best.other is not None:
         return found
     alike = {d.episode_id: d.camera_errors for d in listed if d.best.conventions == best.conventions}
     return found.with_camera_errors(combine(list(alike.values())), together=len(alike) >= FEWEST_TOGETHER)
-
-
-def _judged_in_none(diagnoses: Sequence[Diagnosis]) -> dict[str, str]:
-    """The views that no episode's pictures judge, and why."""
-    return {view: why for view, why in diagnoses[0].not_judged.items() if all(view in d.not_judged for d in diagnoses)}
 
 
 _Key = frozenset[tuple[str, str]]
@@ -298,12 +272,8 @@ _ByKey = dict[_Key, Explanation]
 
 
 class _SourceReading:
-    """One reading over all episodes of a source.
-
-    `gain` is its score above that of the recordings as written, `healthy` the number of episodes that are healthy under it,
-    `contradicting` of those that fit as written, or under another reading, but not under this one. It `wins` if it is clearly
-    better than the recordings as written, and most are healthy under it.
-    """
+    """One reading over all episodes of a source: its `gain` over the recordings as written, and the numbers of episodes that are
+    `healthy` under it, and that fit as written or under another reading but not under this one (`contradicting`)."""
 
     def __init__(self, key: _Key, listed: list[Diagnosis], by_key: list[_ByKey]) -> None:
         self.names = {name for name, _ in key}
@@ -341,11 +311,9 @@ class _SourceReading:
 
 
 def _instead_of(key: _Key, found: _ByKey) -> Explanation:
-    """Substitute for a reading that was not tried in an episode.
+    """Substitute for a reading that was not tried in an episode: the largest part of it that was, since a mistake beside
+    another leaves no trace there. For a lag the best other lag if it is worse than none: that lag was not worth trying."""
 
-    The largest part of it that was tried: a mistake beside another leaves no trace there. For a lag, the best other lag if
-    it is worse than none: that lag was not worth trying.
-    """
     part = max((tried for tried in found if tried <= key), key=lambda tried: (len(tried), found[tried].score))
     fields = {name for name, _ in key}
     others = [e for tried, e in found.items() if tried and {name for name, _ in tried} == fields]

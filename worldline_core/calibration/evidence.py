@@ -3,8 +3,7 @@
 Poses: rigid mounts, stated mounts, plausible places, kinematics against records. Pictures, in a fixed view: the projected
 motion of the robot's points against optical flow and image change; in a wrist view: the flow of the scene that the
 camera's own motion predicts (rotation exactly, translation up to one depth for each step); in any view: the speed of what
-moves it against the amount of change. Grippers: does 1 mean open? The typical values are medians over the healthy training
-episodes of the shipped recordings, so decisions rest on differences between readings.
+moves it against the amount of change. Grippers: does 1 mean open? Typical values are medians over healthy shipped recordings.
 """
 
 from __future__ import annotations
@@ -90,7 +89,8 @@ def pose_terms(observation: Observation, reading: Reading) -> dict[str, float]:
         terms["kinematics"] = _kinematics(reading.kinematic_tools, reading.tools)
     for view, camera in reading.cameras.items():
         terms[f"intrinsics {view}"] = _intrinsics(camera)
-        terms[f"camera place {view}"] = _place(camera.T_base_camera)
+        distance = float(np.median(np.linalg.norm(camera.T_base_camera[:, :3, 3], axis=1)))
+        terms[f"camera place {view}"] = _quadratic(_beyond(distance, MAX_CAMERA_M))
         if view in observation.wrists:
             terms |= _wrist(observation, reading, camera)
         else:
@@ -119,25 +119,28 @@ def _quadratic(*ratios: float) -> float:
 
 def _wrist(observation: Observation, reading: Reading, camera: CameraTrack) -> dict[str, float]:
     view, i = camera.view, observation.wrists[camera.view]
-    stated = observation.arms[i].T_tool_mount
     poses = camera.poses(np.arange(len(reading.tools)))
     mount, metres, degrees = rms_hand_eye(reading.tools[:, i], poses)
-    terms = {f"hand-eye {view}": hand_eye_log_likelihood(metres, degrees)}
+    rigid = hand_eye_log_likelihood(metres, degrees)
     if reading.action_tools is not None:
         _, *by_action = rms_hand_eye(reading.action_tools[:, i], poses)
-        followed = hand_eye_log_likelihood(*by_action) - FOLLOWS_COMMANDS_COST
-        terms[f"hand-eye {view}"] = max(terms[f"hand-eye {view}"], followed)
-    if stated is not None:
+        rigid = max(rigid, hand_eye_log_likelihood(*by_action) - FOLLOWS_COMMANDS_COST)
+    terms = {f"hand-eye {view}": rigid}
+    if (stated := observation.arms[i].T_tool_mount) is not None:
         offset, turned = mount_offset(mount, stated)
         terms[f"mount {view}"] = _quadratic(offset / MOUNT_M, turned / MOUNT_DEG)
     # Wherever it is mounted, a wrist camera is near its tool and looks at it.
     tool = rigid_inverse(mount)[:3, 3]
-    distance = float(np.linalg.norm(tool))
     off_axis = float(np.degrees(np.arctan2(np.hypot(tool[0], tool[1]), tool[2])))
-    far = max(0.0, np.log(max(distance, 1e-6) / MAX_WRIST_CAMERA_M)) / 0.2
     aside = max(0.0, off_axis - FACING_DEG) / FACING_SPREAD_DEG
+    far = _beyond(float(np.linalg.norm(tool)), MAX_WRIST_CAMERA_M)
     terms[f"faces its tool {view}"] = max(WORST_FACING_TERM, _quadratic(far, aside))
     return terms
+
+
+def _beyond(distance: float, limit: float) -> float:
+    """Deviations by which a distance is above a limit."""
+    return max(0.0, np.log(max(distance, 1e-6) / limit)) / 0.2
 
 
 def mount_offset(mount: np.ndarray, stated: np.ndarray) -> tuple[float, float]:
@@ -162,11 +165,6 @@ def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, f
     """Horizontal and vertical field of view."""
     horizontal, vertical = (np.degrees(2 * np.arctan2(n, 2 * f)) for n, f in ((width, K[0, 0]), (height, K[1, 1])))
     return float(horizontal), float(vertical)
-
-
-def _place(T_base_camera: np.ndarray) -> float:
-    distance = float(np.median(np.linalg.norm(T_base_camera[:, :3, 3], axis=1)))
-    return _quadratic(max(0.0, np.log(max(distance, 1e-6) / MAX_CAMERA_M)) / 0.2)
 
 
 def in_view_share(reading: Reading, camera: CameraTrack) -> float:
@@ -235,16 +233,14 @@ def frozen_views(observation: Observation, reading: Reading) -> list[str]:
     """Views whose pictures stay the same through several steps in which what they show travels far."""
     found = []
     for view in observation.episode.cameras:
-        if len(observation.gray.get(view, ())) <= MIN_IMAGE_PAIRS:
-            continue
-        speed, change = speed_and_change(observation, reading, view)
-        same = change.max(axis=(1, 2)) < FROZEN_CHANGE
-        travel = longest = 0.0
-        for still, step in zip(same, speed, strict=True):
-            travel = travel + step if still else 0.0
-            longest = max(longest, travel)
-        if longest > (FROZEN_WRIST_TRAVEL_M if view in observation.wrists else FROZEN_TRAVEL_M):
-            found.append(view)
+        if len(observation.gray.get(view, ())) > MIN_IMAGE_PAIRS:
+            speed, change = speed_and_change(observation, reading, view)
+            travel = longest = 0.0
+            for still, step in zip(change.max(axis=(1, 2)) < FROZEN_CHANGE, speed, strict=True):
+                travel = travel + step if still else 0.0
+                longest = max(longest, travel)
+            if longest > (FROZEN_WRIST_TRAVEL_M if view in observation.wrists else FROZEN_TRAVEL_M):
+                found.append(view)
     return found
 
 
@@ -341,19 +337,16 @@ def gripper_terms(observation: Observation, reading: Reading) -> dict[str, float
     terms: dict[str, float] = {}
     if reading.gripper is None:
         return terms
+    signs = ("fingers", finger_flow, FINGERS), ("finger links", finger_agreement, FINGER_LINKS)
     for i, arm in enumerate(observation.arms):
         # A few moving steps may coincide with something else; the weight is the same for all readings.
         moving = np.abs(np.diff(reading.gripper[:, i])) > MIN_OPENING_STEP
         weight = min(1.0, float(moving.sum()) / FULL_OPENING_STEPS)
-        for name, found, (typical, spread) in (
-            ("fingers", finger_flow(observation, reading, i), FINGERS),
-            ("finger links", finger_agreement(observation, reading, i), FINGER_LINKS),
-        ):
-            if found is not None:
+        for name, measure, (typical, spread) in signs:
+            if (found := measure(observation, reading, i)) is not None:
                 deviations = min(((found - typical) / spread) ** 2, LARGEST_DEVIATIONS**2)
                 terms[f"{name} {arm.wrist_view}"] = -0.5 * weight * deviations
-        stopped = stopped_share(reading, i)
-        if stopped is not None:
+        if (stopped := stopped_share(reading, i)) is not None:
             terms[f"stopped gripper {arm.name}"] = STOPPED_TERM * (1 - stopped)
     return terms
 
@@ -361,9 +354,9 @@ def gripper_terms(observation: Observation, reading: Reading) -> dict[str, float
 def finger_agreement(observation: Observation, reading: Reading, arm: int) -> float | None:
     """Correlation (-1..1) of measured flow in the wrist view with that of the finger links by kinematics, None if unknown."""
     view, kinematics = observation.arms[arm].wrist_view, observation.kinematics
-    if kinematics is None or not kinematics.embodiment.arms[arm].gripper.finger_joints:
+    if kinematics is None or not kinematics.embodiment.arms[arm].gripper.finger_joints or reading.shape == "hands":
         return None
-    if reading.shape == "hands" or not _moves(observation, reading, arm):
+    if not _moves(observation, reading, arm):
         return None
     states, images = reading.steps(observation.num_images, view)
     name, camera, flow = f"fingers {arm}", reading.cameras[view], observation.motion(view).flow[images]

@@ -100,14 +100,12 @@ class Observation:
     def with_exchanged_wrists(self) -> Observation | None:
         """The same with the videos of two wrist cameras exchanged; None without two of one size."""
         views = [arm.wrist_view for arm in self.arms]
-        if len(views) != 2 or not all(view in self.gray and view in self.episode.cameras for view in views):
+        both = self.gray.keys() & self.episode.cameras.keys()
+        if len(views) != 2 or not both >= set(views) or self.gray[views[0]].shape != self.gray[views[1]].shape:
             return None
-        if self.gray[views[0]].shape != self.gray[views[1]].shape:
-            return None
-        gray = dict(self.gray) | {one: self.gray[two] for one, two in (views, views[::-1])}
-        motion = {view: self.motion(view) for view in self.gray}
-        motion |= {one: self.motion(two) for one, two in (views, views[::-1])}
-        return replace(self, gray=gray, _motion=motion)
+        others = {view: view for view in self.gray} | {views[0]: views[1], views[1]: views[0]}
+        gray = {view: self.gray[other] for view, other in others.items()}
+        return replace(self, gray=gray, _motion={view: self.motion(other) for view, other in others.items()})
 
     @property
     def wrists(self) -> dict[str, int]:
@@ -130,21 +128,18 @@ def observe(
     return Observation(episode, gray, arms_of(episode, kinematics), kinematics)
 
 
-def small_gray(images: Iterable[np.ndarray]) -> np.ndarray:
-    """uint8 (n, h, GRAY_WIDTH) of RGB (H, W, 3) or grey (H, W) images."""
-    return np.stack([_small(image) for image in images])
-
-
-def _small(image: np.ndarray) -> np.ndarray:
-    if image.ndim not in (2, 3) or image.dtype != np.uint8 or (image.ndim == 3 and image.shape[2] != 3):
-        raise DataError(
-            "Images have a wrong shape", expected="uint8 (H, W, 3) or (H, W)", got=f"{image.dtype} {image.shape}"
-        )
-    if image.ndim == 2 and image.shape[1] == GRAY_WIDTH:
-        return image
-    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    height = max(2, round(image.shape[0] * GRAY_WIDTH / image.shape[1]))
-    return cv2.resize(gray, (GRAY_WIDTH, height), interpolation=cv2.INTER_AREA)
+def small_gray(images: Iterable[np.ndarray], width: int = GRAY_WIDTH) -> np.ndarray:
+    """uint8 (n, h, width) of RGB (H, W, 3) or grey (H, W) images. Raises: DataError for images of another shape."""
+    small = []
+    for image in images:
+        if image.ndim not in (2, 3) or image.dtype != np.uint8 or (image.ndim == 3 and image.shape[2] != 3):
+            expected, got = "uint8 (H, W, 3) or (H, W)", f"{image.dtype} {image.shape}"
+            raise DataError("Images have a wrong shape", expected=expected, got=got)
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        size = width, max(2, round(image.shape[0] * width / image.shape[1]))
+        done = image.ndim == 2 and image.shape[1] == width
+        small.append(image if done else cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+    return np.stack(small)
 
 
 def cell_centres(height: int, width: int) -> np.ndarray:
@@ -168,9 +163,8 @@ def measured_motion(gray: np.ndarray, *, exact: bool = False) -> Motion:
     if len(gray) < 2:
         empty = np.zeros((0, gray.shape[1] // CELL_PX, gray.shape[2] // CELL_PX), dtype=np.float32)
         return Motion(np.zeros((*empty.shape, 2), dtype=np.float32), empty, empty)
-    engine = cv2.DISOpticalFlow.create(
-        cv2.DISOPTICAL_FLOW_PRESET_FAST if exact else cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST
-    )
+    preset = cv2.DISOPTICAL_FLOW_PRESET_FAST if exact else cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST
+    engine = cv2.DISOpticalFlow.create(preset)
     engine.setFinestScale(0 if exact else 1)
     parts: list[tuple[np.ndarray, ...]] = []
     # Cells alone are kept of an episode: flow of every pixel of some minutes would fill gigabytes.
@@ -191,18 +185,16 @@ def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Observe
 
     A mount that the recording's calibration gives takes the place of the described one.
     """
+    recorded = None if episode.T_base_ee is None else episode.T_base_ee.shape[1]
     if kinematics is None:
-        count = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
+        count = recorded or 0
         names = {1: ("right",), 2: ("left", "right")}.get(count, tuple(f"arm_{i}" for i in range(count)))
         return tuple(ObservedArm(name, f"{name}_wrist", None) for name in names)
     arms = arms_of_embodiment(kinematics)
-    if episode.T_base_ee is not None and episode.T_base_ee.shape[1] != len(arms):
-        raise DataError(
-            "Recorded tool poses and embodiment differ in the number of arms",
-            where=f"episode {episode.episode_id}, embodiment {kinematics.embodiment.name}",
-            expected=f"{len(arms)} arms",
-            got=f"{episode.T_base_ee.shape[1]} tool poses per frame",
-        )
+    if recorded not in (None, len(arms)):
+        what = "Recorded tool poses and embodiment differ in the number of arms"
+        where = f"episode {episode.episode_id}, embodiment {kinematics.embodiment.name}"
+        raise DataError(what, where=where, expected=f"{len(arms)} arms", got=f"{recorded} tool poses per frame")
     calibrated = episode.calibrated_mounts
     return tuple(replace(arm, T_tool_mount=None) if arm.wrist_view in calibrated else arm for arm in arms)
 
@@ -280,14 +272,11 @@ def tool_travel(tools: np.ndarray) -> np.ndarray:
 
 def read(observation: Observation, conventions: RecordedConventions) -> Reading | None:
     """The episode under these conventions; None where no tool poses are known."""
-    recorded = observation.episode
-    kinematics = observation.kinematics
-    episode = apply_conventions(recorded, conventions)
+    kinematics, episode = observation.kinematics, apply_conventions(observation.episode, conventions)
     tools, kinematic, action = episode.T_base_ee, None, None
-    points, radii = np.zeros((episode.num_frames, 0, 3)), np.zeros(0)
-    capsules = points, radii
+    points, radii = along = np.zeros((episode.num_frames, 0, 3)), np.zeros(0)
     if kinematics is not None and episode.state_kind == "joints":
-        kinematic, action, points, radii, *capsules = _moved_arms(observation, kinematics, episode)
+        kinematic, action, points, radii, *along = _moved_arms(observation, kinematics, episode)
     if tools is None:
         if kinematic is None:
             return None
@@ -301,26 +290,16 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
         radii = np.full(points.shape[1], _TOOL_RADIUS_M)
     blocks = arm_blocks(episode)
     columns = [block[-1] for block in blocks] if len(blocks) == tools.shape[1] else []
-    cameras = {}
-    for view, camera in episode.cameras.items():
-        gray = observation.gray.get(view)
-        cameras[view] = camera if gray is None else camera.resized(gray.shape[2], gray.shape[1])
-    return Reading(
-        conventions,
-        episode,
-        tools,
-        tool_travel(tools),
-        action,
-        kinematic,
-        cameras,
-        episode.state[:, columns].astype(np.float64) if columns else None,
-        episode.action[:, columns].astype(np.float64) if columns else None,
-        points,
-        radii,
-        shape,
-        (capsules[0], capsules[1]),
-        frames_with_all(recorded.num_frames, conventions)[0],
-    )
+    arrays = episode.state, episode.action
+    opening, command = (each[:, columns].astype(np.float64) if columns else None for each in arrays)
+    cameras = dict(episode.cameras)
+    for view in cameras.keys() & observation.gray.keys():
+        height, width = observation.gray[view].shape[1:]
+        cameras[view] = cameras[view].resized(width, height)
+    poses = tools, tool_travel(tools), action, kinematic
+    on_arms = points, radii, shape, (along[0], along[1])
+    first = frames_with_all(observation.episode.num_frames, conventions)[0]
+    return Reading(conventions, episode, *poses, cameras, opening, command, *on_arms, first)
 
 
 def _moved_arms(observation: Observation, kinematics: ArmKinematics, episode: Episode) -> tuple[np.ndarray, ...]:

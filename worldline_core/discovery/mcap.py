@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from itertools import chain
 from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, collect_faults
 from worldline_core.data.guards.source_paths import AnyPath, find_files
 from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
 from worldline_core.data.mcap.file import McapFile, Stream
@@ -23,19 +25,10 @@ from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 
 _SECONDS = 30
+_BY_HAND = "write the source by hand: configs/sources/mcap_ros2.yaml"
 _COMMAND_WORDS = {
-    "command",
-    "commands",
-    "cmd",
-    "action",
-    "actions",
-    "target",
-    "targets",
-    "desired",
-    "leader",
-    "goal",
-    "controller",
-}
+    "command", "commands", "cmd", "action", "actions", "target", "targets", "desired", "leader", "goal", "controller",
+}  # fmt: skip
 
 
 def discover_mcap(root: AnyPath) -> Discovery:
@@ -45,29 +38,20 @@ def discover_mcap(root: AnyPath) -> Discovery:
         other = next(iter([*find_files(root, "*.db3"), *find_files(root, "*.bag"), *find_files(root, "*.mcap.zst*")]))
         McapFile(other)  # which says how it becomes an MCAP file
     file = _first_readable(files)
-    if exported := _exported(file):
-        return _of_this_project(root, files, exported)
-    return _of_topics(root, files, file)
+    exported = ""
+    with suppress(DataError):
+        exported = exported_episode_id(file)
+    return _of_this_project(root, files, exported) if exported else _of_topics(root, files, file)
 
 
 def _first_readable(files: Sequence[AnyPath]) -> McapFile:
-    fault: RejectedInputError | None = None
+    faults: list[RejectedInputError] = []
     for path in files[:20]:
-        try:
+        with collect_faults(faults):
             file = McapFile(path)
             _ = file.topics
-        except RejectedInputError as error:
-            fault = fault or error
-        else:
             return file
-    raise fault or DataError("No MCAP file can be read")
-
-
-def _exported(file: McapFile) -> str | None:
-    try:
-        return exported_episode_id(file)
-    except DataError:
-        return None
+    raise faults[0] if faults else DataError("No MCAP file can be read")
 
 
 def _of_this_project(root: AnyPath, files: Sequence[AnyPath], episode_id: str) -> Discovery:
@@ -85,12 +69,7 @@ def _of_topics(root: AnyPath, files: Sequence[AnyPath], file: McapFile) -> Disco
     kinds: dict[str, Kind] = {
         topic: kind for topic, schema in file.topics.items() if (kind := schema_kind(schema)) is not None
     }
-    pictures = [
-        topic
-        for topic, kind in kinds.items()
-        if kind in IMAGE_KINDS and not set(words_of(topic)) & {"depth", "disparity", "infra"}
-    ]
-    pictures = _one_of_each_camera(pictures, kinds)
+    pictures = _one_of_each_camera(kinds)
     joints = [topic for topic, kind in kinds.items() if kind == "joints"]
     if not pictures or not joints:
         raise DataError(
@@ -100,10 +79,9 @@ def _of_topics(root: AnyPath, files: Sequence[AnyPath], file: McapFile) -> Disco
             next_step="docs/mcap.md lists the schemas that are read",
         )  # fmt: skip
     start = file.first_log_ns
+    others = ("numbers", "transforms", "calibration", "marker")
     wanted: dict[str, tuple[Kind, ...]] = {topic: (kinds[topic],) for topic in [*pictures, *joints]}
-    wanted |= {
-        topic: (kind,) for topic, kind in kinds.items() if kind in ("numbers", "transforms", "calibration", "marker")
-    }
+    wanted |= {topic: (kind,) for topic, kind in kinds.items() if kind in others}
     streams = file.streams(wanted, start, start + _SECONDS * 10**9)
     found = Discovery(
         "mcap_topics",
@@ -121,45 +99,34 @@ def _of_topics(root: AnyPath, files: Sequence[AnyPath], file: McapFile) -> Disco
     return found
 
 
-def _one_of_each_camera(topics: Sequence[str], kinds: dict[str, Kind]) -> list[str]:
-    """Compressed pictures before raw ones of the same camera (`/cam/image` and `/cam/image/compressed`)."""
+def _one_of_each_camera(kinds: dict[str, Kind]) -> list[str]:
+    """Topics of pictures; compressed before raw ones of the same camera (`/cam/image` and `/cam/image/compressed`)."""
+    depth = {"depth", "disparity", "infra"}
+    topics = [topic for topic, kind in kinds.items() if kind in IMAGE_KINDS and not set(words_of(topic)) & depth]
     compressed = [topic for topic in topics if kinds[topic] != "raw_image"]
-    return [
-        topic for topic in topics if topic in compressed or not any(other.startswith(topic) for other in compressed)
-    ]
+    return [t for t in topics if t in compressed or not any(other.startswith(t) for other in compressed)]
 
 
 def _rate(found: Discovery, streams: Sequence[Stream]) -> None:
-    rates = {
-        s.topic: 1e9 / float(np.median(np.diff(_times(s))))
-        for s in streams
-        if len(s.log_ns) > 2 and np.median(np.diff(_times(s))) > 0
-    }
+    steps = {s.topic: float(np.median(np.diff(_times(s)))) for s in streams if len(s.log_ns) > 2}
+    rates = {topic: 1e9 / step for topic, step in steps.items() if step > 0}
     if not rates:
         found.source["fps"] = Question("fps", "rate to which pictures and joints are brought")
         return
-    slowest = min(rates.values())
-    found.fps = float(max(1, round(slowest)))
-    found.say(
-        ("fps",),
-        found.fps,
-        "pictures come at " + ", ".join(f"{rate:.1f} Hz ({named([topic])})" for topic, rate in rates.items()),
-    )
+    found.fps = float(max(1, round(min(rates.values()))))
+    shown = ", ".join(f"{rate:.1f} Hz ({named([topic])})" for topic, rate in rates.items())
+    found.say(("fps",), found.fps, f"pictures come at {shown}")
 
 
 def _times(stream: Stream) -> np.ndarray:
-    return np.array(
-        [log if stamp is None else stamp for log, stamp in zip(stream.log_ns, stream.stamps_ns, strict=True)],
-        np.float64,
-    )
+    both = zip(stream.log_ns, stream.stamps_ns, strict=True)
+    return np.array([log if stamp is None else stamp for log, stamp in both], np.float64)
 
 
 def _columns(stream: Stream) -> list[Column]:
     """The joints of the topic whose positions are stated."""
-    read = (
-        (name, place) for value in stream.values[:50] for name, place in zip(value.names, value.position, strict=False)
-    )
-    names = list(dict.fromkeys(name for name, place in read if np.isfinite(place)))
+    read = chain.from_iterable(zip(value.names, value.position, strict=False) for value in stream.values[:50])
+    names = dict.fromkeys(name for name, place in read if np.isfinite(place))
     return [Column(stream.topic, i, name, words_of(name)) for i, name in enumerate(names)]
 
 
@@ -174,7 +141,7 @@ def _state(found: Discovery, streams: Sequence[Stream]) -> tuple[Stream, list[Ar
     raise DataError(
         "No topic of joint states has an arm",
         got=named([column.name for s in streams for column in _columns(s)], 20),
-        next_step="write the source by hand: configs/sources/mcap_ros2.yaml",
+        next_step=_BY_HAND,
     )
 
 
@@ -204,9 +171,8 @@ def _views(
         if near and frame in frames:
             entry["calibration"] = max(near, key=lambda c: _shared(c, topic))
         elif near:
-            found.notes.append(
-                f"The pictures of {named([topic])} are in the frame {named([frame])}, which no transform names: the view stays without a camera."
-            )
+            where = f"The pictures of {named([topic])} are in the frame {named([frame])}"
+            found.notes.append(f"{where}, which no transform names: the view stays without a camera.")
         views[view] = entry
         found.evidence["views", view] = chosen.evidence[topic]
     found.source["views"] = views
@@ -216,11 +182,8 @@ def _views(
     roots = sorted(parents - frames)
     if posed and roots:
         base = next((root for root in sorted(parents) if "base" in root), roots[0])
-        found.say(
-            ("base_frame",),
-            base,
-            f"transforms lead from {named(roots)}; frames called base: {named([f for f in sorted(parents | frames) if 'base' in f])}",
-        )
+        called = named([frame for frame in sorted(parents | frames) if "base" in frame])
+        found.say(("base_frame",), base, f"transforms lead from {named(roots)}; frames called base: {called}")
     static = [topic for topic in transforms if "static" in topic]
     found.source["transforms"] = [topic for topic in transforms if topic not in static] if posed else []
     found.source["static_transforms"] = static if posed else []
@@ -228,11 +191,8 @@ def _views(
 
 def _shared(one: str, other: str) -> int:
     """Leading parts that two topics have in common."""
-    pairs = zip(PurePosixPath(one).parts[1:-1], PurePosixPath(other).parts[1:], strict=False)
-    return next(
-        (i for i, (a, b) in enumerate(pairs) if a != b),
-        min(len(PurePosixPath(one).parts) - 2, len(PurePosixPath(other).parts) - 1),
-    )
+    pairs = list(zip(PurePosixPath(one).parts[1:-1], PurePosixPath(other).parts[1:], strict=False))
+    return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
 
 
 def _arms(
@@ -247,31 +207,24 @@ def _arms(
             arm.joints = [arm.joints[i] for i in joint_order(arm, robot, number)]
             arm.side = robot.arms[number].name  # type: ignore[assignment]
     elif choices:
-        found.say(
-            ("embodiment",),
-            Question("embodiment", f"which robot: {', '.join(choices[:10])}; or none, or the path of a description"),
-            said,
-        )
+        which = f"which robot: {', '.join(choices[:10])}; or none, or the path of a description"
+        found.say(("embodiment",), Question("embodiment", which), said)
     else:
         found.say(("embodiment",), NO_EMBODIMENT, said or "an arm without a gripper")
     commands = _command_topics(streams, others, arms)
-    entries = []
-    for arm in arms:
-        entry: dict[str, Any] = {"name": arm.side, "state": _readings(found, stream, arm, ("arms", arm.side, "state"))}
+    entries: list[dict[str, Any]] = []
+    for number, arm in enumerate(arms):
+        entries.append({"name": arm.side, "state": _readings(found, stream, arm, ("arms", arm.side, "state"))})
         if commands is not None:
-            entry["command"] = _readings(
-                found, commands[0], commands[1][arms.index(arm)], ("arms", arm.side, "command")
-            )
-        entries.append(entry)
+            topic, columns = commands
+            entries[-1]["command"] = _readings(found, topic, columns[number], ("arms", arm.side, "command"))
     found.source["arms"] = entries
     if commands is None:
         numbers = [topic for topic in others if topic in streams and streams[topic].kind == "numbers"]
-        text = (
-            f" ({named(numbers)} hold numbers without names: declare `command` where they are commands)"
-            if numbers
-            else ""
-        )
-        found.say(("without_commands",), "repeat_state", f"no topic of commands has the joints' names{text}")
+        why = "no topic of commands has the joints' names"
+        if numbers:
+            why += f" ({named(numbers)} hold numbers without names: declare `command` where they are commands)"
+        found.say(("without_commands",), "repeat_state", why)
     found.state_size = sum(len(arm.joints) + 1 for arm in arms)
 
 
@@ -297,50 +250,29 @@ def _readings(found: Discovery, stream: Stream, arm: ArmColumns, place: tuple[st
     joints = {"topic": stream.topic, "names": [column.name for column in arm.joints]}
     if arm.gripper is None:
         raise DataError(
-            "An arm has no gripper among its joints",
-            where=stream.topic,
-            expected="a joint called gripper or finger",
-            got=named([c.name for c in arm.joints]),
-            next_step="write the source by hand: configs/sources/mcap_ros2.yaml",
-        )
-    values = _values(stream, [arm.gripper])[:, 0]
-    readings = gripper_readings(
-        values,
-        None,
-        arm.gripper.words,
-        open_is_high=True if "finger" in arm.gripper.words and values.max() < 0.2 else None,
-        why="a finger that opens by some centimetres",
-    )
-    low, high = readings.ends
+            "An arm has no gripper among its joints", where=stream.topic, expected="a joint called gripper or finger",
+            got=named([c.name for c in arm.joints]), next_step=_BY_HAND,
+        )  # fmt: skip
+    values, words = _values(stream, [arm.gripper])[:, 0], arm.gripper.words
+    finger = True if "finger" in words and values.max() < 0.2 else None
+    why = "a finger that opens by some centimetres"
+    readings = gripper_readings(values, None, words, open_is_high=finger, why=why)
+    said = readings.evidence
+    ends: dict[str, Any] = dict(zip(("closed", "open"), readings.ends, strict=True))
     if readings.open_is_high is None:
-        ends: dict[str, Any] = {
-            end: Question(
-                f"{side}_gripper_{end}",
-                f"reading of {named([arm.gripper.name])} when it is {end} ({readings.evidence})",
-            )
-            for end in ("closed", "open")
-        }
-    else:
-        ends = {"closed": low, "open": high} if readings.open_is_high else {"closed": high, "open": low}
-    found.evidence[(*place, "gripper")] = readings.evidence + (
-        "; nothing says which end is open" if readings.open_is_high is None else ""
-    )
+        asked = f"reading of {named([arm.gripper.name])} when it is"
+        ends = {end: Question(f"{side}_gripper_{end}", f"{asked} {end} ({said})") for end in ends}
+        said += "; nothing says which end is open"
+    elif not readings.open_is_high:
+        ends = dict(zip(ends, reversed(readings.ends), strict=True))
+    found.evidence[(*place, "gripper")] = said
     return {"joints": joints, "gripper": {"topic": stream.topic, "names": [arm.gripper.name], "range": ends}}
 
 
 def _episodes(found: Discovery, kinds: dict[str, Kind], streams: dict[str, Stream]) -> None:
-    markers = [
-        topic
-        for topic, kind in kinds.items()
-        if kind == "marker"
-        and topic in streams
-        and any(str(v).startswith(("start", "stop")) for v in streams[topic].values)
-    ]
-    if markers:
-        found.say(("episodes",), {"by": "markers", "topic": markers[0]}, "its messages begin with start and stop")
-    else:
-        found.say(
-            ("episodes",),
-            {"by": "file"},
-            "every file is an episode; `ranges` or `markers` cut longer ones (docs/mcap.md)",
-        )
+    for topic in (topic for topic, kind in kinds.items() if kind == "marker" and topic in streams):
+        if any(str(text).startswith(("start", "stop")) for text in streams[topic].values):
+            found.say(("episodes",), {"by": "markers", "topic": topic}, "its messages begin with start and stop")
+            return
+    why = "every file is an episode; `ranges` or `markers` cut longer ones (docs/mcap.md)"
+    found.say(("episodes",), {"by": "file"}, why)

@@ -78,11 +78,10 @@ def _spread(places: np.ndarray, travel: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """A camera (focal length in widths of the picture, T_base_camera) and its score, the cosine."""
+    """A focal length in widths of the picture, and T_base_camera (4, 4)."""
 
     focal: float
     T_base_camera: np.ndarray
-    score: float
 
 
 class _Scorer:
@@ -159,7 +158,7 @@ def search_cameras(motion: MotionOfSteps) -> list[FoundCamera]:
         focal, pose = torch.cat([focal, tried[0]]), torch.cat([pose, tried[1]])
         found = _Scorer(chosen, blur).scores(focal, pose)
     kept = _apart(focal, pose, found, STARTS, APART_DEG[-1])
-    return [FoundCamera(float(focal[i]), pose[i].double().numpy(), float(found[i])) for i in kept]
+    return [FoundCamera(float(focal[i]), pose[i].double().numpy()) for i in kept]
 
 
 def _apart(focal: Tensor, pose: Tensor, score: Tensor, count: int, degrees: float) -> list[int]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip
-from worldline_core.calibration.check_report import SIGMA_PX_REF, TILE_HEIGHT, recorded_tracks
+from worldline_core.calibration.check import SIGMA_PX_REF, TILE_HEIGHT, recorded_tracks
 from worldline_core.data.episodes.conventions import RecordedConventions, with_image_lags
 from worldline_core.errors import ConfigError
 from worldline_core.pages.page import render

@@ -21,6 +21,7 @@ from worldline_core.calibration.observation import (
     observe,
     placed_surfaces,
     read,
+    small_gray,
 )
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
@@ -73,8 +74,7 @@ class ViewOfEpisode:
     @cached_property
     def rough_gray(self) -> np.ndarray:
         """(n, h, GRAY_WIDTH)."""
-        height = max(2, round(self.gray.shape[1] * GRAY_WIDTH / self.gray.shape[2]))
-        return np.stack([cv2.resize(g, (GRAY_WIDTH, height), interpolation=cv2.INTER_AREA) for g in self.gray])
+        return small_gray(self.gray)
 
     @cached_property
     def rough(self) -> Motion:
@@ -241,7 +241,7 @@ def _thinned(
     for number, image in enumerate(images):
         if number % every == 0:
             sizes.append(image.shape[:2])
-            gray.append(_fine_gray(image))
+            gray.append(small_gray([image], FINE_WIDTH)[0])
             if colour:
                 height, width = image.shape[:2]
                 scale = min(1.0, MASKED_WIDTH / width)
@@ -258,9 +258,3 @@ def _busiest(points: np.ndarray, count: int) -> slice:
     sums = np.convolve(travel, np.ones(count - 1), "valid")
     start = int(sums.argmax())
     return slice(start, start + count)
-
-
-def _fine_gray(image: np.ndarray) -> np.ndarray:
-    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    height = max(2, round(image.shape[0] * FINE_WIDTH / image.shape[1]))
-    return cv2.resize(gray, (FINE_WIDTH, height), interpolation=cv2.INTER_AREA)

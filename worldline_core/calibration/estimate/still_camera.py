@@ -44,7 +44,6 @@ class StillCamera:
     fitted: FittedCamera
     halves: tuple[FittedCamera, ...]
     agreements: np.ndarray
-    score: float
     rival: FittedCamera | None
     rival_agreements: np.ndarray | None
     mirrored: np.ndarray
@@ -89,7 +88,7 @@ def estimate_still(recorded: RecordedView) -> StillCamera:
     halves, agreements = _by_halves(views, best, recorded.shared)
     rival = next((fit for fit in fits[1:] if tools_apart(best.camera, fit.camera, recorded) > RIVAL_APART), None)
     rivals = None if rival is None else np.array([agreement(view, rival) for view in views])
-    return StillCamera(best, halves, agreements, found[0].score, rival, rivals, gains, agreed, apart)
+    return StillCamera(best, halves, agreements, rival, rivals, gains, agreed, apart)
 
 
 def refine_with_masks(masked: RecordedView, found: StillCamera) -> StillCamera:

@@ -141,8 +141,11 @@ class _Messages:
             name, converted = _ROS2[schema]
             if schema not in self._schemas:
                 self._schemas[schema] = self.writer.register_msgdef(name.replace("/", "/msg/"), _definition(name))
-            content = converted(message, {"sec": seconds, "nanosec": nanoseconds})
-            self.writer.write_message(topic, self._schemas[schema], content, self.time_ns)
+            header = {
+                "stamp": {"sec": seconds, "nanosec": nanoseconds},
+                "frame_id": message.get("frame_id", message.get("parent_frame_id", "")),
+            }
+            self.writer.write_message(topic, self._schemas[schema], converted(message, header), self.time_ns)
             return
         kind = _PROTOBUF[schema]
         if schema not in self._schemas:
@@ -167,8 +170,13 @@ class _Messages:
 
     def add_images(self, images: Mapping[tuple[str, str], np.ndarray], image_format: Literal["png", "jpeg"]) -> None:
         """By kind (image, robot_mask) and view."""
+        jpeg = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        settings = jpeg if image_format == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
         for (kind, view), image in images.items():
-            self.add(f"/{view}/{kind}", "CompressedImage", _image(image, f"{view}_camera", image_format))
+            pixels = image.astype(np.uint8) * 255 if image.dtype == bool else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+            _, encoded = cv2.imencode(f".{image_format}", pixels, settings)
+            message = {"frame_id": f"{view}_camera", "data": encoded.tobytes(), "format": image_format}
+            self.add(f"/{view}/{kind}", "CompressedImage", message)
 
 
 _PROTOBUF: dict[str, Any] = {
@@ -188,13 +196,6 @@ def _metadata(episode: Episode, views: list[str]) -> dict[str, str]:
         "gripper": None if episode.gripper is None else np.asarray(episode.gripper, np.float64).tolist(),
     }
     return {key: json.dumps(value, sort_keys=True) for key, value in values.items()}
-
-
-def _image(frame: np.ndarray, frame_id: str, image_format: Literal["png", "jpeg"]) -> dict[str, Any]:
-    pixels = frame.astype(np.uint8) * 255 if frame.dtype == bool else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-    settings = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if image_format == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
-    _, encoded = cv2.imencode(f".{image_format}", pixels, settings)
-    return {"frame_id": frame_id, "data": encoded.tobytes(), "format": image_format}
 
 
 def _calibration(camera: CameraTrack) -> dict[str, Any]:
@@ -221,30 +222,24 @@ def _transform(child: str, pose: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _headed(message: Message, stamp: Message) -> dict[str, Any]:
-    return {"header": {"stamp": stamp, "frame_id": message["frame_id"]}}
-
-
-def _camera_info(message: Message, stamp: Message) -> Message:
+def _camera_info(message: Message, header: Message) -> Message:
     same = {name: message[name] for name in ("height", "width", "distortion_model")}
     matrices = {name.lower(): list(message[name]) for name in "DKRP"}
-    return {**_headed(message, stamp), **same, **matrices, "binning_x": 0, "binning_y": 0, "roi": {}}
+    return {"header": header, **same, **matrices, "binning_x": 0, "binning_y": 0, "roi": {}}
 
 
-def _tf_message(message: Message, stamp: Message) -> Message:
+def _tf_message(message: Message, header: Message) -> Message:
     transform = {name: message[name] for name in ("translation", "rotation")}
-    header = {"stamp": stamp, "frame_id": message["parent_frame_id"]}
     return {"transforms": [{"header": header, "child_frame_id": message["child_frame_id"], "transform": transform}]}
 
 
-def _joint_state(message: Message, stamp: Message) -> Message:
+def _joint_state(message: Message, header: Message) -> Message:
     names, positions = ([joint[field] for joint in message["joints"]] for field in ("name", "position"))
-    header = {"stamp": stamp, "frame_id": ""}
     return {"header": header, "name": names, "position": positions, "velocity": [], "effort": []}
 
 
 _ROS2: dict[_Schema, tuple[str, Callable[[Message, Message], Message]]] = {
-    "CompressedImage": ("sensor_msgs/CompressedImage", lambda message, stamp: {**_headed(message, stamp), **message}),
+    "CompressedImage": ("sensor_msgs/CompressedImage", lambda message, header: {"header": header, **message}),
     "CameraCalibration": ("sensor_msgs/CameraInfo", _camera_info),
     "FrameTransform": ("tf2_msgs/TFMessage", _tf_message),
     "JointStates": ("sensor_msgs/JointState", _joint_state),
@@ -340,7 +335,7 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         topic = f"/{view}/calibration"
         (calibration,) = _all_of(streams, topic, 1, file).values
         camera_poses = _poses(poses, f"{view}_camera", num_frames if moving[view] else 1, file)
-        add_camera(cameras, view, calibration, camera_poses, where=f"{file.path}, topic {topic}")
+        add_camera(cameras, view, calibration, camera_poses, f"{file.path}, topic {topic}")
     tools = [_poses(poses, frame, num_frames, file) for frame in _tool_frames(int(about["num_arms"]))]
     state, action = (
         np.array([value.position for value in joints[name].values], dtype=ARRAYS["state"].dtype)

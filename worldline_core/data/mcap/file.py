@@ -136,35 +136,29 @@ class McapFile:
     @cached_property
     def topics(self) -> dict[str, str]:
         """Topic -> schema name of everything in the file."""
-        if self._summary is not None and self._summary.channels:
-            schemas = self._summary.schemas
-            return {
-                channel.topic: schemas[channel.schema_id].name if channel.schema_id in schemas else ""
-                for channel in self._summary.channels.values()
-            }
-        found = {channel.topic: schema.name if schema else "" for schema, channel, _ in self._records(None)}
-        return dict(sorted(found.items()))
+        if self._summary is None or not self._summary.channels:
+            found = {channel.topic: schema.name if schema else "" for schema, channel, _ in self._records(None)}
+            return dict(sorted(found.items()))
+        schemas = {number: schema.name for number, schema in self._summary.schemas.items()}
+        return {channel.topic: schemas.get(channel.schema_id, "") for channel in self._summary.channels.values()}
 
     @property
     def first_log_ns(self) -> int:
         """Log time of the first message; a file without messages is rejected (missing_topic)."""
         statistics = self._summary.statistics if self._summary is not None else None
-        if statistics is None:
-            first = min((record.log_time for _, _, record in self._records(None)), default=None)
-        else:
-            first = statistics.message_start_time if statistics.message_count else None
+        if statistics is not None and statistics.message_count:
+            return statistics.message_start_time
+        first = min((record.log_time for _, _, record in self._records(None)), default=None)
         if first is None:
             raise RejectedInputError("missing_topic", "MCAP file holds no messages", where=self.path)
         return first
 
     def lacks_topics(self, missing: Collection[str]) -> RejectedInputError:
+        what, next_step = "MCAP file lacks a topic", "correct the topics in curate.sources[]"
+        expected = ", ".join(sorted(missing))
+        got = ", ".join(f"{topic} ({schema})" for topic, schema in self.topics.items()) or "no topics"
         return RejectedInputError(
-            "missing_topic",
-            "MCAP file lacks a topic",
-            where=self.path,
-            expected=", ".join(sorted(missing)),
-            got=", ".join(f"{topic} ({schema})" for topic, schema in self.topics.items()) or "no topics",
-            next_step="correct the topics in curate.sources[]",
+            "missing_topic", what, where=self.path, expected=expected, got=got, next_step=next_step
         )
 
     def messages(
@@ -198,13 +192,9 @@ class McapFile:
         for topic, kind, log_ns, stamp_ns, value in self.messages(roles, start_ns, stop_ns):
             expected = (streams[topic].kind,) if topic in streams else roles[topic]
             if kind not in expected:
-                raise RejectedInputError(
-                    "unknown_schema",
-                    "Topic has messages of another kind than its role or its first message",
-                    where=f"{self.path}, topic {topic}",
-                    expected=" or ".join(expected),
-                    got=f"{kind} ({self.topics.get(topic, '')})",
-                )
+                what = "Topic has messages of another kind than its role or its first message"
+                where, got = f"{self.path}, topic {topic}", f"{kind} ({self.topics.get(topic, '')})"
+                raise RejectedInputError("unknown_schema", what, where=where, expected=" or ".join(expected), got=got)
             stream = streams.setdefault(topic, Stream(topic, kind))
             stream.log_ns.append(log_ns)
             stream.stamps_ns.append(stamp_ns)
@@ -334,13 +324,9 @@ class ImageTrack:
         number, image = next(decoded)
         shape = image.shape
         if self.camera is not None and shape[:2] != (self.camera.height, self.camera.width):
-            raise RejectedInputError(
-                "missing_calibration",
-                "Calibration belongs to another image size",
-                where=f"{where}, view {self.camera.view}",
-                expected=f"{shape[1]}x{shape[0]}",
-                got=f"{self.camera.width}x{self.camera.height}",
-            )
+            what, where = "Calibration belongs to another image size", f"{where}, view {self.camera.view}"
+            expected, got = f"{shape[1]}x{shape[0]}", f"{self.camera.width}x{self.camera.height}"
+            raise RejectedInputError("missing_calibration", what, where=where, expected=expected, got=got)
         for wanted in self.chosen:
             while number < wanted:
                 number, image = next(decoded)

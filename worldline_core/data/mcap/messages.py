@@ -108,13 +108,11 @@ class EncodedImage:
             what, expected = "Video codec is not supported", " or ".join(VIDEO_CODECS)
             raise RejectedInputError("unknown_schema", what, where=where, expected=expected, got=self.format)
         if not re.match(rb"\x00\x00+\x01", self.data):
+            what, expected = "Video messages are not in Annex B", "a start code (00 00 00 01) before every NAL unit"
+            got = f"{self.data[:8].hex(' ')}, in AVCC the length of the unit"
+            next_step = "write the packets through FFmpeg's bitstream filter h264_mp4toannexb or hevc_mp4toannexb"
             raise RejectedInputError(
-                "unknown_schema",
-                "Video messages are not in Annex B",
-                where=where,
-                expected="a start code (00 00 00 01) before every NAL unit",
-                got=f"{self.data[:8].hex(' ')}, in AVCC the length of the unit",
-                next_step="write the packets through FFmpeg's bitstream filter h264_mp4toannexb or hevc_mp4toannexb",
+                "unknown_schema", what, where=where, expected=expected, got=got, next_step=next_step
             )
 
 
@@ -254,8 +252,6 @@ def _as_object(value: Any) -> Any:
 _FAULTS = (
     McapError, DecodeError, ValueError, TypeError, LookupError, AttributeError, EOFError, RuntimeError, struct.error,
 )  # fmt: skip
-
-
 # What the ROS 2 parser raises beyond that for texts that are no definitions.
 _SCHEMA_FAULTS = (InvalidSpecification, InvalidValue, NameError, AssertionError)
 
@@ -286,40 +282,37 @@ class MessageDecoder:
         return kind, stamp_ns, value
 
     def _channel(self, channel: Channel, schema: Schema | None) -> tuple[Kind, Callable[[bytes], Any]]:
-        name = schema.name if schema is not None else ""
+        encoding, where = channel.message_encoding, f"{self._where}, topic {channel.topic}"
+        name, defined = ("no schema", "no schema") if schema is None else (schema.name or "no schema", schema.encoding)
         kind = schema_kind(name)
-        decoder = self._decoder(channel, schema) if kind is not None else None
-        if kind is None or decoder is None:
-            encoding = schema.encoding if schema is not None else "no schema"
+        decode = None if kind is None or schema is None else _decoder(encoding, schema, where)
+        if kind is None or decode is None:
             raise RejectedInputError(
                 "unknown_schema",
                 "Messages of this schema are not understood",
-                where=f"{self._where}, topic {channel.topic}",
+                where=where,
                 expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(SCHEMA_KINDS),
-                got=f"{name or 'no schema'} ({channel.message_encoding or 'no encoding'}, {encoding})",
+                got=f"{name} ({encoding or 'no encoding'}, {defined})",
                 next_step="name another topic, or convert the recording",
             )
-        return kind, decoder
+        return kind, decode
 
-    def _decoder(self, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any] | None:
-        where = f"{self._where}, topic {channel.topic}"
-        if channel.message_encoding == "json":
-            return lambda data: _as_object(parse_json(data, where))
-        if schema is not None and channel.message_encoding in ("cdr", "protobuf") and not schema.data.strip():
-            raise RejectedInputError(
-                "unknown_schema",
-                "The file holds no definition of its messages",
-                where=where,
-                got=f"an empty definition of {schema.name}",
-                next_step="record where the message's package is installed, or write the bag again there: ros2 bag convert",
-            )
-        if schema is not None and schema.encoding == "ros2msg" and _EMPTY_ARRAY.search(schema.data):
-            what = "Schema definition has arrays of length 0, which no message needs"
-            raise RejectedInputError("unknown_schema", what, where=where, got=schema.name)
-        factory = Ros2DecoderFactory() if channel.message_encoding == "cdr" else ProtobufDecoderFactory()
-        try:
-            with redirect_stderr(StringIO()):  # the ROS 2 parser prints the line at fault as it is
-                return factory.decoder_for(channel.message_encoding, schema)
-        except (*_FAULTS, *_SCHEMA_FAULTS) as error:
-            what = "Schema definition cannot be read"
-            raise RejectedInputError("unknown_schema", what, where=where, got=repr(error)[:200]) from error
+
+def _decoder(encoding: str, schema: Schema, where: str) -> Callable[[bytes], Any] | None:
+    """Decoder of a channel's messages into objects; None where the schema's encoding does not belong to that of the channel."""
+    if encoding == "json":
+        return lambda data: _as_object(parse_json(data, where))
+    if encoding in ("cdr", "protobuf") and not schema.data.strip():
+        what, got = "The file holds no definition of its messages", f"an empty definition of {schema.name}"
+        next_step = "record where the message's package is installed, or write the bag again there: ros2 bag convert"
+        raise RejectedInputError("unknown_schema", what, where=where, got=got, next_step=next_step)
+    if schema.encoding == "ros2msg" and _EMPTY_ARRAY.search(schema.data):
+        what = "Schema definition has arrays of length 0, which no message needs"
+        raise RejectedInputError("unknown_schema", what, where=where, got=schema.name)
+    factory = Ros2DecoderFactory() if encoding == "cdr" else ProtobufDecoderFactory()
+    try:
+        with redirect_stderr(StringIO()):  # the ROS 2 parser prints the line at fault as it is
+            return factory.decoder_for(encoding, schema)
+    except (*_FAULTS, *_SCHEMA_FAULTS) as error:
+        what = "Schema definition cannot be read"
+        raise RejectedInputError("unknown_schema", what, where=where, got=repr(error)[:200]) from error

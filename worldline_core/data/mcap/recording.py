@@ -14,7 +14,6 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.file import ImageTrack, McapFile, Stream, frames_after_loss
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Calibration, Joints, Kind
 from worldline_core.data.mcap.resampling import (
-    Clocks,
     TransformTree,
     add_camera,
     check_alternation,
@@ -28,6 +27,7 @@ from worldline_core.data.mcap.resampling import (
     nearest,
     resampled,
     resampled_poses,
+    times_by_topic,
     uncalibrated,
 )
 from worldline_core.data.mcap.topics_config import ArmReadings, McapTopicsSourceConfig, TopicReadings
@@ -80,23 +80,17 @@ class _Recording:
         )
         self.absent: dict[str, RejectedInputError] = {}
         self.streams = self._read_streams()
-        config = self.config
-        self.clocks = clocks = Clocks(config, self.streams, file.path)
-        self.start_ns, self.stop_ns = (None if t is None else t - clocks.header_to_log_ns for t in (start, stop))
+        config = self.config  # without the views that have no images
+        self.times_ns, header_to_log_ns = times_by_topic(config, self.streams, file.path)
+        self.start_ns, self.stop_ns = (None if t is None else t - header_to_log_ns for t in (start, stop))
         self.signals = {readings: self._signal(readings) for readings in config.readings}
-        self.tools: dict[str, _Signal] = {}
-        """Poses (n, 7) by topic."""
-        self.tool_frames: list[str] = []
+        self.tools = {arm.tool_pose: self._tool(arm.tool_pose) for arm in config.arms if arm.tool_pose is not None}
+        """By topic: times and poses (n, 7), and the frame that these are given in."""
+        frames = (arm.tool_frame if arm.tool_pose is None else self.tools[arm.tool_pose][1] for arm in config.arms)
+        self.tool_frames = [frame.lstrip("/") for frame in frames if frame is not None]
         """For each arm, the frame that is its tool, or the one that its recorded poses are given in."""
-        for arm in config.arms:
-            if arm.tool_frame is not None:
-                self.tool_frames.append(arm.tool_frame.lstrip("/"))
-            elif arm.tool_pose is not None:
-                self.tools[arm.tool_pose], frame = self._tool(arm.tool_pose)
-                self.tool_frames.append(frame)
         self.images = {
-            view: in_order(clocks.times_ns(self.streams[each.image]), self.at(each.image))
-            for view, each in config.views.items()
+            view: in_order(self.times_ns[each.image], self.at(each.image)) for view, each in config.views.items()
         }
         """Times (n,) [ns] of each view's images, and the index of each in the order of the file."""
         read = {view: self._calibration(each.calibration) for view, each in config.views.items() if each.calibration}
@@ -124,9 +118,7 @@ class _Recording:
             {t for role in _KINDS for t in topics[role]} - set(self.file.topics), self.file.lacks_topics
         )
         topics = self.config.topics
-        roles: dict[str, tuple[Kind, ...]] = {
-            topic: kinds for role, kinds in _KINDS.items() for topic in sorted(topics[role])
-        }
+        roles = {topic: kinds for role, kinds in _KINDS.items() for topic in sorted(topics[role])}
         needed = set(roles) - topics["calibrations"]
         roles |= {topic: ("transforms",) for topic in self.config.transforms if topic in self.file.topics}
         streams = self.file.streams(roles, *self.around_ns)
@@ -160,14 +152,11 @@ class _Recording:
                 taken.append(number)
                 rows.append([numbers[column] for column in columns])
         if not rows:
-            raise RejectedInputError(
-                "missing_column",
-                "No message of a topic has the declared joints or columns",
-                where=self.at(stream.topic),
-                expected=", ".join(readings.names or map(str, readings.columns or ())),
-                got=", ".join(sorted({name for v in stream.values for name in getattr(v, "names", ())})) or "an array",
-            )
-        times = self.clocks.times_ns(stream)[taken]
+            what = "No message of a topic has the declared joints or columns"
+            expected = ", ".join(readings.names or map(str, readings.columns or ()))
+            got = ", ".join(sorted({name for v in stream.values for name in getattr(v, "names", ())})) or "an array"
+            raise RejectedInputError("missing_column", what, where=self.at(stream.topic), expected=expected, got=got)
+        times = self.times_ns[stream.topic][taken]
         return in_order_with_values(times, np.array(rows, np.float64), self.at(stream.topic))
 
     def _tool(self, topic: str) -> tuple[_Signal, str]:
@@ -178,7 +167,7 @@ class _Recording:
         if len(frames) != 1:
             what = "Tool poses change their frame"
             raise RejectedInputError("invalid_tool_pose", what, where=where, got=", ".join(frames))
-        return in_order_with_values(self.clocks.times_ns(stream), values, where), frames[0]
+        return in_order_with_values(self.times_ns[topic], values, where), frames[0]
 
     def _calibration(self, topic: str) -> Calibration:
         """The calibration around the episode, or in the whole file where it was sent only once."""
@@ -213,11 +202,10 @@ class _Recording:
 
         tree = read_static(config.static_transforms, None)
         for stream in (self.streams[topic] for topic in config.transforms if topic in self.streams):
-            offset_ns = config.offset_ns(stream.topic)
-            for transforms, time_ns in zip(stream.values, self.clocks.times_ns(stream), strict=True):
+            for transforms, time_ns in zip(stream.values, self.times_ns[stream.topic], strict=True):
                 times = [int(time_ns)] * len(transforms)
                 if config.time == "header":  # every transform of a message has its own
-                    times = [transform.stamp_ns + offset_ns for transform in transforms]
+                    times = [transform.stamp_ns + config.offset_ns(stream.topic) for transform in transforms]
                 tree.add(transforms, times, static=False)
         start = self.start_log_ns
         if start is not None and not all(tree.connected(config.base_frame, frame) for frame in wanted):
@@ -230,7 +218,7 @@ class _Recording:
         # Gaps between images are judged in `chosen_images`, by the distance of instants from the nearest image.
         topics = [(config.views[view].image, times, float("inf")) for view, (times, _) in self.images.items()]
         topics += [(readings.topic, times, config.max_gap_s) for readings, (times, _) in self.signals.items()]
-        topics += [(topic, times, config.max_gap_s) for topic, (times, _) in self.tools.items()]
+        topics += [(topic, times, config.max_gap_s) for topic, ((times, _), _) in self.tools.items()]
         start = min(int(times[0]) for _, times, _ in topics) if self.start_ns is None else self.start_ns
         stop = max(int(times[-1]) for _, times, _ in topics) if self.stop_ns is None else self.stop_ns
         for topic, times, max_gap_s in topics:
@@ -254,26 +242,23 @@ class _Recording:
         config, (times, _) = self.config, self.images[view]
         where = self.at(config.views[view].image)
         if (step_ns := median_step_ns(times)) * config.fps > 1.25e9:
+            what, next_step = "Camera is slower than the wanted rate", "lower the source's fps"
+            expected, got = f"{config.fps} fps", f"{1e9 / step_ns:.2f} fps"
             raise RejectedInputError(
-                "wrong_fps",
-                "Camera is slower than the wanted rate",
-                where=where,
-                expected=f"{config.fps} fps",
-                got=f"{1e9 / step_ns:.2f} fps",
-                next_step="lower the source's fps",
+                "wrong_fps", what, where=where, expected=expected, got=got, next_step=next_step,
                 evidence={"measured_fps": 1e9 / step_ns},
-            )
+            )  # fmt: skip
         chosen = nearest(times, grid)
         distance = np.abs(times[chosen] - grid) * config.fps / 1e9
         if distance.max() > config.max_image_distance_frames:
             at_s = float((grid[int(np.argmax(distance))] - grid[0]) / 1e9)
+            expected = f"an image within {config.max_image_distance_frames} frames of every instant"
+            got, evidence = (
+                f"{distance.max():.2f} frames at {at_s:.3f} s",
+                {"gap_s": float(2 * distance.max() / config.fps)},
+            )
             raise RejectedInputError(
-                "time_gap",
-                "Images are missing",
-                where=where,
-                expected=f"an image within {config.max_image_distance_frames} frames of every instant",
-                got=f"{distance.max():.2f} frames at {at_s:.3f} s",
-                evidence={"gap_s": float(2 * distance.max() / config.fps)},
+                "time_gap", "Images are missing", where=where, expected=expected, got=got, evidence=evidence
             )
         return chosen
 
@@ -285,13 +270,12 @@ class _Recording:
             spoiled = frames_after_loss(times, median_step_ns(times), track.key_frames, track.log_ns)[chosen]
             if spoiled.any():
                 first, count = int(np.argmax(spoiled)), int(spoiled.sum())
+                what, next_step = "Video frames depend on a message that is missing", "cut the recording at the gap"
+                where = f"{self.at(stream.topic)}, frame {first}"
+                got = f"{count} of {len(chosen)} frames after a gap, before the next key frame"
+                evidence = {"first_frame": first, "frames": count}
                 raise RejectedInputError(
-                    "truncated_video",
-                    "Video frames depend on a message that is missing",
-                    where=f"{self.at(stream.topic)}, frame {first}",
-                    got=f"{count} of {len(chosen)} frames after a gap, before the next key frame",
-                    next_step="cut the recording at the gap",
-                    evidence={"first_frame": first, "frames": count},
+                    "truncated_video", what, where=where, got=got, next_step=next_step, evidence=evidence
                 )
         return track
 
@@ -305,13 +289,11 @@ class _Recording:
             finite: np.ndarray = np.all(np.isfinite(values), axis=1)
             if not finite.all():
                 at_s = float((times[np.argmin(finite)] - grid[0]) / 1e9)
+                what = "Readings of a topic are not finite"
+                expected = "finite numbers between the episode's beginning and end"
+                got = f"{int((~finite).sum())} of {len(finite)} messages, the first at {at_s:.3f} s"
                 raise RejectedInputError(
-                    "nan_state",
-                    "Readings of a topic are not finite",
-                    where=where,
-                    expected="finite numbers between the episode's beginning and end",
-                    got=f"{int((~finite).sum())} of {len(finite)} messages, the first at {at_s:.3f} s",
-                    evidence={"at_s": at_s},
+                    "nan_state", what, where=where, expected=expected, got=got, evidence={"at_s": at_s}
                 )
             if readings is arm.gripper:  # which may be switched: it has no speed
                 check_alternation(times, arm.gripper.range.opening(values)[0], where)
@@ -347,7 +329,7 @@ class _Recording:
         for arm, frame in zip(self.config.arms, self.tool_frames, strict=False):
             pose = self.tree.poses(base, frame, grid) if frame != base else np.eye(4)
             if arm.tool_pose is not None:
-                pose = pose @ resampled_poses(*self.tools[arm.tool_pose], grid)
+                pose = pose @ resampled_poses(*self.tools[arm.tool_pose][0], grid)
             poses.append(np.broadcast_to(pose, (len(grid), 4, 4)))
         return np.stack(poses, axis=1) if poses else None
 
@@ -367,13 +349,13 @@ def read_topics_episode(
         fixed = np.abs(poses - poses[:1]).max() <= _FIXED_TOLERANCE
         where = f"{recording.at(topics.calibration or '')}, frame {frame}"
         calibration = recording.calibrations[view]
-        add_camera(cameras, view, calibration, poses[:1] if fixed else poses, where=where, rectified=topics.rectified)
+        add_camera(cameras, view, calibration, poses[:1] if fixed else poses, where, rectified=topics.rectified)
     state, outside = recording.arm_vectors([arm.state for arm in config.arms], grid, share=0.01)
     action, commands = state, [arm.command for arm in config.arms if arm.command is not None]
     if commands:
         action, beyond = recording.arm_vectors(commands, grid, share=0.05)
         outside += beyond
-    state_names: list[str] = []
+    state_names = []
     for arm in config.arms:
         joints = arm.state.joints
         given = joints.names or tuple(f"joint_{number}" for number in range(1, joints.width + 1))
@@ -405,10 +387,7 @@ def read_topics_episode(
         },
     )
     tracks = {view: recording.track(view, chosen[view], cameras.tracks.get(view)) for view in config.views}
+    views, lenses = tuple(config.views), cameras.lenses
     return LoadedEpisode(
-        episode,
-        tuple(config.views),
-        lambda view: tracks[view].frames(),
-        distortions=cameras.lenses,
-        absent=recording.absent,
+        episode, views, lambda view: tracks[view].frames(), distortions=lenses, absent=recording.absent
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -34,54 +34,40 @@ MAX_DISORDER_S = 1.0
 """A message that comes later than this behind a younger one was stamped by a clock that was set back."""
 
 
-class Clocks:
-    """Clocks of one episode's topics, compared by their least delays (log time minus header time).
+def times_by_topic(
+    config: McapTopicsSourceConfig, streams: Mapping[str, Stream], where: object
+) -> tuple[dict[str, np.ndarray], int]:
+    """Times (n,) of each topic's messages [ns] on the configured clock, and what leads from a log time to it.
+
+    The latter is subtracted: the least delay (log time minus header time) of the joints' topic, which commands must fit; where
+    the joints have no header, the least of all topics.
 
     Raises: RejectedInputError (clock_skew) where header times count, and disagree by more than allowed or are not set.
-
-    Attributes:
-        header_to_log_ns: subtracted from a log time to get a time on the clock of the headers: the least delay of the
-            joints' topic, which commands must fit; where the joints have no header, the least of all topics.
     """
-
-    def __init__(self, config: McapTopicsSourceConfig, streams: Mapping[str, Stream], where: object) -> None:
-        self.config, self.header_to_log_ns = config, 0
-        if config.time == "log":
-            return
-        # A simulated clock is 0 once, a driver that sets none writes 0 always.
-        unset = {topic: count for topic, stream in streams.items() if (count := _without_time(stream)) > 1}
-        if unset:
-            raise RejectedInputError(
-                "clock_skew",
-                "Messages have no header time",
-                where=f"{where}, topic {', '.join(unset)}",
-                got=", ".join(f"0 in {count} of {len(streams[topic].log_ns)}" for topic, count in unset.items()),
-                next_step="set time: log",
-            )
-        least_ms: dict[str, float] = {}
-        for stream in streams.values():
-            if stream.has_header and stream.kind != "calibration":
-                delay = np.array(stream.log_ns, np.int64) - np.array(stream.stamps_ns, np.int64)
-                least_ms[stream.topic] = float(delay.min() - config.offset_ns(stream.topic)) / 1e6
-        skew_ms = max(least_ms.values(), default=0.0) - min(least_ms.values(), default=0.0)
-        if skew_ms > config.max_clock_skew_ms:
-            raise RejectedInputError(
-                "clock_skew",
-                "Clocks of topics disagree",
-                where=where,
-                expected=f"least delays within {config.max_clock_skew_ms} ms of each other",
-                got=", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items())),
-                next_step="declare time_offsets_ms, or set time: log",
-                evidence={"skew_ms": skew_ms},
-            )
-        joints = config.arms[0].state.joints.topic if config.arms else ""
-        self.header_to_log_ns = round(least_ms.get(joints, min(least_ms.values(), default=0.0)) * 1e6)
-
-    def times_ns(self, stream: Stream) -> np.ndarray:
-        """(n,) times of a topic's messages [ns] on the configured clock."""
-        if self.config.time == "header" and stream.has_header:
-            return np.array(stream.stamps_ns, np.int64) + self.config.offset_ns(stream.topic)
-        return np.array(stream.log_ns, np.int64) - self.header_to_log_ns
+    log_ns = {topic: np.array(stream.log_ns, np.int64) for topic, stream in streams.items()}
+    if config.time == "log":
+        return log_ns, 0
+    # A simulated clock is 0 once, a driver that sets none writes 0 always.
+    unset = {topic: count for topic, stream in streams.items() if (count := _without_time(stream)) > 1}
+    if unset:
+        where = f"{where}, topic {', '.join(unset)}"
+        got = ", ".join(f"0 in {count} of {len(log_ns[topic])}" for topic, count in unset.items())
+        what, next_step = "Messages have no header time", "set time: log"
+        raise RejectedInputError("clock_skew", what, where=where, got=got, next_step=next_step)
+    headed = [topic for topic, stream in streams.items() if stream.has_header and stream.kind != "calibration"]
+    stamps_ns = {topic: np.array(streams[topic].stamps_ns, np.int64) + config.offset_ns(topic) for topic in headed}
+    least_ms = {topic: float((log_ns[topic] - times).min()) / 1e6 for topic, times in stamps_ns.items()}
+    least, skew_ms = min(least_ms.values(), default=0.0), np.ptp(list(least_ms.values()) or [0.0])
+    if skew_ms > config.max_clock_skew_ms:
+        got = ", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items()))
+        raise RejectedInputError(
+            "clock_skew", "Clocks of topics disagree", where=where, got=got, evidence={"skew_ms": float(skew_ms)},
+            expected=f"least delays within {config.max_clock_skew_ms} ms of each other",
+            next_step="declare time_offsets_ms, or set time: log",
+        )  # fmt: skip
+    joints = config.arms[0].state.joints.topic if config.arms else ""
+    header_to_log_ns = round(least_ms.get(joints, least) * 1e6)
+    return {topic: stamps_ns.get(topic, times - header_to_log_ns) for topic, times in log_ns.items()}, header_to_log_ns
 
 
 def _without_time(stream: Stream) -> int:
@@ -105,15 +91,12 @@ def in_order(times_ns: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     back_s = (np.maximum.accumulate(times_ns) - times_ns) / 1e9
     if back_s.max() > MAX_DISORDER_S:
         first = int(np.argmax(back_s > MAX_DISORDER_S))
+        what, expected = "Times of a topic jump back", f"at most {MAX_DISORDER_S} s out of order"
         raise RejectedInputError(
-            "clock_jump",
-            "Times of a topic jump back",
-            where=f"{where}, message {first}",
-            expected=f"at most {MAX_DISORDER_S} s out of order",
-            got=f"{back_s.max():.3f} s",
+            "clock_jump", what, where=f"{where}, message {first}", expected=expected, got=f"{back_s.max():.3f} s",
             next_step="set time: log, if the recorder's clock is sound, or cut the recording at the jump",
             evidence={"message": first, "jump_s": float(back_s.max())},
-        )
+        )  # fmt: skip
     return np.unique(times_ns, return_index=True)
 
 
@@ -203,14 +186,9 @@ def check_gaps(
         ((stop_ns - times_ns[-1]) / 1e9, max_trim_s, "Topic ends too early", int(times_ns[-1])),
     ):
         if seconds > allowed:
-            raise RejectedInputError(
-                "time_gap",
-                what,
-                where=where,
-                expected=f"at most {allowed:.3f} s",
-                got=f"{seconds:.3f} s from {(at_ns - start_ns) / 1e9:.3f} s on",
-                evidence={"gap_s": float(seconds)},
-            )
+            expected, got = f"at most {allowed:.3f} s", f"{seconds:.3f} s from {(at_ns - start_ns) / 1e9:.3f} s on"
+            evidence = {"gap_s": float(seconds)}
+            raise RejectedInputError("time_gap", what, where=where, expected=expected, got=got, evidence=evidence)
 
 
 def instants(start_ns: int, stop_ns: int, fps: float) -> np.ndarray:
@@ -299,9 +277,8 @@ class TransformTree:
             parent, child = transform.parent, transform.child
             edge = self._edges.setdefault(child, _Edge(parent, f"{self._where}, transform {parent} -> {child}"))
             if edge.parent != parent:
-                raise RejectedInputError(
-                    "invalid_extrinsics", "A frame has two parents", where=edge.where, expected=edge.parent, got=parent
-                )
+                what, expected = "A frame has two parents", edge.parent
+                raise RejectedInputError("invalid_extrinsics", what, where=edge.where, expected=expected, got=parent)
             edge.static = edge.static and static
             edge.times_ns.append(time_ns)
             edge.values.append(transform.values)
@@ -316,9 +293,8 @@ class TransformTree:
         while found[-1] in self._edges:
             above = self._edges[found[-1]].parent
             if above in found:
-                raise RejectedInputError(
-                    "invalid_extrinsics", "Transforms form a ring", where=self._where, got=" -> ".join([*found, above])
-                )
+                what, got = "Transforms form a ring", " -> ".join([*found, above])
+                raise RejectedInputError("invalid_extrinsics", what, where=self._where, got=got)
             found.append(above)
         return found
 
@@ -369,13 +345,7 @@ def uncalibrated(calibration: Calibration, *, rectified: bool) -> str | None:
 
 
 def add_camera(
-    cameras: RecordedCameras,
-    view: str,
-    calibration: Calibration,
-    poses: np.ndarray,
-    *,
-    where: object,
-    rectified: bool = False,
+    cameras: RecordedCameras, view: str, message: Calibration, poses: np.ndarray, where: str, *, rectified: bool = False
 ) -> None:
     """Adds a view from its calibration message and its poses (n or 1, 4, 4) in the base.
 
@@ -383,34 +353,31 @@ def add_camera(
 
     Raises: RejectedInputError: singular_intrinsics, invalid_extrinsics, invalid_distortion.
     """
-    K, size = _intrinsics(calibration, rectified=rectified, where=where)
+    K, size = _intrinsics(message, rectified=rectified, where=where)
     pose = camera_pose(view, poses, where=where)
     with rejected_as("invalid_distortion", where):
-        lens = None if rectified else distortion_from_ros(calibration.model, calibration.D)
+        lens = None if rectified else distortion_from_ros(message.model, message.D)
     cameras.add(view, K, pose, size, lens)
 
 
-def _intrinsics(calibration: Calibration, *, rectified: bool, where: object) -> tuple[np.ndarray, tuple[int, int]]:
+def _intrinsics(calibration: Calibration, *, rectified: bool, where: str) -> tuple[np.ndarray, tuple[int, int]]:
     """K (3, 3) of the published image, and its size (height, width), after region of interest and binning.
 
     K and P belong to the whole sensor (ROS REP 104); a region is cut out first, then binned.
     """
-
-    def refused(what: str, got: object) -> RejectedInputError:
-        return RejectedInputError("singular_intrinsics", what, where=where, got=got)
-
+    refused = partial(RejectedInputError, "singular_intrinsics", where=where)
     numbers, count = (calibration.P, 12) if rectified else (calibration.K, 9)
     if len(numbers) != count:
-        raise refused(f"Calibration has not {count} values of {'P' if rectified else 'K'}", len(numbers))
+        raise refused(f"Calibration has not {count} values of {'P' if rectified else 'K'}", got=len(numbers))
     K = np.array(numbers, np.float64).reshape(3, -1)[:, :3]
     height, width = calibration.height, calibration.width
     transform = ImageTransform.of((height, width))
     x, y, region_width, region_height = calibration.roi
     if region_width and region_height:
         if x + region_width > width or y + region_height > height:
-            raise refused(f"Region of interest leaves the image of {width}x{height}", calibration.roi)
+            raise refused(f"Region of interest leaves the image of {width}x{height}", got=calibration.roi)
         transform = transform.crop(y, x, (region_height, region_width))
-    across, down = max(calibration.binning[0], 1), max(calibration.binning[1], 1)
+    across, down = (max(each, 1) for each in calibration.binning)
     if (across, down) != (1, 1):
         height, width = transform.image_size
         transform = transform.resize((height // down, width // across))
