@@ -15,22 +15,20 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation import vlm
 from worldline_core.evaluation.evaluation_config import VLMConfig
-from worldline_core.evaluation.policy.evidence import (
+from worldline_core.evaluation.policy.judge import (
+    Extracted,
     GraspEvidence,
     LiftEvidence,
     MotionEvidence,
     Reconciliation,
     StateChangeEvidence,
-    establishes_success,
-    overturns,
-    route,
-)
-from worldline_core.evaluation.policy.judge import (
-    Extracted,
     VLMJudge,
+    establishes_success,
     first_pass_indices,
     judge_trajectory,
     motion_indices,
+    overturns,
+    route,
     verification_indices,
 )
 from worldline_core.evaluation.recordings import Trajectory

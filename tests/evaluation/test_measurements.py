@@ -11,7 +11,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frame_iou
-from worldline_core.evaluation.policy.evidence import establishes_success, route
+from worldline_core.evaluation.policy.judge import establishes_success, route
 from worldline_core.evaluation.policy.measured_judge import (
     LATE_COUNT,
     PressMeasurement,
@@ -30,8 +30,12 @@ from worldline_core.evaluation.segmenters.coloured_things import (
     named_things,
     own_colour,
 )
-from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
-from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter, Sam3Segmenter, open_segmenter
+from worldline_core.evaluation.segmenters.segmenter import (
+    ColourSegmenter,
+    Sam3Segmenter,
+    kinematic_masks,
+    open_segmenter,
+)
 from worldline_core.rehearsal.outside_models import write_sam3
 from worldline_core.store.artifact_files import digest_folder
 

@@ -13,19 +13,25 @@ from worldline_core.actions.render_actions import KinematicsByName
 from worldline_core.actions.tool_error import end_effector_error
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.evaluation.metrics import MAX_PSNR_DB, frame_iou, frames_to_unit, psnr, ssim
-from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
-from worldline_core.evaluation.video.background import Background, invented_motion, sharpness
-from worldline_core.evaluation.video.metrics_on_request import (
+from worldline_core.evaluation.metrics import (
+    MAX_PSNR_DB,
+    Background,
     ControlledPair,
     ToolFinder,
     action_following,
     counterfactual_direction,
     dynamics_score,
+    frame_iou,
+    frames_to_unit,
     hausdorff_score,
+    invented_motion,
+    psnr,
+    sharpness,
+    ssim,
     time_warping_distance,
     time_warping_score,
 )
+from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
 from worldline_core.model.lpips import BACKBONE_FILE, HEADS_FILE, load_lpips
 
 

@@ -203,7 +203,7 @@ def test_the_step_marks_what_begins_later_than_any_training_recording(trained, t
     doubts = {row["method"]: row["doubt"] for row in rows if row["episode_id"] == "prompt"}
     assert 0 < doubts["good"] < 0.5
     found = json.loads((tmp_path / "summary.json").read_text())["trust"]
-    assert found["training_recordings"] == 20
+    assert found["training_recordings"] == 8
     assert "5 of each are needed" in found["methods"]["good"]["reason"]
 
 

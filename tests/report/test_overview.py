@@ -10,7 +10,7 @@ import pytest
 from tasks.execution.run_page import FinishedStep, write_finished_page, write_progress_page
 from worldline_core.report.context import ReportConfig, ReportContext, VideoScores, in_order, method, share_interval
 from worldline_core.report.report import Figure, first_page, head_views, headline, planning_figure, video_figure
-from worldline_core.report.videos import best_median_worst, choose_episodes
+from worldline_core.report.results import best_median_worst, choose_episodes
 
 COPY, SHUFFLED = "copy_first_frame", "shipped_stage2_shuffled"
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import StrictBool, StrictInt
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.policy.evidence import route
+from worldline_core.evaluation.policy.judge import route
 from worldline_core.evaluation.policy.learned_judge import LearnedJudge
 from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure
 from worldline_core.evaluation.recordings import Trajectory
@@ -31,6 +31,8 @@ GROUP_SIZE = 4
 SURVIVORS = 2
 _WHOLE, _LATE = 10, 6
 _LATE_FROM = 0.6
+
+Letters = tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -58,33 +60,19 @@ class CandidateVideo:
         return digest.hexdigest()
 
 
-@dataclass(frozen=True)
-class CandidateScore:
-    """P2's answer, 0..100."""
-
-    score: float
-    well_formed: bool = True
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """P1's answer: letters, as many as were asked for."""
-
-    labels: tuple[str, ...]
-    well_formed: bool = True
-
-
 class Selector(Protocol):
-    """Ranks candidates of one scene."""
+    """Ranks candidates of one scene; with each answer, False where it could not be read."""
 
     @property
     def name(self) -> str: ...
 
-    def compare(self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int) -> Comparison:
+    def compare(
+        self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
+    ) -> tuple[Letters, bool]:
         """P1: letters of the ``select_count`` candidates (by letter) most likely to complete the task."""
         ...
 
-    def score(self, instruction: str, candidate: CandidateVideo) -> CandidateScore:
+    def score(self, instruction: str, candidate: CandidateVideo) -> tuple[float, bool]:
         """P2: 0..100, how likely this candidate completes the task."""
         ...
 
@@ -114,23 +102,25 @@ class ScoringSelector(ABC):
 
     def __init__(self) -> None:
         # Smaller budgets show the same videos again.
-        self._scores: dict[tuple[str, str], CandidateScore] = {}
+        self._scores: dict[tuple[str, str], float] = {}
 
     @abstractmethod
     def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
         """0..1, how likely this candidate completes the task."""
 
-    def compare(self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int) -> Comparison:
+    def compare(
+        self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
+    ) -> tuple[Letters, bool]:
         """The highest scores; of equals, those shown first."""
-        ranked = sorted(candidates, key=lambda letter: -self.score(instruction, candidates[letter]).score)
-        return Comparison(tuple(ranked[:select_count]))
+        ranked = sorted(candidates, key=lambda letter: -self.score(instruction, candidates[letter])[0])
+        return tuple(ranked[:select_count]), True
 
-    def score(self, instruction: str, candidate: CandidateVideo) -> CandidateScore:
+    def score(self, instruction: str, candidate: CandidateVideo) -> tuple[float, bool]:
         """0..100."""
         key = (instruction, candidate.digest)
         if key not in self._scores:
-            self._scores[key] = CandidateScore(round(100.0 * self.likelihood(instruction, candidate), 3))
-        return self._scores[key]
+            self._scores[key] = round(100.0 * self.likelihood(instruction, candidate), 3)
+        return self._scores[key], True
 
 
 class MeasuredSelector(ScoringSelector):
@@ -185,23 +175,23 @@ class VLMSelector:
         self.model = model
         self.name = model.name
 
-    def compare(self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int) -> Comparison:
+    def compare(
+        self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
+    ) -> tuple[Letters, bool]:
         """P1. A malformed answer has no labels."""
         parts: list[Part] = [Text(f"Task instruction: {instruction}")]
         for letter, candidate in candidates.items():
             parts += [Text(f"Candidate {letter}:"), _side_by_side(candidate)]
         parts.append(Text(PROMPTS["compare"].format(select_count=select_count)))
         answer, well_formed = ask(self.model, parts, _ComparisonAnswer)
-        return Comparison(tuple(label.strip().upper() for label in answer.selected_labels), well_formed)
+        return tuple(label.strip().upper() for label in answer.selected_labels), well_formed
 
-    def score(self, instruction: str, candidate: CandidateVideo) -> CandidateScore:
+    def score(self, instruction: str, candidate: CandidateVideo) -> tuple[float, bool]:
         """P2. A malformed answer, or a score outside of 0..100, scores 0."""
         question = Text(f"Task instruction: {instruction}\nCandidate video:")
         parts = [question, _side_by_side(candidate), Text(PROMPTS["score"].format())]
         answer, well_formed = ask(self.model, parts, _ScoreAnswer)
-        if not 0 <= answer.score <= 100:
-            return CandidateScore(0.0, well_formed=False)
-        return CandidateScore(float(answer.score), well_formed)
+        return (float(answer.score), well_formed) if 0 <= answer.score <= 100 else (0.0, False)
 
 
 def _side_by_side(candidate: CandidateVideo) -> Video:
@@ -246,9 +236,10 @@ def choose(
         if len(group) <= count:
             return list(group)
         shown = dict(zip(string.ascii_uppercase, group, strict=False))
-        answer = selector.compare(instruction, {letter: load(number) for letter, number in shown.items()}, count)
-        labels = list(dict.fromkeys(label for label in answer.labels if label in shown))[:count]
-        well_formed.append(answer.well_formed and len(labels) == count)
+        videos = {letter: load(number) for letter, number in shown.items()}
+        letters, readable = selector.compare(instruction, videos, count)
+        labels = list(dict.fromkeys(letter for letter in letters if letter in shown))[:count]
+        well_formed.append(readable and len(labels) == count)
         # An answer that names too few is filled up in the order shown, which the shuffle made arbitrary; it is counted.
         labels += [letter for letter in shown if letter not in labels][: count - len(labels)]
         return [number for letter, number in shown.items() if letter in labels]
@@ -261,9 +252,8 @@ def choose(
         rounds.append(survivors)
     scores: dict[int, float] = {}
     for candidate in survivors:
-        answer = selector.score(instruction, load(candidate))
-        well_formed.append(answer.well_formed)
-        scores[candidate] = answer.score
+        scores[candidate], readable = selector.score(instruction, load(candidate))
+        well_formed.append(readable)
     best = max(scores.values())
     (winner,) = best_of([candidate for candidate in survivors if scores[candidate] == best], 1)
     return Choice(winner, scores, rounds, well_formed.count(False), len(well_formed))
