@@ -1,4 +1,4 @@
-"""A small world with known outcomes: a dark gripper over a grey table, a red cube, three views."""
+"""A small world with known outcomes: a dark gripper over a grey table, a red cube, two views."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +53,7 @@ def make_film(success, seed):
         points[frame, 0] = (column + 3, tip - 6)
         if frame < 9 or success:
             wrist[frame, 20:44, 24:48] = (220, 20, 20)
-    return {"head": head, "left_wrist": np.full_like(wrist, 100), "right_wrist": wrist}, masks, points
+    return {"head": head, "right_wrist": wrist}, masks, points
 
 
 def _tracks(episode_id, points, path):

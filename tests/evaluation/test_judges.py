@@ -16,7 +16,6 @@ from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation import vlm
 from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.evaluation.policy.judge import (
-    Extracted,
     GraspEvidence,
     LiftEvidence,
     MotionEvidence,
@@ -74,38 +73,24 @@ WELL_FORMED = (
 )
 
 
-@pytest.mark.parametrize(
-    "answer",
-    [
-        WELL_FORMED,
-        f"Here is the evidence:\n```json\n{WELL_FORMED}\n```\nThat is all.",
-        f'{{"note": "first thoughts"}} {WELL_FORMED}',
-        WELL_FORMED[:-1] + ', "verdict": "success"}',
-        WELL_FORMED.replace("80", '"high"').replace('"x"', "null"),
-    ],
-)
-def test_answers_are_found_in_what_surrounds_them(answer):
-    evidence, well_formed = vlm.parse_answer(GraspEvidence, answer)
-    assert (well_formed, evidence.target_held_for_two_late_steps) == (True, True)
+SURROUNDED = (
+    WELL_FORMED, f"Here is the evidence:\n```json\n{WELL_FORMED}\n```\nThat is all.",
+    f'{{"note": "first thoughts"}} {WELL_FORMED}', WELL_FORMED[:-1] + ', "verdict": "success"}',
+    WELL_FORMED.replace("80", '"high"').replace('"x"', "null"),
+)  # fmt: skip
+MALFORMED = (
+    "", "The object is held.", "{", '{"target_held_for_two_late_steps": "true", "wrong_object_or_drop": false}',
+    '{"target_held_for_two_late_steps": 1, "wrong_object_or_drop": false}',
+    '{"required_final_state_visible": true, "wrong_object_or_drop": false}',
+    '["target_held_for_two_late_steps", true]', WELL_FORMED[:40], "{" * 5000,
+)  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "answer",
-    [
-        "",
-        "The object is held.",
-        "{",
-        '{"target_held_for_two_late_steps": "true", "wrong_object_or_drop": false}',
-        '{"target_held_for_two_late_steps": 1, "wrong_object_or_drop": false}',
-        '{"required_final_state_visible": true, "wrong_object_or_drop": false}',
-        '["target_held_for_two_late_steps", true]',
-        WELL_FORMED[:40],
-        "{" * 5000,
-    ],
-)
-def test_malformed_answers_become_null_evidence(answer):
+@pytest.mark.parametrize("answer", SURROUNDED + MALFORMED)
+def test_answers_are_found_in_what_surrounds_them_and_malformed_ones_become_null_evidence(answer):
     evidence, well_formed = vlm.parse_answer(GraspEvidence, answer)
-    assert (well_formed, evidence) == (False, GraspEvidence())
+    assert well_formed == (answer in SURROUNDED)
+    assert evidence.target_held_for_two_late_steps is True if well_formed else evidence == GraspEvidence()
 
 
 def test_first_pass_is_denser_towards_the_end():
@@ -133,17 +118,16 @@ class ScriptedJudge:
 
     def reconcile(self, trajectory, selected, first, verification):
         self.asked.append(("reconcile", selected, first, verification))
-        return Extracted(Reconciliation(observations_prove_completion=self.reconciliation))
+        return Reconciliation(observations_prove_completion=self.reconciliation), True
 
     def inspect_motion(self, trajectory, indices, earlier):
         self.asked.append(("motion", len(indices), earlier))
-        return Extracted(MotionEvidence(task_effect_completed=self.motion))
+        return MotionEvidence(task_effect_completed=self.motion), True
 
 
 def state(done, wrong=False, text=""):
-    return Extracted(
-        StateChangeEvidence(required_final_state_visible=done, wrong_object_or_drop=wrong, observations=text)
-    )
+    facts = {"required_final_state_visible": done, "wrong_object_or_drop": wrong, "observations": text}
+    return StateChangeEvidence(**facts), True
 
 
 def judged(judge, instruction="press the bell", views=("head", "left_wrist")):
@@ -159,7 +143,7 @@ def test_passes_ask_for_what_they_need_and_no_more():
     assert judge.asked[1:] == [("extract", 6, 480), ("reconcile", "two", "one", "two"), ("motion", 12, "two")]
 
 
-GRASP, NULL = Extracted(GraspEvidence()), Extracted(LiftEvidence(), well_formed=False)
+GRASP, NULL = (GraspEvidence(), True), (LiftEvidence(), False)
 PASSES = ["first_pass", "verification", "reconciliation", "motion"]
 
 
@@ -241,37 +225,34 @@ def test_sends_text_and_frames_and_reads_the_answer(server, monkeypatch):
     assert server.headers[0]["Authorization"] == "Bearer secret"
 
 
-def test_retries_what_fails_on_the_way(server):
-    server.replies = [(503, {}), (429, {}), _reply("third time")]
-    assert _model(server).answer([vlm.Text("?")]) == "third time"
-    server.replies = [(503, {})] * 3
-    with pytest.raises(UnavailableError, match="HTTP 503"):
-        _model(server).answer([vlm.Text("?")])
-    assert len(server.requests) == 6
-
-
 @pytest.mark.parametrize(
-    ("reply", "error", "message"),
+    ("replies", "error", "message"),
     [
-        ((401, {"error": "key"}), UnavailableError, "HTTP 401"),
-        ((200, {"choices": []}), vlm.UnansweredMessageError, "choices"),
-        ((200, b"<html>"), vlm.UnansweredMessageError, "JSON"),
+        ([(503, {}), (429, {}), _reply("third time")], None, ""),
+        ([(503, {})] * 3, UnavailableError, "HTTP 503"),
+        # A refusal or a malformed reply is not asked for again.
+        ([(401, {"error": "key"})], UnavailableError, "HTTP 401"),
+        ([(200, {"choices": []})], vlm.UnansweredMessageError, "choices"),
+        ([(200, b"<html>")], vlm.UnansweredMessageError, "JSON"),
     ],
 )
-def test_does_not_retry_a_refusal_or_a_malformed_reply(server, reply, error, message):
-    server.replies = [reply]
-    with pytest.raises(error, match=message):
-        _model(server).answer([vlm.Text("?")])
-    assert len(server.requests) == 1
+def test_retries_what_fails_on_the_way_alone(server, replies, error, message):
+    server.replies = [*replies]
+    if error is None:
+        assert _model(server).answer([vlm.Text("?")]) == "third time"
+    else:
+        with pytest.raises(error, match=message):
+            _model(server).answer([vlm.Text("?")])
+    assert len(server.requests) == len(replies)
 
 
 def test_no_answer_is_null_evidence_and_counted_until_the_server_is_given_up(server):
     judge = VLMJudge(_model(server, attempts=1))
     good = _reply('{"target_held_for_two_late_steps": true, "wrong_object_or_drop": false}')
     server.replies = [(400, {"error": "content"}), (500, {}), good]
-    found = [judge.extract(TRAJECTORY, "grasp", (0, 19), 360) for _ in range(3)]
-    assert [answer.well_formed for answer in found] == [False, False, True]
-    assert found[0].evidence.target_held_for_two_late_steps is None  # pyright: ignore[reportAttributeAccessIssue]
+    found = [judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX) for _ in range(3)]
+    assert [well_formed for _, well_formed in found] == [False, False, True]
+    assert found[0][0] == GraspEvidence()
     server.replies = [(500, {})] * 3
     judge.reconcile(TRAJECTORY, "", "", "")
     judge.inspect_motion(TRAJECTORY, (0, 19), "")
@@ -334,21 +315,27 @@ class Leading:
         return torch.full_like(scores, float("-inf")).index_fill(1, torch.tensor([wanted]), 0.0)
 
 
+@pytest.fixture(scope="module")
+def loaded(folder):
+    return vlm.open_vlm("qwen3_vl", VLMConfig(weights=folder))
+
+
 @pytest.fixture
-def opened(folder):
-    model = vlm.open_vlm("qwen3_vl", VLMConfig(weights=folder))
-    calls = model.model.generate = Calls(model.model, model.processor.tokenizer)
-    return model, calls
+def opened(loaded, monkeypatch):
+    calls = Calls(loaded.model, loaded.processor.tokenizer)
+    monkeypatch.setattr(loaded.model, "generate", calls)
+    return loaded, calls
 
 
-def test_generation_is_greedy_bounded_and_sees_every_picture(opened):
+def test_generation_is_greedy_bounded_and_sees_every_picture(opened, monkeypatch):
     model, calls = opened
+    monkeypatch.setattr(vlm, "MAX_NEW_TOKENS", 12)
     picture = np.random.default_rng(0).integers(0, 256, (64, 96, 3), dtype=np.uint8)
     first, *parts = vlm.Image(picture), vlm.Text("and"), vlm.Image(picture[:32])
     answers = [model.answer([vlm.Text("what?"), image, *parts]) for image in (first, first, vlm.Image(255 - picture))]
     assert answers[0] == answers[1]
     first, _, changed = calls.inputs
-    assert (first["do_sample"], first["max_new_tokens"]) == (False, vlm.MAX_NEW_TOKENS)
+    assert (first["do_sample"], first["max_new_tokens"]) == (False, 12)
     # Patches of 8 pixels: 8 x 12 and 4 x 12 of them, four of which become one token.
     assert first["image_grid_thw"].tolist() == [[1, 8, 12], [1, 4, 12]]
     assert int((first["input_ids"] == model.processor.image_token_id).sum()) == (8 * 12 + 4 * 12) // 4
@@ -356,13 +343,13 @@ def test_generation_is_greedy_bounded_and_sees_every_picture(opened):
     prompt = model.processor.tokenizer.decode(first["input_ids"][0])
     assert prompt.startswith("<|im_start|>user\nwhat?<|vision_start|><|image_pad|>")
     assert prompt.endswith("<|im_end|>\n<|im_start|>assistant\n")
-    assert 1 <= calls.outputs[0].shape[1] - first["input_ids"].shape[1] <= vlm.MAX_NEW_TOKENS
+    assert 1 <= calls.outputs[0].shape[1] - first["input_ids"].shape[1] <= 12
     assert model.model.dtype == torch.bfloat16
 
 
 def test_chosen_frames_of_a_video_are_shown_as_they_are_at_their_times(opened):
     model, calls = opened
-    chosen = (0, 5, 11, 19)
+    chosen, calls.answer = (0, 5, 11, 19), "nothing"
     model.answer([vlm.Video(FRAMES[list(chosen), :32, :48], chosen, 8.0, 20), vlm.Text("what happens?")])
     inputs = calls.inputs[0]
     # Two frames make one temporal patch; sampling again would have left fewer of them.
@@ -377,18 +364,17 @@ def test_a_readable_answer_becomes_evidence(opened):
     judge = VLMJudge(model)
     facts = {"target_held_for_two_late_steps": True, "wrong_object_or_drop": False}
     calls.answer = f"```json\n{json.dumps(facts)}\n```"
-    grasp = judge.extract(TRAJECTORY, "grasp", (0, 10, 19), HEIGHT_PX)
-    assert grasp.well_formed and establishes_success(grasp.evidence)
+    evidence, well_formed = judge.extract(TRAJECTORY, "grasp", (0, 10, 19), HEIGHT_PX)
+    assert well_formed and establishes_success(evidence)
     # A grasp's facts are no lift's evidence, and words instead of facts are none.
-    assert not judge.extract(TRAJECTORY, "lift", (0, 19), HEIGHT_PX).well_formed
+    assert not judge.extract(TRAJECTORY, "lift", (0, 19), HEIGHT_PX)[1]
     calls.answer = '{"target_held_for_two_late_steps": "true"}'
-    spoken = judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX)
-    assert (spoken.well_formed, spoken.evidence) == (False, GraspEvidence())
+    assert judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX) == (GraspEvidence(), False)
     calls.answer = '{"task_effect_completed": true, "observations": "it went up"}'
-    motion = judge.inspect_motion(TRAJECTORY, (0, 10, 19), "nothing earlier")
-    assert motion.evidence == MotionEvidence(task_effect_completed=True, observations="it went up")
+    motion, _ = judge.inspect_motion(TRAJECTORY, (0, 10, 19), "nothing earlier")
+    assert motion == MotionEvidence(task_effect_completed=True, observations="it went up")
     calls.answer = '{"observations_prove_completion": false, "reason": "held, not placed"}'
-    assert judge.reconcile(TRAJECTORY, "grasp", "{}", "{}").evidence.observations_prove_completion is False
+    assert judge.reconcile(TRAJECTORY, "grasp", "{}", "{}")[0].observations_prove_completion is False
     # One image a time step for grasps, one a view and time step for lifts, one video a view for motion.
     counts = [(len(inputs.get("image_grid_thw", ())), len(inputs.get("video_grid_thw", ()))) for inputs in calls.inputs]
     assert counts == [(3, 0), (6, 0), (2, 0), (0, 3), (0, 0)]

@@ -69,7 +69,7 @@ def test_a_task_without_a_known_verb_is_undecided_and_not_chosen_in(judge):
     selector = LearnedSelector(opened)
     with pytest.raises(DataError, match=r"does not know this task[\s\S]*lift[\s\S]*fold"):
         selector.score("fold the red cloth", shown_video(Trajectory("fold", frames, 8.0)))
-    assert 0 <= selector.score("gently lift a cube", shown_video(Trajectory("lift", frames, 8.0))).score <= 100
+    assert 0 <= selector.score("gently lift a cube", shown_video(Trajectory("lift", frames, 8.0)))[0] <= 100
 
 
 @pytest.mark.parametrize(
