@@ -15,31 +15,17 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation import vlm
 from worldline_core.evaluation.evaluation_config import VLMConfig
-from worldline_core.evaluation.policy.judge import (
-    GraspEvidence,
-    LiftEvidence,
-    MotionEvidence,
-    Reconciliation,
-    StateChangeEvidence,
-    VLMJudge,
-    establishes_success,
-    first_pass_indices,
-    judge_trajectory,
-    motion_indices,
-    overturns,
-    route,
-    verification_indices,
-)
+from worldline_core.evaluation.policy import judge as judging
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.rehearsal.outside_models import write_qwen3_vl
 
 SUCCESS = {
-    GraspEvidence: {"target_held_for_two_late_steps": True, "wrong_object_or_drop": False},
-    LiftEvidence: {
+    judging.GraspEvidence: {"target_held_for_two_late_steps": True, "wrong_object_or_drop": False},
+    judging.LiftEvidence: {
         "head_view_confirms_target_displacement": True, "target_held_for_two_late_steps": True,
         "target_on_original_support_at_end": False, "wrong_object_or_drop": False,
     },
-    StateChangeEvidence: {"required_final_state_visible": True, "wrong_object_or_drop": False},
+    judging.StateChangeEvidence: {"required_final_state_visible": True, "wrong_object_or_drop": False},
 }  # fmt: skip
 
 
@@ -47,10 +33,10 @@ SUCCESS = {
 def test_only_the_facts_of_a_success_establish_it(schema):
     for values in itertools.product((True, False, None), repeat=len(SUCCESS[schema])):
         found = dict(zip(SUCCESS[schema], values, strict=True))
-        assert establishes_success(schema(**found)) == (found == SUCCESS[schema])
-        if schema is StateChangeEvidence:
+        assert judging.establishes_success(schema(**found)) == (found == SUCCESS[schema])
+        if schema is judging.StateChangeEvidence:
             done, wrong = values
-            assert overturns(done, schema(**found)) == (done is True and wrong is not True)
+            assert judging.overturns(done, schema(**found)) == (done is True and wrong is not True)
 
 
 ROUTES = {
@@ -65,7 +51,7 @@ ROUTES = {
 
 @pytest.mark.parametrize(("instruction", "family"), [(text, name) for name, texts in ROUTES.items() for text in texts])
 def test_routing(instruction, family):
-    assert route(instruction) == family
+    assert judging.route(instruction) == family
 
 
 WELL_FORMED = (
@@ -88,19 +74,19 @@ MALFORMED = (
 
 @pytest.mark.parametrize("answer", SURROUNDED + MALFORMED)
 def test_answers_are_found_in_what_surrounds_them_and_malformed_ones_become_null_evidence(answer):
-    evidence, well_formed = vlm.parse_answer(GraspEvidence, answer)
+    evidence, well_formed = vlm.parse_answer(judging.GraspEvidence, answer)
     assert well_formed == (answer in SURROUNDED)
-    assert evidence.target_held_for_two_late_steps is True if well_formed else evidence == GraspEvidence()
+    assert evidence.target_held_for_two_late_steps is True if well_formed else evidence == judging.GraspEvidence()
 
 
 def test_first_pass_is_denser_towards_the_end():
-    indices = first_pass_indices(129)
+    indices = judging.first_pass_indices(129)
     assert (len(indices), indices[0], indices[-1]) == (12, 0, 128)
     assert indices[1] == round(np.sqrt(1 / 11) * 128)
     assert np.all(np.diff(np.diff(indices)) <= 1)
-    assert verification_indices(101) == (0, 65, 78, 88, 95, 100)
-    assert len(motion_indices(129)) == 12
-    assert first_pass_indices(3) == (0, 1, 2)
+    assert judging.verification_indices(101) == (0, 65, 78, 88, 95, 100)
+    assert len(judging.motion_indices(129)) == 12
+    assert judging.first_pass_indices(3) == (0, 1, 2)
 
 
 class ScriptedJudge:
@@ -118,21 +104,21 @@ class ScriptedJudge:
 
     def reconcile(self, trajectory, selected, first, verification):
         self.asked.append(("reconcile", selected, first, verification))
-        return Reconciliation(observations_prove_completion=self.reconciliation), True
+        return judging.Reconciliation(observations_prove_completion=self.reconciliation), True
 
     def inspect_motion(self, trajectory, indices, earlier):
         self.asked.append(("motion", len(indices), earlier))
-        return MotionEvidence(task_effect_completed=self.motion), True
+        return judging.MotionEvidence(task_effect_completed=self.motion), True
 
 
 def state(done, wrong=False, text=""):
     facts = {"required_final_state_visible": done, "wrong_object_or_drop": wrong, "observations": text}
-    return StateChangeEvidence(**facts), True
+    return judging.StateChangeEvidence(**facts), True
 
 
 def judged(judge, instruction="press the bell", views=("head", "left_wrist")):
     frames = {view: np.zeros((129, 8, 8, 3), np.uint8) for view in views}
-    return judge_trajectory(judge, Trajectory(instruction, frames, 8.0))
+    return judging.judge_trajectory(judge, Trajectory(instruction, frames, 8.0))
 
 
 def test_passes_ask_for_what_they_need_and_no_more():
@@ -143,7 +129,7 @@ def test_passes_ask_for_what_they_need_and_no_more():
     assert judge.asked[1:] == [("extract", 6, 480), ("reconcile", "two", "one", "two"), ("motion", 12, "two")]
 
 
-GRASP, NULL = (GraspEvidence(), True), (LiftEvidence(), False)
+GRASP, NULL = (judging.GraspEvidence(), True), (judging.LiftEvidence(), False)
 PASSES = ["first_pass", "verification", "reconciliation", "motion"]
 
 
@@ -247,12 +233,12 @@ def test_retries_what_fails_on_the_way_alone(server, replies, error, message):
 
 
 def test_no_answer_is_null_evidence_and_counted_until_the_server_is_given_up(server):
-    judge = VLMJudge(_model(server, attempts=1))
+    judge = judging.VLMJudge(_model(server, attempts=1))
     good = _reply('{"target_held_for_two_late_steps": true, "wrong_object_or_drop": false}')
     server.replies = [(400, {"error": "content"}), (500, {}), good]
     found = [judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX) for _ in range(3)]
     assert [well_formed for _, well_formed in found] == [False, False, True]
-    assert found[0][0] == GraspEvidence()
+    assert found[0][0] == judging.GraspEvidence()
     server.replies = [(500, {})] * 3
     judge.reconcile(TRAJECTORY, "", "", "")
     judge.inspect_motion(TRAJECTORY, (0, 19), "")
@@ -361,18 +347,18 @@ def test_chosen_frames_of_a_video_are_shown_as_they_are_at_their_times(opened):
 
 def test_a_readable_answer_becomes_evidence(opened):
     model, calls = opened
-    judge = VLMJudge(model)
+    judge = judging.VLMJudge(model)
     facts = {"target_held_for_two_late_steps": True, "wrong_object_or_drop": False}
     calls.answer = f"```json\n{json.dumps(facts)}\n```"
     evidence, well_formed = judge.extract(TRAJECTORY, "grasp", (0, 10, 19), HEIGHT_PX)
-    assert well_formed and establishes_success(evidence)
+    assert well_formed and judging.establishes_success(evidence)
     # A grasp's facts are no lift's evidence, and words instead of facts are none.
     assert not judge.extract(TRAJECTORY, "lift", (0, 19), HEIGHT_PX)[1]
     calls.answer = '{"target_held_for_two_late_steps": "true"}'
-    assert judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX) == (GraspEvidence(), False)
+    assert judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX) == (judging.GraspEvidence(), False)
     calls.answer = '{"task_effect_completed": true, "observations": "it went up"}'
     motion, _ = judge.inspect_motion(TRAJECTORY, (0, 10, 19), "nothing earlier")
-    assert motion == MotionEvidence(task_effect_completed=True, observations="it went up")
+    assert motion == judging.MotionEvidence(task_effect_completed=True, observations="it went up")
     calls.answer = '{"observations_prove_completion": false, "reason": "held, not placed"}'
     assert judge.reconcile(TRAJECTORY, "grasp", "{}", "{}")[0].observations_prove_completion is False
     # One image a time step for grasps, one a view and time step for lifts, one video a view for motion.

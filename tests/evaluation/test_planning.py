@@ -10,15 +10,7 @@ from tests.rollout.conftest import ROBOT
 from worldline_core import WorldLine
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation import shortcuts
-from worldline_core.evaluation.planning.bracket import (
-    CandidateVideo,
-    MeasuredSelector,
-    VLMSelector,
-    choose,
-    planning_indices,
-    shown_order,
-    shown_video,
-)
+from worldline_core.evaluation.planning import bracket
 from worldline_core.evaluation.planning.closed_loop import ClosedLoopPlanner, Situation, judged, recorded
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
@@ -27,7 +19,7 @@ from worldline_core.rollout.robot import CommandedRobot
 
 def load(candidate):
     """The candidate's number is all that its video shows."""
-    return CandidateVideo({"head": np.full((1, 1, 1, 3), candidate, np.uint8)}, (0,), 8.0, 1)
+    return bracket.CandidateVideo({"head": np.full((1, 1, 1, 3), candidate, np.uint8)}, (0,), 8.0, 1)
 
 
 class PerfectSelector:
@@ -52,7 +44,7 @@ class PerfectSelector:
 
 
 def pick(selector, candidates, *, scene="s", seed=0):
-    return choose(selector, "task", candidates, load, scene=scene, seed=seed)
+    return bracket.choose(selector, "task", candidates, load, scene=scene, seed=seed)
 
 
 ROUNDS = {1: [1], 2: [2], 3: [3], 4: [4], 5: [5], 8: [8, 4], 16: [16, 8, 4], 24: [24, 12, 6, 4], 32: [32, 16, 8, 4]}
@@ -73,9 +65,9 @@ def test_groups_of_four_and_the_order_depends_on_scene_and_seed_only():
     selector = PerfectSelector(np.arange(16))
     pick(selector, range(16), scene="kitchen", seed=3)
     assert [len(group) for group in selector.shown] == [4, 4, 4, 4, 4, 4]
-    assert [c for group in selector.shown[:4] for c in group] == shown_order(range(16), "kitchen", 3)
-    assert shown_order([3, 1, 2, 0], "kitchen", 3) == shown_order(range(4), "kitchen", 3)
-    orders = [shown_order(range(16), *key) for key in (("kitchen", 3), ("garage", 3), ("kitchen", 4))]
+    assert [c for group in selector.shown[:4] for c in group] == bracket.shown_order(range(16), "kitchen", 3)
+    assert bracket.shown_order([3, 1, 2, 0], "kitchen", 3) == bracket.shown_order(range(4), "kitchen", 3)
+    orders = [bracket.shown_order(range(16), *key) for key in (("kitchen", 3), ("garage", 3), ("kitchen", 4))]
     assert all(one != other for one, other in itertools.combinations([*orders, list(range(16))], 2))
 
 
@@ -87,20 +79,20 @@ def test_answers_that_name_nobody_are_counted_and_filled_up():
     choice = pick(Silent(np.zeros(8)), range(8))
     # Two comparisons name one valid letter each; the tie-break names A, which is valid.
     assert (choice.malformed_answers, choice.answers) == (2, 7)
-    assert choice.candidate == shown_order(range(8), "s", 0)[0]
+    assert choice.candidate == bracket.shown_order(range(8), "s", 0)[0]
     for candidates in ([], [1, 1]):
         with pytest.raises(DataError, match="distinct"):
             pick(PerfectSelector(np.arange(4)), candidates)
 
 
 def test_sixteen_frames_ten_over_the_whole_and_six_late():
-    indices = planning_indices(129)
+    indices = bracket.planning_indices(129)
     assert (len(indices), indices[0], indices[-1]) == (16, 0, 128)
     whole = {round(p * 128) for p in np.linspace(0, 1, 10)}
     assert whole <= set(indices)
     assert all(index >= 0.6 * 128 for index in set(indices) - whole)
-    assert len(planning_indices(33)) == 16
-    assert planning_indices(5) == (0, 1, 2, 3, 4)
+    assert len(bracket.planning_indices(33)) == 16
+    assert bracket.planning_indices(5) == (0, 1, 2, 3, 4)
 
 
 class ScriptedModel:
@@ -122,10 +114,10 @@ class ScriptedModel:
     ],
 )
 def test_vlm_selector_reads_labels_and_scores_and_malformed_ones_are_zero(text, score):
-    assert VLMSelector(ScriptedModel(text)).score("lift it", load(0)) == (score or 0.0, score is not None)
+    assert bracket.VLMSelector(ScriptedModel(text)).score("lift it", load(0)) == (score or 0.0, score is not None)
     videos = {letter: load(index) for index, letter in enumerate("ABCD")}
     model = ScriptedModel('Sure: {"selected_labels": ["b", "D"], "reason": "held"}')
-    assert VLMSelector(model).compare("lift it", videos, 2) == (("B", "D"), True)
+    assert bracket.VLMSelector(model).compare("lift it", videos, 2) == (("B", "D"), True)
     assert "exactly 2 candidate" in model.parts[0][-1].text
 
 
@@ -152,9 +144,9 @@ RISEN = near((0, 0, 0.2))
 
 def test_the_medoid_is_the_sequence_most_like_the_others_shown():
     targets = near((0.3, 0, 0), (0, 0, 0), (0.02, 0, 0), (-0.02, 0, 0), (-0.4, 0, 0))
-    choose = shortcuts.medoid(facts("lift the red cube", targets, targets + np.array([0, 0, 0.2])))
-    assert choose(range(5)) == 1
-    assert choose([0, 1, 2]) == 2
+    bracket.choose = shortcuts.medoid(facts("lift the red cube", targets, targets + np.array([0, 0, 0.2])))
+    assert bracket.choose(range(5)) == 1
+    assert bracket.choose([0, 1, 2]) == 2
 
 
 @pytest.mark.parametrize(
@@ -264,7 +256,7 @@ def world(shipped):
 @pytest.mark.slow
 def test_a_horizon_of_the_whole_episode_is_open_loop_best_of_n(world, start, shipped, planner_of):
     candidates = np.stack([start.controls[1:], start.controls[1:] + 0.03, start.controls[1:][::-1]])
-    selector = MeasuredSelector(LearnedSegmenter.load(shipped / "models" / "segmenter"))
+    selector = bracket.MeasuredSelector(LearnedSegmenter.load(shipped / "models" / "segmenter"))
     options = {"propose": recorded(candidates), "score": judged(selector), "candidates": 3, "batch": 2, "horizon": 2}
     planner = planner_of(**options, limits=False)
     plan = planner.plan(start.images, start.controls[0])
@@ -272,7 +264,7 @@ def test_a_horizon_of_the_whole_episode_is_open_loop_best_of_n(world, start, shi
     for controls in candidates:
         rows = np.concatenate((start.controls[:1], controls))
         frames = world.predict(start.images, rows, start.cameras, embodiment=ROBOT)
-        shown = shown_video(Trajectory(start.episode.instruction, frames, world.contract.fps))
+        shown = bracket.shown_video(Trajectory(start.episode.instruction, frames, world.contract.fps))
         scores.append(selector.score(start.episode.instruction, shown)[0] / 100)
     assert np.array_equal(plan.scores, np.sort(scores)[::-1])
     assert np.array_equal(plan.sequence, candidates[int(np.argmax(scores))])
