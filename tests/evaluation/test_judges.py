@@ -3,8 +3,6 @@
 import base64
 import itertools
 import json
-import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import cv2
 import numpy as np
@@ -154,61 +152,43 @@ def test_each_pass_can_establish_success_until_the_last_one(judge, more, passes,
 
 
 class Server:
-    """A chat server with prepared replies: (status, body)."""
+    """In place of `exchange`, whose sockets test_hostile_endpoints tests: prepared replies (status, body)."""
 
     def __init__(self):
-        self.replies, self.requests, self.headers = [], [], []
-        outer = self
+        self.replies, self.requests = [], []
 
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self):
-                body = self.rfile.read(int(self.headers["Content-Length"]))
-                outer.requests.append((self.path, json.loads(body)))
-                outer.headers.append(dict(self.headers))
-                status, reply = outer.replies.pop(0)
-                self.send_response(status)
-                self.end_headers()
-                self.wfile.write(reply if isinstance(reply, bytes) else json.dumps(reply).encode())
-
-            def log_message(self, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
-                pass
-
-        self.server = HTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}/v1"
-        threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True).start()
+    def __call__(self, url, body, *, headers, **limits):
+        self.requests.append((url, json.loads(body), headers))
+        status, reply = self.replies.pop(0)
+        return status, reply if isinstance(reply, bytes) else json.dumps(reply).encode()
 
 
 @pytest.fixture
-def server():
-    running = Server()
-    yield running
-    running.server.shutdown()
-    running.server.server_close()
+def server(monkeypatch):
+    monkeypatch.setattr(vlm, "exchange", replies := Server())
+    return replies
 
 
 def _reply(text):
     return 200, {"choices": [{"message": {"content": text}}]}
 
 
-def _model(server, **options):
-    return vlm.OpenAICompatibleModel(
-        VLMConfig(url=server.url, model="some-model", timeout_s=5, **options), backoff_s=0.01
-    )
+def _model(**options):
+    return vlm.OpenAICompatibleModel(VLMConfig(url="http://judge/v1", model="some-model", **options), backoff_s=0.01)
 
 
 def test_sends_text_and_frames_and_reads_the_answer(server, monkeypatch):
     monkeypatch.setenv("JUDGE_KEY", "secret")
     server.replies = [_reply("fine")]
     picture = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
-    assert _model(server, api_key_variable="JUDGE_KEY").answer([vlm.Text("what?"), vlm.Image(picture)]) == "fine"
-    path, body = server.requests[0]
-    assert path == "/v1/chat/completions"
+    assert _model(api_key_variable="JUDGE_KEY").answer([vlm.Text("what?"), vlm.Image(picture)]) == "fine"
+    url, body, headers = server.requests[0]
+    assert (url, headers["Authorization"]) == ("http://judge/v1/chat/completions", "Bearer secret")
     assert (body["temperature"], body["max_tokens"], len(body["messages"])) == (0.0, 256, 1)
     text, image = body["messages"][0]["content"]
     assert text == {"type": "text", "text": "what?"}
     png = base64.b64decode(image["image_url"]["url"].removeprefix("data:image/png;base64,"))
     assert np.array_equal(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], picture)  # pyright: ignore[reportOptionalSubscript]
-    assert server.headers[0]["Authorization"] == "Bearer secret"
 
 
 @pytest.mark.parametrize(
@@ -225,15 +205,15 @@ def test_sends_text_and_frames_and_reads_the_answer(server, monkeypatch):
 def test_retries_what_fails_on_the_way_alone(server, replies, error, message):
     server.replies = [*replies]
     if error is None:
-        assert _model(server).answer([vlm.Text("?")]) == "third time"
+        assert _model().answer([vlm.Text("?")]) == "third time"
     else:
         with pytest.raises(error, match=message):
-            _model(server).answer([vlm.Text("?")])
+            _model().answer([vlm.Text("?")])
     assert len(server.requests) == len(replies)
 
 
 def test_no_answer_is_null_evidence_and_counted_until_the_server_is_given_up(server):
-    judge = judging.VLMJudge(_model(server, attempts=1))
+    judge = judging.VLMJudge(_model(attempts=1))
     good = _reply('{"target_held_for_two_late_steps": true, "wrong_object_or_drop": false}')
     server.replies = [(400, {"error": "content"}), (500, {}), good]
     found = [judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX) for _ in range(3)]
@@ -274,7 +254,7 @@ def folder(tmp_path_factory):
 
 
 class Calls:
-    """The real `generate`, with what it was given and, on request, the answer it is led to."""
+    """The real `generate`, or an answer in its place (what weights would have to be trained for), and what it was given."""
 
     def __init__(self, model, tokenizer):
         self.inner, self.tokenizer = model.generate, tokenizer
@@ -282,23 +262,12 @@ class Calls:
 
     def __call__(self, **inputs):
         self.inputs.append(inputs)
-        leading = []
-        if self.answer is not None:
+        if self.answer is None:
+            self.outputs.append(self.inner(**inputs))
+        else:
             tokens = [*self.tokenizer(self.answer)["input_ids"], self.tokenizer.eos_token_id]
-            leading = [Leading(tokens, inputs["input_ids"].shape[1])]
-        self.outputs.append(self.inner(**inputs, logits_processor=leading))
+            self.outputs.append(torch.cat([inputs["input_ids"], torch.tensor([tokens])], dim=1))
         return self.outputs[-1]
-
-
-class Leading:
-    """Makes the model say given tokens, then end: what weights would have to be trained for."""
-
-    def __init__(self, tokens, prompt):
-        self.tokens, self.prompt = tokens, prompt
-
-    def __call__(self, input_ids, scores):
-        wanted = self.tokens[input_ids.shape[1] - self.prompt]
-        return torch.full_like(scores, float("-inf")).index_fill(1, torch.tensor([wanted]), 0.0)
 
 
 @pytest.fixture(scope="module")

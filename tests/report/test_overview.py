@@ -134,31 +134,11 @@ def test_a_perfect_score_of_few_cases_is_no_certainty(tmp_path: Path) -> None:
     assert figure.verdict == "unclear"
 
 
-@pytest.mark.parametrize(
-    ("mean", "bounds", "verdict", "better"),
-    [
-        (0.7, (0.1, 0.3), "better", True),
-        (0.6, (-0.1, 0.3), "unclear", True),
-        (0.4, (-0.3, -0.05), "worse", False),
-        (0.4, (-0.3, 0.1), "unclear", False),
-        (0.7, None, "unclear", True),
-    ],
-)
-def test_a_figure_is_coloured_by_its_reference(mean: float, bounds: tuple, verdict: str, better: bool) -> None:
-    figure = Figure("right", {"mean": mean}, "recordings", "chance", 0.5, bounds, "")
-    assert (figure.verdict, figure.gain > 0) == (verdict, better)
-
-
 def test_a_figure_within_chance_is_neutral_on_the_page(tmp_path: Path) -> None:
     page = first_page(context_of(tmp_path, over_copy=(-0.1, 0.7), success=0.76), [])
     assert "better than copying the first frame: 0.50, within chance" in page
     assert [page.count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")] == [0, 0, 2]
-
-
-def test_the_page_shows_the_video_and_three_coloured_figures(full_report: Path) -> None:
-    text = (full_report / "index.html").read_text()
-    assert 'src="media/episode0_shipped_head.mp4"' in text
-    assert [text.count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")] == [3, 0, 0]
+    assert Figure("right", {"mean": 0.7}, "recordings", "chance", 0.5, None, "").verdict == "unclear"
 
 
 def artifact(store: Path, step: str, key: str, seconds: float, finished: str = "2026-01-01", **metrics: object) -> Path:

@@ -124,11 +124,16 @@ def test_times_and_versions_stay_out_of_the_reproducible_page(full_report: Path)
 
 def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
     found = pages(full_report)
-    assert "+0.21" in found["quality"]  # over shuffled actions
-    assert "lpips" in found["quality"]
-    assert "no weights in the configured folder" in found["quality"]
-    assert "0.930" in found["quality"]  # the segmenter's own accuracy
-    assert ", colour</th>" in found["quality"]  # by a second segmenter
+    assert 'src="media/episode0_shipped_head.mp4"' in found["index"]
+    tiles = [found["index"].count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")]
+    assert tiles == [3, 0, 0]
+    for shown in (
+        "+0.21",  # over shuffled actions
+        "lpips", "no weights in the configured folder",
+        "0.930",  # the segmenter's own accuracy
+        ", colour</th>",  # by a second segmenter
+    ):  # fmt: skip
+        assert shown in found["quality"], shown
     assert "recorded videos (ceiling)" in found["decisions"]
     assert re.search(r"0\.95</span>.*?0\.50.*?</td><td[^>]*>0\.95</td>", found["decisions"])
     for cells in (
