@@ -12,7 +12,7 @@ from tests.evaluation.test_evaluation_steps import summary_of  # pyright: ignore
 from tests.training.conftest import write_tokenizer  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import JudgeConfig, PlanningConfig
-from worldline_core.evaluation.planning.bracket import LearnedSelector, shown_video
+from worldline_core.evaluation.planning.bracket import learned_selector, shown_video
 from worldline_core.evaluation.planning.evaluate_planning import open_selector
 from worldline_core.evaluation.policy import learned_judge
 from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
@@ -66,7 +66,7 @@ def test_a_task_without_a_known_verb_is_undecided_and_not_chosen_in(judge):
     opened = learned_judge.LearnedJudge.load(judge)
     verdict = opened.judge(Trajectory("fold the red cloth", frames, 8.0))
     assert (verdict.success, verdict.undecided) == (False, True)
-    selector = LearnedSelector(opened)
+    selector = learned_selector(opened)
     with pytest.raises(DataError, match=r"does not know this task[\s\S]*lift[\s\S]*fold"):
         selector.score("fold the red cloth", shown_video(Trajectory("fold", frames, 8.0)))
     assert 0 <= selector.score("gently lift a cube", shown_video(Trajectory("lift", frames, 8.0)))[0] <= 100

@@ -256,7 +256,7 @@ def world(shipped):
 @pytest.mark.slow
 def test_a_horizon_of_the_whole_episode_is_open_loop_best_of_n(world, start, shipped, planner_of):
     candidates = np.stack([start.controls[1:], start.controls[1:] + 0.03, start.controls[1:][::-1]])
-    selector = bracket.MeasuredSelector(LearnedSegmenter.load(shipped / "models" / "segmenter"))
+    selector = bracket.measured_selector(LearnedSegmenter.load(shipped / "models" / "segmenter"))
     options = {"propose": recorded(candidates), "score": judged(selector), "candidates": 3, "batch": 2, "horizon": 2}
     planner = planner_of(**options, limits=False)
     plan = planner.plan(start.images, start.controls[0])

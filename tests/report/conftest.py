@@ -139,6 +139,14 @@ def write_video_scores(folder: Path) -> None:
     write_json_atomic(folder / "summary.json", summary)
 
 
+def write_evaluation(folder: Path, scores: list[Score]) -> dict[str, Path]:
+    """An evaluation of videos with these scores, as an input."""
+    folder.mkdir(parents=True)
+    write_scores(folder, scores)
+    write_json_atomic(folder / "summary.json", summarise(scores, resamples=100, seed=0, by_view=True))
+    return {"evaluate_video": folder}
+
+
 def write_policy_scores(folder: Path) -> None:
     """Verdicts of three methods, the recorded videos judged best."""
     outcomes = ("failure", "success")

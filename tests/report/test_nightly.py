@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
+from tests.report.conftest import write_evaluation  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import ArtifactError, RegressionError
 from worldline_core.evaluation.paired import Series, differences, paired_tests, read_scores
-from worldline_core.evaluation.scores import Interval, Score, summarise, write_scores
+from worldline_core.evaluation.scores import Interval, Score, write_scores
 from worldline_core.report import comparison
 
 METRICS = ("robot_iou", "robot_iou_exact", "ssim", "hsd", "psnr", "end_effector_error_px")
@@ -172,11 +173,7 @@ class World:
             for (method, metric), values in self.night(loss).items()
             for name, value in values.items()
         ]
-        folder.mkdir(parents=True)
-        write_scores(folder, scores)
-        found = summarise(scores, resamples=100, seed=0, by_view=True)
-        (folder / "summary.json").write_text(json.dumps(found))
-        return {"evaluate_video": folder}
+        return write_evaluation(folder, scores)
 
 
 def verdicts(present: Series, good: list[Series]) -> dict[str, str]:

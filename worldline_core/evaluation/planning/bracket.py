@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import string
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -92,21 +91,17 @@ def planning_indices(num_frames: int) -> tuple[int, ...]:
 def shown_video(video: Trajectory) -> CandidateVideo:
     """The sixteen frames of a whole video that a selector sees."""
     indices = planning_indices(video.num_frames)
-    frames = {view: shown[list(indices)] for view, shown in video.frames.items()}
-    points = None if video.points is None else video.points[list(indices)]
+    frames, points = video.at(indices)
     return CandidateVideo(frames, indices, video.fps, video.num_frames, points)
 
 
-class ScoringSelector(ABC):
-    """Scores each video by itself; a comparison takes the best scores."""
+class ScoringSelector:
+    """Scores each video by its own likelihood to complete the task, 0..1; a comparison takes the best scores."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str, likelihood: Callable[[str, CandidateVideo], float]) -> None:
+        self.name, self.likelihood = name, likelihood
         # Smaller budgets show the same videos again.
         self._scores: dict[tuple[str, str], float] = {}
-
-    @abstractmethod
-    def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
-        """0..1, how likely this candidate completes the task."""
 
     def compare(
         self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
@@ -123,33 +118,21 @@ class ScoringSelector(ABC):
         return self._scores[key], True
 
 
-class MeasuredSelector(ScoringSelector):
-    """Likelihood by the measured judge's facts with soft thresholds."""
+def measured_selector(segmenter: Segmenter) -> ScoringSelector:
+    """Likelihood by the measured judge's facts with soft thresholds; `UNSEEN_SCORE` where nothing can be measured."""
 
-    name = "measured"
-
-    def __init__(self, segmenter: Segmenter) -> None:
-        super().__init__()
-        self.segmenter = segmenter
-
-    def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
-        """`UNSEEN_SCORE` where nothing can be measured."""
-        measured = measure(self.segmenter, instruction, route(instruction), candidate.frames, candidate.points)
+    def likelihood(instruction: str, candidate: CandidateVideo) -> float:
+        measured = measure(segmenter, instruction, route(instruction), candidate.frames, candidate.points)
         return UNSEEN_SCORE if measured is None else measured.score()
 
+    return ScoringSelector("measured", likelihood)
 
-class LearnedSelector(ScoringSelector):
-    """Likelihood by the learned judge."""
 
-    name = "learned"
-
-    def __init__(self, judge: LearnedJudge) -> None:
-        super().__init__()
-        self.judge = judge
-
-    def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
-        """Raises: DataError for a task that the judge does not know."""
-        return self.judge.probability(instruction, candidate.frames, candidate.indices, candidate.total_frames)
+def learned_selector(judge: LearnedJudge) -> ScoringSelector:
+    """Likelihood by the learned judge; a task that it does not know raises DataError."""
+    return ScoringSelector(
+        "learned", lambda text, video: judge.probability(text, video.frames, video.indices, video.total_frames)
+    )
 
 
 class _ComparisonAnswer(Answer):

@@ -366,9 +366,7 @@ def soft_score(segmenter: Segmenter, trajectory: Trajectory) -> tuple[float, dic
     Raises: DataError where nothing can be measured.
     """
     chosen = list(first_pass_indices(trajectory.num_frames))
-    chosen = [0] * (LATE_COUNT - len(chosen)) + chosen
-    frames = {view: video[chosen] for view, video in trajectory.frames.items()}
-    points = None if trajectory.points is None else trajectory.points[chosen]
+    frames, points = trajectory.at([0] * (LATE_COUNT - len(chosen)) + chosen)
     measured = measure(segmenter, trajectory.instruction, route(trajectory.instruction), frames, points)
     if measured is None:
         raise DataError(
@@ -425,9 +423,7 @@ class MeasuredEvidenceJudge:
         return MotionEvidence(task_effect_completed=done, observations=evidence.observations), True
 
     def _facts(self, trajectory: Trajectory, family: EvidenceFamily, indices: tuple[int, ...]) -> Evidence:
-        chosen = list(indices)
-        frames = {view: video[chosen] for view, video in trajectory.frames.items()}
-        points = None if trajectory.points is None else trajectory.points[chosen]
+        frames, points = trajectory.at(indices)
         measured = measure(self.segmenter, trajectory.instruction, family, frames, points)
         evidence = facts(measured, trajectory.instruction, family)
         if measured is None:
