@@ -25,7 +25,7 @@ from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.evaluation.metrics import frame_iou
 from worldline_core.evaluation.planning.bracket import planning_indices
-from worldline_core.evaluation.policy.evidence import establishes_success, route
+from worldline_core.evaluation.policy.judge import establishes_success, route
 from worldline_core.evaluation.policy.measured_judge import facts, measure
 from worldline_core.evaluation.scores import bootstrap_mean
 from worldline_core.evaluation.segmenters.coloured_things import named_things, own_colour, thing_share

@@ -1,4 +1,4 @@
-"""A small world with known outcomes: a dark gripper over a grey table, a red cube, three views."""
+"""A small world with known outcomes: a dark gripper over a grey table, a red cube, two views."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +11,12 @@ from tests.training.conftest import build_episode, build_tracks, killed_after  #
 from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig, VideoEvaluationConfig
+from worldline_core.evaluation.metric_registry import ON_REQUEST
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
 from worldline_core.rollout.rollout_set import RolloutSetWriter
 
 VIDEO = VideoEvaluationConfig(segmenters=("colour",), resamples=100)
+EVERY = VIDEO.model_copy(update={"metrics": ON_REQUEST, "changed_controls": {"good": {"delayed": "copy"}}})
 POLICY = PolicyEvaluationConfig(segmenter="colour", splits=("test",), resamples=100)
 NUM_FRAMES = 17
 HEIGHT, WIDTH = 48, 72
@@ -51,7 +53,7 @@ def make_film(success, seed):
         points[frame, 0] = (column + 3, tip - 6)
         if frame < 9 or success:
             wrist[frame, 20:44, 24:48] = (220, 20, 20)
-    return {"head": head, "left_wrist": np.full_like(wrist, 100), "right_wrist": wrist}, masks, points
+    return {"head": head, "right_wrist": wrist}, masks, points
 
 
 def _tracks(episode_id, points, path):
@@ -72,6 +74,7 @@ def _write(root, cases, *, split, bank, sources=None, training=0, late=()):
     index = []
     with EpisodeSetWriter(episodes, video_preset="slow", pixel_format="yuv444p") as writer:
         learned = {f"train-{number:02d}": bool(number % 2) for number in range(training)}
+        middle = (training + 3) / 2
         for number, (episode_id, success) in enumerate({**cases, **learned}.items()):
             frames, masks, points = make_film(success, seed=0 if bank else number)
             state = np.zeros((NUM_FRAMES, 2), dtype=np.float32)
@@ -84,7 +87,7 @@ def _write(root, cases, *, split, bank, sources=None, training=0, late=()):
             cube = (frames["head"] == (220, 20, 20)).all(axis=-1).astype(np.uint8)
             writer.add(episode, frames, {"head": masks}, thing_labels={"head": cube})
             waits = 8 if episode_id in late else 0
-            speed = 0.02 + 0.0002 * (number if episode_id in learned else 11.5)
+            speed = 0.02 + 0.0002 * (number if episode_id in learned else middle)
             path = speed * np.maximum(np.arange(NUM_FRAMES) - waits, 0)
             index += write_shard(tracks, number, [_tracks(episode_id, points, path if training else 0 * path)])
             if episode_id in learned:
@@ -120,7 +123,7 @@ def policies(tmp_path_factory):
 def trained(tmp_path_factory):
     """Two attempts beside the recordings that the model knows; the second one begins later than any of these."""
     root = tmp_path_factory.mktemp("trained")
-    return _write(root, {"prompt": True, "late": True}, split="test", bank=None, training=20, late=("late",))
+    return _write(root, {"prompt": True, "late": True}, split="test", bank=None, training=8, late=("late",))
 
 
 @pytest.fixture(scope="session")
@@ -141,7 +144,7 @@ def bank(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def evaluated(recordings, tmp_path_factory):
-    """An evaluation of videos that nothing disturbed."""
+    """Every metric of videos that nothing disturbed; `copy` stands for a model that ignores changed controls."""
     folder = tmp_path_factory.mktemp("evaluated")
-    assert evaluate_video(VIDEO, recordings.inputs, folder)["methods"] == ["copy", "good"]
+    assert evaluate_video(EVERY, recordings.inputs, folder)["methods"] == ["copy", "good"]
     return folder

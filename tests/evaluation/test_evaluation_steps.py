@@ -16,23 +16,22 @@ import pytest
 
 from flows.pipeline import chain
 from tasks.execution.chain import outline
-from tests.evaluation.conftest import POLICY, VIDEO
+from tests.evaluation.conftest import EVERY, POLICY, VIDEO
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import load_config
-from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames, pieces
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import PlanningConfig, VideoEvaluationConfig
 from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, metric_of
+from worldline_core.evaluation.metrics import SceneFrames, scene_consistency
 from worldline_core.evaluation.planning import evaluate_planning as outcomes
 from worldline_core.evaluation.planning.evaluate_planning import CHOICES_FILE, SEALED_FILE, evaluate_planning
 from worldline_core.evaluation.policy.evaluate_policy import choose_trajectories, evaluate_policy
-from worldline_core.evaluation.policy.evidence import SCHEMAS, MotionEvidence, Reconciliation
+from worldline_core.evaluation.policy.judge import SCHEMAS, MotionEvidence, Reconciliation
 from worldline_core.evaluation.video import episode_measurement
 from worldline_core.evaluation.video import evaluate_video as evaluate_video_module
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
-from worldline_core.evaluation.video.metrics_on_request import SceneFrames, scene_consistency
 from worldline_core.evaluation.vlm import Text
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.report.context import ReportConfig, ReportContext
@@ -54,16 +53,20 @@ def measure(inputs, output, config=VIDEO, **changes):
     return found, found["metrics"]["test"]
 
 
-def without_copy(world):
-    """For what one method shows."""
-    return {name: path for name, path in world.inputs.items() if name != "rollouts.copy"}
+@pytest.fixture(scope="module")
+def few(recordings, tmp_path_factory):
+    """Inputs for what one method and two recordings show."""
+    made = rewritten(recordings, tmp_path_factory.mktemp("few") / "good", names=("ep-0", "ep-1"))
+    return {name: path for name, path in recordings.inputs.items() if not name.startswith("rollouts.")} | made
 
 
 def differences_of(summary):
     return {(row["first"], row["second"], row["metric"]): row["mean"] for row in summary["differences"]["test"]}
 
 
-def rewritten(world, output, change=lambda frames: frames, *, source="good", names=None, views=VIEWS, fps=8.0):
+def rewritten(
+    world, output, change=lambda frames: frames, *, source="good", names=None, views=("head", "right_wrist"), fps=8.0
+):
     """A method's predictions again, changed, of some episodes and views: its entry among inputs."""
     made, writer = RolloutSet.open(world.inputs[f"rollouts.{source}"]), RolloutSetWriter(output, output.name, fps)
     for name in names or made.episode_ids:
@@ -80,39 +83,53 @@ def rewritten(world, output, change=lambda frames: frames, *, source="good", nam
         (-1.0, "absent", "unchecked"),
     ],
 )
-def test_a_segmenter_without_exact_masks_is_measured_first(recordings, tmp_path, monkeypatch, floor, camera, reason):
+def test_a_segmenter_without_exact_masks_is_measured_first(few, tmp_path, monkeypatch, floor, camera, reason):
     monkeypatch.setattr(EpisodeSet, "robot_masks", lambda *_: None)
     monkeypatch.setattr(evaluate_video_module, "MIN_SEGMENTER_IOU", floor)
     tracks = ActionTracks.tracks
     monkeypatch.setattr(ActionTracks, "tracks", lambda self, i: replace(tracks(self, i), camera_motion=(camera,) * 3))
-    summary, means = measure(without_copy(recordings), tmp_path, views=("head",))
+    summary, means = measure(few, tmp_path, views=("head",))
     frames = set(pq.read_table(tmp_path / "by_frame.parquet")["metric"].to_pylist())
     assert ("robot_iou_kinematic" in frames) == (camera == "static")
     assert ("robot_iou" in frames) == ("robot_iou" in means["good"]) == (reason is None)
     assert reason is None or re.search(reason, summary["unavailable"]["robot_iou"])
 
 
-def test_video_metrics_prefer_the_right_videos(evaluated):
+def test_every_metric_of_the_registry_tells_good_videos_from_bad_ones_and_is_shown(evaluated, tmp_path):
     summary = summary_of(evaluated)
-    good, copy = summary["metrics"]["test"]["good"], summary["metrics"]["test"]["copy"]
+    good, copy = (summary["metrics"]["test"][method] for method in ("good", "copy"))
+    assert {metric_of(name).name for name in good} | {"lpips", "invented_motion"} == set(METRICS)  # no thing stays here
+    for name, metric in METRICS.items():
+        if name in ("lpips", "scene_consistency", "sharpness", "invented_motion") or metric.needs == "changed_controls":
+            continue
+        key = f"{name}@head" if f"{name}@head" in good else name
+        better, worse = good[key]["mean"], copy[key]["mean"]
+        assert (better < worse) == metric.lower_is_better, name
+        assert abs(better - metric.perfect) <= abs(worse - metric.perfect), name
     assert good["robot_iou_exact"]["mean"] > 0.8 > copy["robot_iou_exact"]["mean"]
-    assert good["robot_iou"]["mean"] > 0.9
-    assert good["ssim"]["mean"] > copy["ssim"]["mean"]
+    assert min(good[n]["mean"] for n in ("robot_iou", "scene_consistency@head", "sharpness@head")) > 0.9
     assert good["end_effector_error_px"]["mean"] < 1 < copy["end_effector_error_px"]["mean"]
     # Of four attempts the cube moves in the two that succeed.
     assert good["object_iou_exact"]["mean"] > 0.8 > 0.2 > copy["object_iou_exact"]["mean"]
     assert good["object_iou_exact"]["count"] == 2
+    assert good["action_following[delayed]@head"]["mean"] > 0.6
+    assert good.keys() >= {"counterfactual_direction[delayed]@head", "psnr@right_wrist"}
     assert set(summary["metrics"]) == {"test", "test/box_arm", "test/success", "test/failure"}
-    assert "psnr@left_wrist" in good
+    differences = differences_of(summary)
     difference = copy["robot_iou_exact"]["mean"] - good["robot_iou_exact"]["mean"]
-    assert differences_of(summary)["copy", "good", "robot_iou_exact"] == pytest.approx(difference)
+    assert differences["copy", "good", "robot_iou_exact"] == pytest.approx(difference)
+    assert {metric for *_, metric in differences} >= {"hsd", "ndtw", "dyn", "scene_consistency"}
     accuracy = summary["segmenters"][0]["accuracy_on_true_frames"]["test"]
     assert min(accuracy[name]["mean"] for name in ("robot_iou_exact", "object_iou_exact")) > 0.8
     assert "LPIPS is not available" in summary["unavailable"]["lpips"]
-    assert "lpips" not in pq.read_table(evaluated / "scores.parquet")["metric"].to_pylist()
+    tidy = pq.read_table(evaluated / "scores.parquet").to_pandas()
+    assert {*ON_REQUEST} <= {metric_of(name).name for name in tidy["metric"]} <= {*METRICS} - {"lpips"}
+    assert not tidy.duplicated(["method", "episode_id", "view", "seed", "metric"]).any()
     by_frame = pq.read_table(evaluated / "by_frame.parquet").to_pylist()
     first = [row["mean"] for row in by_frame if (row["method"], row["metric"], row["frame"]) == ("copy", "psnr", 0)]
     assert min(first) > 30  # the conditioning frame counts
+    page = str(quality_section(ReportContext(ReportConfig(), {"evaluate_video": evaluated}, tmp_path)).body)
+    assert all(METRICS[name].heading in page and METRICS[name].title in page for name in ON_REQUEST)
 
 
 def test_videos_are_compared_with_videos_without_action_tracks(recordings, evaluated, tmp_path):
@@ -136,7 +153,7 @@ def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, evaluated, 
     written = {path: path.stat().st_mtime_ns for path in parts[1::2]}
     assert len(written) >= 4
     monkeypatch.setattr(episode_measurement, "PIECE_FRAMES", 8)  # the pieces that videos are read in change no value
-    evaluate_video(VIDEO, recordings.inputs, again)
+    evaluate_video(EVERY, recordings.inputs, again)
     assert {path: path.stat().st_mtime_ns for path in written} == written  # what was there is not measured again
     assert digest_folder(evaluated) == digest_folder(again)
 
@@ -159,25 +176,36 @@ def test_names_of_episodes_and_banks_never_become_names_of_files(oddly_named, tm
     assert not list(Path("/tmp").glob("outside*"))
 
 
-def test_what_cannot_be_measured_is_refused(recordings, bank, tmp_path):
-    inputs = recordings.inputs
-    without = {name: path for name, path in inputs.items() if not name.startswith("rollouts")}
+def test_what_cannot_be_measured_is_refused(few, recordings, bank, tmp_path):
+    without = {name: path for name, path in few.items() if not name.startswith("rollouts.")}
+    longer = rewritten(recordings, tmp_path / "longer", lambda frames: frames[[*range(17), 16]], names=("ep-0",))
+    wrong = rewritten(recordings, tmp_path / "wrong", names=("ep-0",), fps=3.0)
     for config, given, error, message in (
-        (VIDEO, inputs | {"rollouts.other": bank.inputs["rollouts.good"]}, DataError, "not in the EpisodeSet"),
+        (VIDEO, few | {"rollouts.other": bank.inputs["rollouts.good"]}, DataError, "not in the EpisodeSet"),
         (VIDEO, without, ArtifactError, "No predicted videos"),
-        (VIDEO.model_copy(update={"views": ()}), inputs, DataError, "No prediction could be measured"),
+        (VIDEO.model_copy(update={"views": ()}), few, DataError, "No prediction could be measured"),
+        (VIDEO, without | wrong, DataError, "another frame rate than their recording.*8 frames per second"),
+        (VIDEO, without | longer, DataError, "longer than its recording.*<= 17.*got: 18"),
     ):
-        with pytest.raises(error, match=message):
-            evaluate_video(config, given, tmp_path)
+        with pytest.raises(error, match=f"(?s){message}"):
+            evaluate_video(config, given, tmp_path / "refused")
+    made = RolloutSet.open(recordings.inputs["rollouts.good"])
+    video = VideoFrames(made.clip("ep-0", "head"), stride=4)
+    assert (len(video), [len(piece) for piece in pieces(video, 2)]) == (5, [2, 2, 1])
+    assert (video[[4]][0] == made.frames("ep-0", "head", 0)[16]).all()
 
 
 def test_policy_accuracy_against_recorded_outcomes(recordings, tmp_path):
-    result = evaluate_policy(POLICY, recordings.inputs, tmp_path)
-    assert result["accuracy"] == {"copy": 0.5, "good": 1.0, "true": 1.0}
+    counts = evaluate_policy(POLICY.model_copy(update={"max_per_group": 1}), recordings.inputs, tmp_path)
+    assert counts["accuracy"] == {"copy": 0.5, "good": 1.0, "true": 1.0}
+    assert (counts["found"], counts["kept"]) == (4, 2)
+    assert {reason: count for reason, count in counts["left_out"].items() if count} == {
+        "not drawn (evaluate_policy.balanced, max_per_group)": 2
+    }
     summary = summary_of(tmp_path)
-    assert summary["trajectories"] == 4
+    assert summary["trajectories"] == 2
     assert summary["methods"]["copy"]["test/lift"]["confusion"] == {
-        "true_success": 0, "false_success": 0, "true_failure": 2, "false_failure": 2,
+        "true_success": 0, "false_success": 0, "true_failure": 1, "false_failure": 1,
     }  # fmt: skip
     over = summary["methods"]["good"]["all"]["over_shortcut"]
     best = max(found["all"]["mean"] for found in summary["shortcuts"].values())
@@ -185,24 +213,17 @@ def test_policy_accuracy_against_recorded_outcomes(recordings, tmp_path):
     assert summary["shortcuts"]["one_verdict"]["all"]["mean"] == 0.5 <= best  # a gain is never over less than guessing
     evidence = pq.read_table(tmp_path / "decisions.parquet")["evidence"][0].as_py()
     assert "head_view_confirms_target_displacement" in json.loads(evidence)[0]
-
-
-def test_nothing_to_judge_is_an_error_that_says_why(recordings, tmp_path):
     with pytest.raises(DataError, match=r"No video can be judged[\s\S]*4 in other splits[\s\S]*evaluate_policy: null"):
         evaluate_policy(POLICY.model_copy(update={"splits": ("nowhere",)}), recordings.inputs, tmp_path / "none")
-    counts = evaluate_policy(POLICY.model_copy(update={"max_per_group": 1}), recordings.inputs, tmp_path / "few")
-    assert (counts["found"], counts["kept"]) == (4, 2)
-    assert {reason: count for reason, count in counts["left_out"].items() if count} == {
-        "not drawn (evaluate_policy.balanced, max_per_group)": 2
-    }
 
 
 @pytest.mark.parametrize(
     ("changes", "counts"), [({}, (4, 4)), ({"balanced": False}, (5, 4)), ({"max_per_group": 1}, (1, 1))]
 )
-def test_as_many_successes_as_failures_are_judged(policies, changes, counts):
+def test_as_many_successes_as_failures_are_judged(recordings, changes, counts):
     """Of nine attempts five succeed."""
-    rows = EpisodeSet.open(policies.inputs["episodes"]).rows
+    row = EpisodeSet.open(recordings.inputs["episodes"]).rows[0]
+    rows = [replace(row, episode_id=f"{n}", outcome=("failure", "success")[n < 5]) for n in range(9)]
     chosen = choose_trajectories(POLICY.model_copy(update=changes), rows, Counter())
     found = Counter(row.outcome for row in chosen)
     assert (found["success"], found["failure"]) == counts
@@ -339,7 +360,7 @@ def test_methods_are_compared_over_the_views_that_both_predicted(recordings, tmp
     found, means = measure(inputs, tmp_path / "out")
     only, good, copy = (means[name] for name in ("head_only", "good", "copy"))
     assert {name for name in only if name.startswith("psnr")} == {"psnr", "psnr@head"}
-    assert only["psnr@head"]["count"] == good["psnr@left_wrist"]["count"] == 4
+    assert only["psnr@head"]["count"] == good["psnr@right_wrist"]["count"] == 4
     rows = differences_of(found)
     assert rows["good", "head_only", "ssim"] == pytest.approx(rows["good", "head_only", "ssim@head"])
     assert rows["good", "head_only", "ssim"] != pytest.approx(good["ssim"]["mean"] - only["ssim"]["mean"], abs=1e-3)
@@ -360,57 +381,9 @@ def test_strided_predictions_are_compared_with_every_second_frame(recordings, tm
     assert evaluate_policy(POLICY, inputs, tmp_path / "policy")["accuracy"]["strided"] == 1.0
 
 
-def test_predictions_that_do_not_fit_their_recordings_are_refused(recordings, tmp_path):
-    longer = rewritten(recordings, tmp_path / "longer", lambda frames: frames[[*range(17), 16]], names=("ep-0",))
-    for wrong, message in (
-        (
-            rewritten(recordings, tmp_path / "wrong", fps=3.0),
-            "another frame rate than their recording.*8 frames per second",
-        ),
-        (longer, "longer than its recording.*<= 17.*got: 18"),
-    ):
-        with pytest.raises(DataError, match=f"(?s){message}"):
-            evaluate_video(VIDEO, recordings.inputs | wrong, tmp_path / "refused")
-    made = RolloutSet.open(recordings.inputs["rollouts.good"])
-    video = VideoFrames(made.clip("ep-0", "head"), stride=4)
-    assert (len(video), video[[0, 4]].shape[0]) == (5, 2)
-    assert [len(piece) for piece in pieces(video, 2)] == [2, 2, 1]
-    assert (video[[4]][0] == made.frames("ep-0", "head", 0)[16]).all()
-
-
-@pytest.fixture(scope="module")
-def measured(recordings, tmp_path_factory):
-    """An evaluation with every metric: `good` predicts well, `copy` stands for a model that ignores changed controls."""
-    folder = tmp_path_factory.mktemp("on_request")
-    measure(recordings.inputs, folder, metrics=ON_REQUEST, changed_controls={"good": {"delayed": "copy"}})
-    return folder
-
-
-def test_every_metric_of_the_registry_tells_good_videos_from_bad_ones_and_is_shown(measured, tmp_path):
-    summary = summary_of(measured)
-    good, copy = (summary["metrics"]["test"][method] for method in ("good", "copy"))
-    assert {metric_of(name).name for name in good} | {"lpips", "invented_motion"} == set(METRICS)  # no thing stays here
-    for name, metric in METRICS.items():
-        if name in ("lpips", "scene_consistency", "sharpness", "invented_motion") or metric.needs == "changed_controls":
-            continue
-        key = f"{name}@head" if f"{name}@head" in good else name
-        better, worse = good[key]["mean"], copy[key]["mean"]
-        assert (better < worse) == metric.lower_is_better, name
-        assert abs(better - metric.perfect) <= abs(worse - metric.perfect), name
-    assert min(good[name]["mean"] for name in ("scene_consistency@head", "sharpness@head")) > 0.9
-    assert good["action_following[delayed]@head"]["mean"] > 0.6
-    assert "counterfactual_direction[delayed]@head" in good
-    assert {row["metric"] for row in summary["differences"]["test"]} >= {"hsd", "ndtw", "dyn", "scene_consistency"}
-    page = str(quality_section(ReportContext(ReportConfig(), {"evaluate_video": measured}, tmp_path)).body)
-    assert all(METRICS[name].heading in page and METRICS[name].title in page for name in ON_REQUEST)
-    tidy = pq.read_table(measured / "scores.parquet").to_pandas()
-    assert {metric_of(name).name for name in tidy["metric"]} >= set(ON_REQUEST)
-    assert not tidy.duplicated(["method", "episode_id", "view", "seed", "metric"]).any()
-
-
-def test_what_is_asked_for_must_exist(recordings, tmp_path):
+def test_what_is_asked_for_must_exist(few, tmp_path):
     asked = {"metrics": ("action_following",)}
-    found, _ = measure(without_copy(recordings), tmp_path / "none", **asked)
+    found, _ = measure(few, tmp_path / "none", views=("head",), **asked)
     assert {"lpips", "action_following"} <= set(found["unavailable"])
     for values, message in (
         ({"metrics": ("hsdd",)}, "No metrics on request"),
@@ -419,7 +392,7 @@ def test_what_is_asked_for_must_exist(recordings, tmp_path):
         with pytest.raises(ValueError, match=message):
             VideoEvaluationConfig(**values)
     with pytest.raises(ConfigError, match=r"were not predicted[\s\S]*unheard"):
-        measure(recordings.inputs, tmp_path, **asked, changed_controls={"good": {"mirrored": "unheard"}})
+        measure(few, tmp_path, **asked, changed_controls={"good": {"mirrored": "unheard"}})
     # A plan asks only for pairs that it predicts.
     config = load_config(PipelineConfig, preset="tiny")
     assert outline(chain, config)["evaluate_video"].config == config.evaluate_video

@@ -3,8 +3,6 @@
 import base64
 import itertools
 import json
-import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import cv2
 import numpy as np
@@ -15,34 +13,17 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation import vlm
 from worldline_core.evaluation.evaluation_config import VLMConfig
-from worldline_core.evaluation.policy.evidence import (
-    GraspEvidence,
-    LiftEvidence,
-    MotionEvidence,
-    Reconciliation,
-    StateChangeEvidence,
-    establishes_success,
-    overturns,
-    route,
-)
-from worldline_core.evaluation.policy.judge import (
-    Extracted,
-    VLMJudge,
-    first_pass_indices,
-    judge_trajectory,
-    motion_indices,
-    verification_indices,
-)
+from worldline_core.evaluation.policy import judge as judging
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.rehearsal.outside_models import write_qwen3_vl
 
 SUCCESS = {
-    GraspEvidence: {"target_held_for_two_late_steps": True, "wrong_object_or_drop": False},
-    LiftEvidence: {
+    judging.GraspEvidence: {"target_held_for_two_late_steps": True, "wrong_object_or_drop": False},
+    judging.LiftEvidence: {
         "head_view_confirms_target_displacement": True, "target_held_for_two_late_steps": True,
         "target_on_original_support_at_end": False, "wrong_object_or_drop": False,
     },
-    StateChangeEvidence: {"required_final_state_visible": True, "wrong_object_or_drop": False},
+    judging.StateChangeEvidence: {"required_final_state_visible": True, "wrong_object_or_drop": False},
 }  # fmt: skip
 
 
@@ -50,10 +31,10 @@ SUCCESS = {
 def test_only_the_facts_of_a_success_establish_it(schema):
     for values in itertools.product((True, False, None), repeat=len(SUCCESS[schema])):
         found = dict(zip(SUCCESS[schema], values, strict=True))
-        assert establishes_success(schema(**found)) == (found == SUCCESS[schema])
-        if schema is StateChangeEvidence:
+        assert judging.establishes_success(schema(**found)) == (found == SUCCESS[schema])
+        if schema is judging.StateChangeEvidence:
             done, wrong = values
-            assert overturns(done, schema(**found)) == (done is True and wrong is not True)
+            assert judging.overturns(done, schema(**found)) == (done is True and wrong is not True)
 
 
 ROUTES = {
@@ -68,7 +49,7 @@ ROUTES = {
 
 @pytest.mark.parametrize(("instruction", "family"), [(text, name) for name, texts in ROUTES.items() for text in texts])
 def test_routing(instruction, family):
-    assert route(instruction) == family
+    assert judging.route(instruction) == family
 
 
 WELL_FORMED = (
@@ -76,48 +57,34 @@ WELL_FORMED = (
 )
 
 
-@pytest.mark.parametrize(
-    "answer",
-    [
-        WELL_FORMED,
-        f"Here is the evidence:\n```json\n{WELL_FORMED}\n```\nThat is all.",
-        f'{{"note": "first thoughts"}} {WELL_FORMED}',
-        WELL_FORMED[:-1] + ', "verdict": "success"}',
-        WELL_FORMED.replace("80", '"high"').replace('"x"', "null"),
-    ],
-)
-def test_answers_are_found_in_what_surrounds_them(answer):
-    evidence, well_formed = vlm.parse_answer(GraspEvidence, answer)
-    assert (well_formed, evidence.target_held_for_two_late_steps) == (True, True)
+SURROUNDED = (
+    WELL_FORMED, f"Here is the evidence:\n```json\n{WELL_FORMED}\n```\nThat is all.",
+    f'{{"note": "first thoughts"}} {WELL_FORMED}', WELL_FORMED[:-1] + ', "verdict": "success"}',
+    WELL_FORMED.replace("80", '"high"').replace('"x"', "null"),
+)  # fmt: skip
+MALFORMED = (
+    "", "The object is held.", "{", '{"target_held_for_two_late_steps": "true", "wrong_object_or_drop": false}',
+    '{"target_held_for_two_late_steps": 1, "wrong_object_or_drop": false}',
+    '{"required_final_state_visible": true, "wrong_object_or_drop": false}',
+    '["target_held_for_two_late_steps", true]', WELL_FORMED[:40], "{" * 5000,
+)  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "answer",
-    [
-        "",
-        "The object is held.",
-        "{",
-        '{"target_held_for_two_late_steps": "true", "wrong_object_or_drop": false}',
-        '{"target_held_for_two_late_steps": 1, "wrong_object_or_drop": false}',
-        '{"required_final_state_visible": true, "wrong_object_or_drop": false}',
-        '["target_held_for_two_late_steps", true]',
-        WELL_FORMED[:40],
-        "{" * 5000,
-    ],
-)
-def test_malformed_answers_become_null_evidence(answer):
-    evidence, well_formed = vlm.parse_answer(GraspEvidence, answer)
-    assert (well_formed, evidence) == (False, GraspEvidence())
+@pytest.mark.parametrize("answer", SURROUNDED + MALFORMED)
+def test_answers_are_found_in_what_surrounds_them_and_malformed_ones_become_null_evidence(answer):
+    evidence, well_formed = vlm.parse_answer(judging.GraspEvidence, answer)
+    assert well_formed == (answer in SURROUNDED)
+    assert evidence.target_held_for_two_late_steps is True if well_formed else evidence == judging.GraspEvidence()
 
 
 def test_first_pass_is_denser_towards_the_end():
-    indices = first_pass_indices(129)
+    indices = judging.first_pass_indices(129)
     assert (len(indices), indices[0], indices[-1]) == (12, 0, 128)
     assert indices[1] == round(np.sqrt(1 / 11) * 128)
     assert np.all(np.diff(np.diff(indices)) <= 1)
-    assert verification_indices(101) == (0, 65, 78, 88, 95, 100)
-    assert len(motion_indices(129)) == 12
-    assert first_pass_indices(3) == (0, 1, 2)
+    assert judging.verification_indices(101) == (0, 65, 78, 88, 95, 100)
+    assert len(judging.motion_indices(129)) == 12
+    assert judging.first_pass_indices(3) == (0, 1, 2)
 
 
 class ScriptedJudge:
@@ -135,22 +102,21 @@ class ScriptedJudge:
 
     def reconcile(self, trajectory, selected, first, verification):
         self.asked.append(("reconcile", selected, first, verification))
-        return Extracted(Reconciliation(observations_prove_completion=self.reconciliation))
+        return judging.Reconciliation(observations_prove_completion=self.reconciliation), True
 
     def inspect_motion(self, trajectory, indices, earlier):
         self.asked.append(("motion", len(indices), earlier))
-        return Extracted(MotionEvidence(task_effect_completed=self.motion))
+        return judging.MotionEvidence(task_effect_completed=self.motion), True
 
 
 def state(done, wrong=False, text=""):
-    return Extracted(
-        StateChangeEvidence(required_final_state_visible=done, wrong_object_or_drop=wrong, observations=text)
-    )
+    facts = {"required_final_state_visible": done, "wrong_object_or_drop": wrong, "observations": text}
+    return judging.StateChangeEvidence(**facts), True
 
 
 def judged(judge, instruction="press the bell", views=("head", "left_wrist")):
     frames = {view: np.zeros((129, 8, 8, 3), np.uint8) for view in views}
-    return judge_trajectory(judge, Trajectory(instruction, frames, 8.0))
+    return judging.judge_trajectory(judge, Trajectory(instruction, frames, 8.0))
 
 
 def test_passes_ask_for_what_they_need_and_no_more():
@@ -161,7 +127,7 @@ def test_passes_ask_for_what_they_need_and_no_more():
     assert judge.asked[1:] == [("extract", 6, 480), ("reconcile", "two", "one", "two"), ("motion", 12, "two")]
 
 
-GRASP, NULL = Extracted(GraspEvidence()), Extracted(LiftEvidence(), well_formed=False)
+GRASP, NULL = (judging.GraspEvidence(), True), (judging.LiftEvidence(), False)
 PASSES = ["first_pass", "verification", "reconciliation", "motion"]
 
 
@@ -186,94 +152,73 @@ def test_each_pass_can_establish_success_until_the_last_one(judge, more, passes,
 
 
 class Server:
-    """A chat server with prepared replies: (status, body)."""
+    """In place of `exchange`, whose sockets test_hostile_endpoints tests: prepared replies (status, body)."""
 
     def __init__(self):
-        self.replies, self.requests, self.headers = [], [], []
-        outer = self
+        self.replies, self.requests = [], []
 
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self):
-                body = self.rfile.read(int(self.headers["Content-Length"]))
-                outer.requests.append((self.path, json.loads(body)))
-                outer.headers.append(dict(self.headers))
-                status, reply = outer.replies.pop(0)
-                self.send_response(status)
-                self.end_headers()
-                self.wfile.write(reply if isinstance(reply, bytes) else json.dumps(reply).encode())
-
-            def log_message(self, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
-                pass
-
-        self.server = HTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}/v1"
-        threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True).start()
+    def __call__(self, url, body, *, headers, **limits):
+        self.requests.append((url, json.loads(body), headers))
+        status, reply = self.replies.pop(0)
+        return status, reply if isinstance(reply, bytes) else json.dumps(reply).encode()
 
 
 @pytest.fixture
-def server():
-    running = Server()
-    yield running
-    running.server.shutdown()
-    running.server.server_close()
+def server(monkeypatch):
+    monkeypatch.setattr(vlm, "exchange", replies := Server())
+    return replies
 
 
 def _reply(text):
     return 200, {"choices": [{"message": {"content": text}}]}
 
 
-def _model(server, **options):
-    return vlm.OpenAICompatibleModel(
-        VLMConfig(url=server.url, model="some-model", timeout_s=5, **options), backoff_s=0.01
-    )
+def _model(**options):
+    return vlm.OpenAICompatibleModel(VLMConfig(url="http://judge/v1", model="some-model", **options), backoff_s=0.01)
 
 
 def test_sends_text_and_frames_and_reads_the_answer(server, monkeypatch):
     monkeypatch.setenv("JUDGE_KEY", "secret")
     server.replies = [_reply("fine")]
     picture = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
-    assert _model(server, api_key_variable="JUDGE_KEY").answer([vlm.Text("what?"), vlm.Image(picture)]) == "fine"
-    path, body = server.requests[0]
-    assert path == "/v1/chat/completions"
+    assert _model(api_key_variable="JUDGE_KEY").answer([vlm.Text("what?"), vlm.Image(picture)]) == "fine"
+    url, body, headers = server.requests[0]
+    assert (url, headers["Authorization"]) == ("http://judge/v1/chat/completions", "Bearer secret")
     assert (body["temperature"], body["max_tokens"], len(body["messages"])) == (0.0, 256, 1)
     text, image = body["messages"][0]["content"]
     assert text == {"type": "text", "text": "what?"}
     png = base64.b64decode(image["image_url"]["url"].removeprefix("data:image/png;base64,"))
     assert np.array_equal(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], picture)  # pyright: ignore[reportOptionalSubscript]
-    assert server.headers[0]["Authorization"] == "Bearer secret"
-
-
-def test_retries_what_fails_on_the_way(server):
-    server.replies = [(503, {}), (429, {}), _reply("third time")]
-    assert _model(server).answer([vlm.Text("?")]) == "third time"
-    server.replies = [(503, {})] * 3
-    with pytest.raises(UnavailableError, match="HTTP 503"):
-        _model(server).answer([vlm.Text("?")])
-    assert len(server.requests) == 6
 
 
 @pytest.mark.parametrize(
-    ("reply", "error", "message"),
+    ("replies", "error", "message"),
     [
-        ((401, {"error": "key"}), UnavailableError, "HTTP 401"),
-        ((200, {"choices": []}), vlm.UnansweredMessageError, "choices"),
-        ((200, b"<html>"), vlm.UnansweredMessageError, "JSON"),
+        ([(503, {}), (429, {}), _reply("third time")], None, ""),
+        ([(503, {})] * 3, UnavailableError, "HTTP 503"),
+        # A refusal or a malformed reply is not asked for again.
+        ([(401, {"error": "key"})], UnavailableError, "HTTP 401"),
+        ([(200, {"choices": []})], vlm.UnansweredMessageError, "choices"),
+        ([(200, b"<html>")], vlm.UnansweredMessageError, "JSON"),
     ],
 )
-def test_does_not_retry_a_refusal_or_a_malformed_reply(server, reply, error, message):
-    server.replies = [reply]
-    with pytest.raises(error, match=message):
-        _model(server).answer([vlm.Text("?")])
-    assert len(server.requests) == 1
+def test_retries_what_fails_on_the_way_alone(server, replies, error, message):
+    server.replies = [*replies]
+    if error is None:
+        assert _model().answer([vlm.Text("?")]) == "third time"
+    else:
+        with pytest.raises(error, match=message):
+            _model().answer([vlm.Text("?")])
+    assert len(server.requests) == len(replies)
 
 
 def test_no_answer_is_null_evidence_and_counted_until_the_server_is_given_up(server):
-    judge = VLMJudge(_model(server, attempts=1))
+    judge = judging.VLMJudge(_model(attempts=1))
     good = _reply('{"target_held_for_two_late_steps": true, "wrong_object_or_drop": false}')
     server.replies = [(400, {"error": "content"}), (500, {}), good]
-    found = [judge.extract(TRAJECTORY, "grasp", (0, 19), 360) for _ in range(3)]
-    assert [answer.well_formed for answer in found] == [False, False, True]
-    assert found[0].evidence.target_held_for_two_late_steps is None  # pyright: ignore[reportAttributeAccessIssue]
+    found = [judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX) for _ in range(3)]
+    assert [well_formed for _, well_formed in found] == [False, False, True]
+    assert found[0][0] == judging.GraspEvidence()
     server.replies = [(500, {})] * 3
     judge.reconcile(TRAJECTORY, "", "", "")
     judge.inspect_motion(TRAJECTORY, (0, 19), "")
@@ -309,7 +254,7 @@ def folder(tmp_path_factory):
 
 
 class Calls:
-    """The real `generate`, with what it was given and, on request, the answer it is led to."""
+    """The real `generate`, or an answer in its place (what weights would have to be trained for), and what it was given."""
 
     def __init__(self, model, tokenizer):
         self.inner, self.tokenizer = model.generate, tokenizer
@@ -317,40 +262,35 @@ class Calls:
 
     def __call__(self, **inputs):
         self.inputs.append(inputs)
-        leading = []
-        if self.answer is not None:
+        if self.answer is None:
+            self.outputs.append(self.inner(**inputs))
+        else:
             tokens = [*self.tokenizer(self.answer)["input_ids"], self.tokenizer.eos_token_id]
-            leading = [Leading(tokens, inputs["input_ids"].shape[1])]
-        self.outputs.append(self.inner(**inputs, logits_processor=leading))
+            self.outputs.append(torch.cat([inputs["input_ids"], torch.tensor([tokens])], dim=1))
         return self.outputs[-1]
 
 
-class Leading:
-    """Makes the model say given tokens, then end: what weights would have to be trained for."""
-
-    def __init__(self, tokens, prompt):
-        self.tokens, self.prompt = tokens, prompt
-
-    def __call__(self, input_ids, scores):
-        wanted = self.tokens[input_ids.shape[1] - self.prompt]
-        return torch.full_like(scores, float("-inf")).index_fill(1, torch.tensor([wanted]), 0.0)
+@pytest.fixture(scope="module")
+def loaded(folder):
+    return vlm.open_vlm("qwen3_vl", VLMConfig(weights=folder))
 
 
 @pytest.fixture
-def opened(folder):
-    model = vlm.open_vlm("qwen3_vl", VLMConfig(weights=folder))
-    calls = model.model.generate = Calls(model.model, model.processor.tokenizer)
-    return model, calls
+def opened(loaded, monkeypatch):
+    calls = Calls(loaded.model, loaded.processor.tokenizer)
+    monkeypatch.setattr(loaded.model, "generate", calls)
+    return loaded, calls
 
 
-def test_generation_is_greedy_bounded_and_sees_every_picture(opened):
+def test_generation_is_greedy_bounded_and_sees_every_picture(opened, monkeypatch):
     model, calls = opened
+    monkeypatch.setattr(vlm, "MAX_NEW_TOKENS", 12)
     picture = np.random.default_rng(0).integers(0, 256, (64, 96, 3), dtype=np.uint8)
     first, *parts = vlm.Image(picture), vlm.Text("and"), vlm.Image(picture[:32])
     answers = [model.answer([vlm.Text("what?"), image, *parts]) for image in (first, first, vlm.Image(255 - picture))]
     assert answers[0] == answers[1]
     first, _, changed = calls.inputs
-    assert (first["do_sample"], first["max_new_tokens"]) == (False, vlm.MAX_NEW_TOKENS)
+    assert (first["do_sample"], first["max_new_tokens"]) == (False, 12)
     # Patches of 8 pixels: 8 x 12 and 4 x 12 of them, four of which become one token.
     assert first["image_grid_thw"].tolist() == [[1, 8, 12], [1, 4, 12]]
     assert int((first["input_ids"] == model.processor.image_token_id).sum()) == (8 * 12 + 4 * 12) // 4
@@ -358,13 +298,13 @@ def test_generation_is_greedy_bounded_and_sees_every_picture(opened):
     prompt = model.processor.tokenizer.decode(first["input_ids"][0])
     assert prompt.startswith("<|im_start|>user\nwhat?<|vision_start|><|image_pad|>")
     assert prompt.endswith("<|im_end|>\n<|im_start|>assistant\n")
-    assert 1 <= calls.outputs[0].shape[1] - first["input_ids"].shape[1] <= vlm.MAX_NEW_TOKENS
+    assert 1 <= calls.outputs[0].shape[1] - first["input_ids"].shape[1] <= 12
     assert model.model.dtype == torch.bfloat16
 
 
 def test_chosen_frames_of_a_video_are_shown_as_they_are_at_their_times(opened):
     model, calls = opened
-    chosen = (0, 5, 11, 19)
+    chosen, calls.answer = (0, 5, 11, 19), "nothing"
     model.answer([vlm.Video(FRAMES[list(chosen), :32, :48], chosen, 8.0, 20), vlm.Text("what happens?")])
     inputs = calls.inputs[0]
     # Two frames make one temporal patch; sampling again would have left fewer of them.
@@ -376,21 +316,20 @@ def test_chosen_frames_of_a_video_are_shown_as_they_are_at_their_times(opened):
 
 def test_a_readable_answer_becomes_evidence(opened):
     model, calls = opened
-    judge = VLMJudge(model)
+    judge = judging.VLMJudge(model)
     facts = {"target_held_for_two_late_steps": True, "wrong_object_or_drop": False}
     calls.answer = f"```json\n{json.dumps(facts)}\n```"
-    grasp = judge.extract(TRAJECTORY, "grasp", (0, 10, 19), HEIGHT_PX)
-    assert grasp.well_formed and establishes_success(grasp.evidence)
+    evidence, well_formed = judge.extract(TRAJECTORY, "grasp", (0, 10, 19), HEIGHT_PX)
+    assert well_formed and judging.establishes_success(evidence)
     # A grasp's facts are no lift's evidence, and words instead of facts are none.
-    assert not judge.extract(TRAJECTORY, "lift", (0, 19), HEIGHT_PX).well_formed
+    assert not judge.extract(TRAJECTORY, "lift", (0, 19), HEIGHT_PX)[1]
     calls.answer = '{"target_held_for_two_late_steps": "true"}'
-    spoken = judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX)
-    assert (spoken.well_formed, spoken.evidence) == (False, GraspEvidence())
+    assert judge.extract(TRAJECTORY, "grasp", (0, 19), HEIGHT_PX) == (judging.GraspEvidence(), False)
     calls.answer = '{"task_effect_completed": true, "observations": "it went up"}'
-    motion = judge.inspect_motion(TRAJECTORY, (0, 10, 19), "nothing earlier")
-    assert motion.evidence == MotionEvidence(task_effect_completed=True, observations="it went up")
+    motion, _ = judge.inspect_motion(TRAJECTORY, (0, 10, 19), "nothing earlier")
+    assert motion == judging.MotionEvidence(task_effect_completed=True, observations="it went up")
     calls.answer = '{"observations_prove_completion": false, "reason": "held, not placed"}'
-    assert judge.reconcile(TRAJECTORY, "grasp", "{}", "{}").evidence.observations_prove_completion is False
+    assert judge.reconcile(TRAJECTORY, "grasp", "{}", "{}")[0].observations_prove_completion is False
     # One image a time step for grasps, one a view and time step for lifts, one video a view for motion.
     counts = [(len(inputs.get("image_grid_thw", ())), len(inputs.get("video_grid_thw", ()))) for inputs in calls.inputs]
     assert counts == [(3, 0), (6, 0), (2, 0), (0, 3), (0, 0)]

@@ -12,7 +12,7 @@ from tests.evaluation.test_evaluation_steps import summary_of  # pyright: ignore
 from tests.training.conftest import write_tokenizer  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import JudgeConfig, PlanningConfig
-from worldline_core.evaluation.planning.bracket import LearnedSelector, shown_video
+from worldline_core.evaluation.planning.bracket import learned_selector, shown_video
 from worldline_core.evaluation.planning.evaluate_planning import open_selector
 from worldline_core.evaluation.policy import learned_judge
 from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
@@ -66,10 +66,10 @@ def test_a_task_without_a_known_verb_is_undecided_and_not_chosen_in(judge):
     opened = learned_judge.LearnedJudge.load(judge)
     verdict = opened.judge(Trajectory("fold the red cloth", frames, 8.0))
     assert (verdict.success, verdict.undecided) == (False, True)
-    selector = LearnedSelector(opened)
+    selector = learned_selector(opened)
     with pytest.raises(DataError, match=r"does not know this task[\s\S]*lift[\s\S]*fold"):
         selector.score("fold the red cloth", shown_video(Trajectory("fold", frames, 8.0)))
-    assert 0 <= selector.score("gently lift a cube", shown_video(Trajectory("lift", frames, 8.0))).score <= 100
+    assert 0 <= selector.score("gently lift a cube", shown_video(Trajectory("lift", frames, 8.0)))[0] <= 100
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_mirrored_videos_change_their_wrists(attempts):
     assert torch.equal(seen.abs().amax(dim=(2, 3, 4, 5)) > 0, views > 0)
 
 
-def test_what_a_judge_lacks_is_named(attempts, tmp_path, project_root):
+def test_what_a_judge_lacks_is_named(attempts, recordings, tmp_path):
     for opened in (
         lambda: open_selector(PlanningConfig(selector="learned"), {}),
         lambda: evaluate_policy(LEARNED, attempts, tmp_path),
@@ -105,6 +105,8 @@ def test_what_a_judge_lacks_is_named(attempts, tmp_path, project_root):
             opened()
     with pytest.raises(ArtifactError, match="Not a trained judge"):
         learned_judge.LearnedJudge.load(tmp_path)
+    with pytest.raises(DataError, match=r"split train does not have both outcomes[\s\S]*curate\.splits"):
+        learned_judge.train_judge(CONFIG, recordings.inputs, tmp_path)
     with pytest.raises(ConfigError, match=r"evaluate_policy\.judge: learned: models\.judge or train_judge"):
         PipelineConfig.load("tiny", None, ("evaluate_policy.judge=learned",))
 
@@ -120,11 +122,6 @@ def test_a_description_that_fits_no_weights_is_refused(change, judge):
     with pytest.raises(ArtifactError, match="judge cannot be read"):
         learned_judge.LearnedJudge.load(judge)
     path.write_text(kept)
-
-
-def test_recordings_without_validation_are_refused(recordings, tmp_path):
-    with pytest.raises(DataError, match=r"split train does not have both outcomes[\s\S]*curate\.splits"):
-        learned_judge.train_judge(CONFIG, recordings.inputs, tmp_path)
 
 
 @pytest.mark.slow

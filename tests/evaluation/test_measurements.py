@@ -11,31 +11,20 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frame_iou
-from worldline_core.evaluation.policy.evidence import establishes_success, route
-from worldline_core.evaluation.policy.measured_judge import (
-    LATE_COUNT,
-    PressMeasurement,
-    facts,
-    measure,
-    measure_lift,
-    measure_press,
-    measure_push,
-)
+from worldline_core.evaluation.policy import measured_judge
+from worldline_core.evaluation.policy.judge import establishes_success, route
+from worldline_core.evaluation.segmenters import coloured_things as things
 from worldline_core.evaluation.segmenters import learned
-from worldline_core.evaluation.segmenters.coloured_things import (
-    ColouredThing,
-    OwnColour,
-    colour_share,
-    likeness,
-    named_things,
-    own_colour,
+from worldline_core.evaluation.segmenters.segmenter import (
+    ColourSegmenter,
+    Sam3Segmenter,
+    kinematic_masks,
+    open_segmenter,
 )
-from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
-from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter, Sam3Segmenter, open_segmenter
 from worldline_core.rehearsal.outside_models import write_sam3
 from worldline_core.store.artifact_files import digest_folder
 
-CUBE = ColouredThing("red", "cube")
+CUBE = things.ColouredThing("red", "cube")
 
 
 def faded(frames, share):
@@ -48,7 +37,7 @@ def faded(frames, share):
 def lift_score(success, share):
     frames, masks, _ = make_film(success, seed=3)
     shown = {view: faded(video, share) for view, video in frames.items()}
-    return measure_lift(shown, CUBE, masks[-LATE_COUNT:]).score()
+    return measured_judge.measure_lift(shown, CUBE, masks[-measured_judge.LATE_COUNT :]).score()
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6, 0.45])
@@ -59,22 +48,22 @@ def test_a_lifted_cube_ranks_first_even_where_it_has_faded(share):
 def test_what_has_faded_is_lost_to_the_colour_word_but_not_to_its_own_colour():
     frames, _, _ = make_film(False, seed=3)
     pale = faded(frames["head"], 0.45)
-    own = own_colour(pale, "red")
+    own = things.own_colour(pale, "red")
     assert own.rgb == pytest.approx([220, 20, 20], abs=6)
-    assert colour_share(pale, "red")[-1].sum() < 0.3 * colour_share(pale, "red")[0].sum()
-    areas = likeness(pale, own).sum(axis=(1, 2))
+    assert things.colour_share(pale, "red")[-1].sum() < 0.3 * things.colour_share(pale, "red")[0].sum()
+    areas = things.likeness(pale, own).sum(axis=(1, 2))
     assert areas[-1] == pytest.approx(areas[0], rel=0.2)
 
 
 def test_a_thing_is_known_by_its_own_colour_alone():
-    own = OwnColour(np.array([220, 20, 20], np.float32), 0.2)
+    own = things.OwnColour(np.array([220, 20, 20], np.float32), 0.2)
     for other in ((20, 20, 220), (20, 200, 20), (120, 120, 120), (230, 130, 20)):
-        assert likeness(np.full((1, 4, 4, 3), other, np.uint8), own).max() == 0
-    assert named_things("lift the green cube") == (ColouredThing("green", "cube"),)
-    assert own_colour(make_film(True, seed=1)[0]["head"], "green") is None  # it is not seen early
+        assert things.likeness(np.full((1, 4, 4, 3), other, np.uint8), own).max() == 0
+    assert things.named_things("lift the green cube") == (things.ColouredThing("green", "cube"),)
+    assert things.own_colour(make_film(True, seed=1)[0]["head"], "green") is None  # it is not seen early
     frames = np.full((9, 48, 72, 3), (172, 140, 110), np.uint8)  # orange, but pale
     frames[:, 20:27, 30:37] = (235, 130, 20)
-    assert likeness(frames, own_colour(frames, "orange"))[0].sum() == pytest.approx(49, rel=0.02)
+    assert things.likeness(frames, things.own_colour(frames, "orange"))[0].sum() == pytest.approx(49, rel=0.02)
 
 
 def painted(*boxes):
@@ -92,26 +81,34 @@ def test_a_button_that_lights_up_is_pressed_though_something_hides_a_part_of_it(
     left = np.stack([painted(cap)] * 8)
     instruction = "press the red button"
     for frames, growth, done in ((pressed, 156 / 49, True), (left, 1.0, False)):
-        measured = measure(ColourSegmenter(), instruction, route(instruction), {"head": frames}, None)
+        measured = measured_judge.measure(ColourSegmenter(), instruction, route(instruction), {"head": frames}, None)
         assert measured.growth == pytest.approx(growth, rel=0.02)
-        assert establishes_success(facts(measured, instruction, "state_change")) is (measured.score() > 0.5) is done
-    unseen = measure_press({"head": np.stack([painted()] * 8)}, ColouredThing("red", "button"))
-    assert unseen == PressMeasurement(None)
-    assert not establishes_success(facts(unseen, instruction, "state_change"))
+        assert (
+            establishes_success(measured_judge.facts(measured, instruction, "state_change"))
+            is (measured.score() > 0.5)
+            is done
+        )
+    unseen = measured_judge.measure_press({"head": np.stack([painted()] * 8)}, things.ColouredThing("red", "button"))
+    assert unseen == measured_judge.PressMeasurement(None)
+    assert not establishes_success(measured_judge.facts(unseen, instruction, "state_change"))
 
 
 @pytest.mark.parametrize("towards_the_camera", [True, False])
 def test_a_drawer_closes_away_from_the_camera_or_towards_it(towards_the_camera):
     closed = slice(28, 30) if towards_the_camera else slice(10, 12)
     frames = np.stack([painted((rows, slice(30, 45))) for rows in [slice(10, 30)] * 5 + [closed] * 3])
-    measured = measure_push({"head": frames}, ColouredThing("red", "drawer"), np.zeros((3, 48, 72), bool))
+    measured = measured_judge.measure_push(
+        {"head": frames}, things.ColouredThing("red", "drawer"), np.zeros((3, 48, 72), bool)
+    )
     assert measured.remaining == pytest.approx(0.1, abs=0.02)
     assert measured.retreat > 0.8
 
 
 def test_a_wide_thing_rises_in_units_of_its_height():
     frames = np.stack([painted((rows, slice(10, 60))) for rows in [slice(34, 38)] * 5 + [slice(24, 28)] * 3])
-    measured = measure_lift({"head": frames}, ColouredThing("red", "tray"), np.zeros((3, 48, 72), bool))
+    measured = measured_judge.measure_lift(
+        {"head": frames}, things.ColouredThing("red", "tray"), np.zeros((3, 48, 72), bool)
+    )
     assert measured.rise == pytest.approx(10 / 4, rel=0.35)
 
 
@@ -213,17 +210,16 @@ def test_colour_segmenter_finds_the_robot_from_points_of_the_first_frame():
     assert np.array_equal(predicted, ColourSegmenter().segment(frames["head"], unknown))
 
 
-def test_missing_weights_are_named(tmp_path):
-    (tmp_path / "damaged").mkdir()
-    (tmp_path / "damaged" / "segmenter.json").write_text("{")
-    (tmp_path / "damaged" / "model.safetensors").write_bytes(b"x")
-    for kind, folder, error, message in (
-        ("learned", None, ArtifactError, "no weights"), ("learned", tmp_path, ArtifactError, "Not a trained segmenter"),
-        ("learned", tmp_path / "damaged", ArtifactError, "cannot be read"),
-        ("sam3", None, UnavailableError, "needs local weights"), ("sam3", tmp_path, UnavailableError, "weights not found"),
-    ):  # fmt: skip
-        with pytest.raises(error, match=message):
-            open_segmenter(kind, **{"learned": None, "sam3": None, kind: folder})
+@pytest.mark.parametrize(
+    ("kind", "given", "error", "message"),
+    [
+        ("learned", False, ArtifactError, "no weights"), ("learned", True, ArtifactError, "Not a trained segmenter"),
+        ("sam3", False, UnavailableError, "needs local weights"), ("sam3", True, UnavailableError, "weights not found"),
+    ],
+)  # fmt: skip
+def test_missing_weights_are_named(tmp_path, kind, given, error, message):
+    with pytest.raises(error, match=message):
+        open_segmenter(kind, **{"learned": None, "sam3": None, kind: tmp_path if given else None})
 
 
 def in_pieces(segmenter, video, points):

@@ -13,19 +13,8 @@ from worldline_core.actions.render_actions import KinematicsByName
 from worldline_core.actions.tool_error import end_effector_error, normalised_correlation
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.evaluation.metrics import MAX_PSNR_DB, frame_iou, frames_to_unit, psnr, ssim
+from worldline_core.evaluation import metrics
 from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
-from worldline_core.evaluation.video.background import Background, invented_motion, sharpness
-from worldline_core.evaluation.video.metrics_on_request import (
-    ControlledPair,
-    ToolFinder,
-    action_following,
-    counterfactual_direction,
-    dynamics_score,
-    hausdorff_score,
-    time_warping_distance,
-    time_warping_score,
-)
 from worldline_core.model.lpips import BACKBONE_FILE, HEADS_FILE, load_lpips
 
 
@@ -41,7 +30,10 @@ def pair():
 
 def test_psnr_and_ssim_equal_scikit_image(pair):
     predicted, true = pair
-    found = [metric(*(frames_to_unit(torch.from_numpy(x)) for x in pair)).numpy() for metric in (psnr, ssim)]
+    found = [
+        metric(*(metrics.frames_to_unit(torch.from_numpy(x)) for x in pair)).numpy()
+        for metric in (metrics.psnr, metrics.ssim)
+    ]
     for index in range(4):
         reference = structural_similarity(
             true[index], predicted[index], gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
@@ -50,16 +42,15 @@ def test_psnr_and_ssim_equal_scikit_image(pair):
         assert found[1][index] == pytest.approx(reference, abs=2e-5)
         # Of equal frames it ends at the rounding error of eight bits.
         equal = index == 2
-        reference = MAX_PSNR_DB if equal else peak_signal_noise_ratio(true[index], predicted[index], data_range=255)
+        reference = (
+            metrics.MAX_PSNR_DB if equal else peak_signal_noise_ratio(true[index], predicted[index], data_range=255)
+        )
         assert found[0][index] == pytest.approx(reference, abs=1e-3)
-    assert 58.9 < MAX_PSNR_DB < 59.0
-
-
-def test_frames_of_other_size_are_refused():
+    assert 58.9 < metrics.MAX_PSNR_DB < 59.0
     with pytest.raises(DataError, match="differ in shape"):
-        psnr(torch.zeros(2, 3, 16, 16), torch.zeros(3, 3, 16, 16))
+        metrics.psnr(torch.zeros(2, 3, 16, 16), torch.zeros(3, 3, 16, 16))
     with pytest.raises(DataError, match="smaller than the SSIM window"):
-        ssim(torch.zeros(2, 3, 8, 16), torch.zeros(2, 3, 8, 16))
+        metrics.ssim(torch.zeros(2, 3, 8, 16), torch.zeros(2, 3, 8, 16))
 
 
 def test_lpips_without_weights_says_so(tmp_path):
@@ -103,12 +94,12 @@ MIDDLE[:, 1:3] = True
 
 
 def test_overlap_over_union_of_each_frame_that_shows_something():
-    assert frame_iou(LEFT[None], MIDDLE[None])[0] == pytest.approx(1 / 3)
-    assert frame_iou(np.stack([LEFT, LEFT, EMPTY]), np.stack([LEFT, EMPTY, LEFT])).tolist() == [1.0, 0.0, 0.0]
-    assert np.isnan(frame_iou(EMPTY[None], EMPTY[None]))
+    assert metrics.frame_iou(LEFT[None], MIDDLE[None])[0] == pytest.approx(1 / 3)
+    assert metrics.frame_iou(np.stack([LEFT, LEFT, EMPTY]), np.stack([LEFT, EMPTY, LEFT])).tolist() == [1.0, 0.0, 0.0]
+    assert np.isnan(metrics.frame_iou(EMPTY[None], EMPTY[None]))
     for true, predicted in ((LEFT[None], MIDDLE[None, :2]), (LEFT[None].astype(np.uint8), MIDDLE[None])):
         with pytest.raises(DataError, match="do not fit"):
-            frame_iou(true, predicted)
+            metrics.frame_iou(true, predicted)
 
 
 def _video_with_patch(column):
@@ -209,7 +200,7 @@ def test_tools_are_found_in_exact_masks_where_kinematics_says_they_are(recorded)
         for errors, predicted, truth in (
             (own, masks, points), (delayed, masks[late], points[late]), (still, masks[late * 0], points[late * 0]),
         ):  # fmt: skip
-            found = ToolFinder().find(masks, predicted, points)
+            found = metrics.ToolFinder().find(masks, predicted, points)
             errors.append(100 / masks.shape[1] * np.linalg.norm(found - truth, axis=-1).ravel())
     own, delayed, still = (np.concatenate(errors) for errors in (own, delayed, still))
     assert np.nanmax(own) < 1e-6
@@ -223,22 +214,22 @@ def test_tools_are_found_in_exact_masks_where_kinematics_says_they_are(recorded)
 def test_pieces_of_a_video_are_one_search(recorded):
     tracks, masks = recorded[0]
     points, late = places_of(tracks), np.maximum(np.arange(len(masks)) - 4, 0)
-    finder = ToolFinder()
+    finder = metrics.ToolFinder()
     pieces = [finder.find(masks[part], masks[late][part], points[part]) for part in (slice(0, 9), slice(9, None))]
-    np.testing.assert_array_equal(np.concatenate(pieces), ToolFinder().find(masks, masks[late], points))
+    np.testing.assert_array_equal(np.concatenate(pieces), metrics.ToolFinder().find(masks, masks[late], points))
     nothing = np.zeros((2, 40, 60), dtype=bool)
-    assert np.isnan(ToolFinder().find(nothing, nothing, np.full((2, 1, 2), 20.0))).all()
+    assert np.isnan(metrics.ToolFinder().find(nothing, nothing, np.full((2, 1, 2), 20.0))).all()
 
 
 def test_hausdorff_is_the_farthest_that_either_path_leaves_the_other():
     aside = LINE.copy()
     aside[8, 0, 1] += 4
-    assert hausdorff_score(LINE, aside) == hausdorff_score(aside, LINE) == pytest.approx(1 / 4)
-    assert hausdorff_score(LINE, LINE[::-1]) == 1.0  # a set of places has no direction
+    assert metrics.hausdorff_score(LINE, aside) == metrics.hausdorff_score(aside, LINE) == pytest.approx(1 / 4)
+    assert metrics.hausdorff_score(LINE, LINE[::-1]) == 1.0  # a set of places has no direction
     half = LINE.copy()
     half[9:] = np.nan  # a tool that vanishes is as far as the rest of the path
-    assert hausdorff_score(LINE, half) == pytest.approx(1 / 25)
-    assert time_warping_score(LINE, half) == pytest.approx(17 / (3.125 * np.arange(1, 9).sum()))
+    assert metrics.hausdorff_score(LINE, half) == pytest.approx(1 / 25)
+    assert metrics.time_warping_score(LINE, half) == pytest.approx(17 / (3.125 * np.arange(1, 9).sum()))
 
 
 def test_time_warping_follows_the_definition():
@@ -249,27 +240,27 @@ def test_time_warping_follows_the_definition():
         return float(np.linalg.norm(a[i] - b[j])) + before
 
     a, b = np.random.default_rng(0).normal(size=(5, 2)), np.random.default_rng(1).normal(size=(6, 2))
-    assert time_warping_distance(a, b) == pytest.approx(recursive(4, 5))
+    assert metrics.time_warping_distance(a, b) == pytest.approx(recursive(4, 5))
     delayed = LINE[np.maximum(np.arange(17) - 1, 0)]
-    assert time_warping_score(LINE, delayed) == 1.0  # a delay is warped away, but for the end
-    assert time_warping_score(LINE, LINE[::-1]) < 0.1  # type: ignore[operator]
+    assert metrics.time_warping_score(LINE, delayed) == 1.0  # a delay is warped away, but for the end
+    assert metrics.time_warping_score(LINE, LINE[::-1]) < 0.1  # type: ignore[operator]
 
 
 def test_dynamics_compare_speeds_and_accelerations():
     twice = LINE[0] + 2 * (LINE - LINE[0])
     # Speeds differ by the true path's own speed; accelerations are zero in both.
-    assert dynamics_score(LINE, twice) == pytest.approx(1 / (1 + 1 / 2))
+    assert metrics.dynamics_score(LINE, twice) == pytest.approx(1 / (1 + 1 / 2))
     bent = LINE.copy()
     bent[9:, 0, 1] += 4.0
     terms = []
     for order in (1, 2):
         own, other = (np.linalg.norm(np.diff(path[:, 0], n=order, axis=0), axis=-1) for path in (LINE, bent))
         terms.append(wasserstein_distance(own, other) / max(own.mean(), 0.1))
-    assert dynamics_score(LINE, bent) == pytest.approx(1 / (1 + sum(terms) / 2))
-    assert dynamics_score(LINE, LINE + 7) == 1.0  # places play no part
+    assert metrics.dynamics_score(LINE, bent) == pytest.approx(1 / (1 + sum(terms) / 2))
+    assert metrics.dynamics_score(LINE, LINE + 7) == 1.0  # places play no part
 
 
-@pytest.mark.parametrize("score", [hausdorff_score, time_warping_score, dynamics_score])
+@pytest.mark.parametrize("score", [metrics.hausdorff_score, metrics.time_warping_score, metrics.dynamics_score])
 def test_only_arms_that_move_are_scored(score):
     """A resting arm, one out of view, one that hovers by what cannot be measured: none flatters, an arm that vanishes scores 0."""
     still, unseen, rest = np.repeat(LINE[:1], 17, axis=0), np.full_like(LINE, np.nan), np.full_like(LINE, 20.0)
@@ -290,12 +281,12 @@ def test_only_arms_that_move_are_scored(score):
 def test_controls_are_followed_or_not():
     elsewhere = LINE + np.array([0.0, 9.0])
     for own, other, followed in ((LINE, elsewhere, 0.9), (LINE, LINE, 0.5), (elsewhere, LINE, 0.1)):
-        assert action_following(ControlledPair(LINE, own, other, None)) == pytest.approx(followed)
+        assert metrics.action_following(metrics.ControlledPair(LINE, own, other, None)) == pytest.approx(followed)
     for own, other, asked, direction in (
         (LINE, elsewhere, elsewhere, 1.0), (LINE, LINE, elsewhere, 0.5), (elsewhere, LINE, elsewhere, 0.0),
         (LINE, LINE, LINE, None), (LINE, elsewhere, None, None),
     ):  # fmt: skip
-        assert counterfactual_direction(ControlledPair(LINE, own, other, asked)) == direction
+        assert metrics.counterfactual_direction(metrics.ControlledPair(LINE, own, other, asked)) == direction
 
 
 def test_changed_controls_begin_alike_and_then_differ_as_said(recorded):
@@ -333,7 +324,7 @@ def moving_robot():
 
 def test_the_background_shows_the_robot_and_every_cloud_around_it(moving_robot):
     frames, robot, labels = moving_robot
-    background = Background.of(frames, robot, labels)  # an array, as a video's frames are asked for
+    background = metrics.Background.of(frames, robot, labels)  # an array, as a video's frames are asked for
     assert not background.uncovered[30:, :4].any() and background.uncovered[10:22, :40].all()
     assert not background.known[3, 3] and background.uncovered[3, 3]
     assert background.robot_iou(robot, frames).min() > 0.7  # less one pixel around it
@@ -349,14 +340,14 @@ def test_the_background_shows_the_robot_and_every_cloud_around_it(moving_robot):
 
 def test_still_things_that_change_are_invented_motion(moving_robot):
     frames, robot, labels = moving_robot
-    assert not invented_motion(labels, labels[0], robot, frames, frames[0]).any()
+    assert not metrics.invented_motion(labels, labels[0], robot, frames, frames[0]).any()
     gone = frames.copy()
     gone[4:, 24:32, 38:46] = 200
-    found = invented_motion(labels, labels[0], robot, gone, frames[0])
+    found = metrics.invented_motion(labels, labels[0], robot, gone, frames[0])
     assert (found == [0, 0, 0, 0, 1, 1, 1, 1]).all()
     away = np.where(labels == 2, 0, labels)  # in the recording it moves as well
     away[0] = labels[0]
-    assert np.isnan(invented_motion(away, labels[0], robot, gone, frames[0])[1:]).all()
+    assert np.isnan(metrics.invented_motion(away, labels[0], robot, gone, frames[0])[1:]).all()
 
 
 def test_blurred_and_noisy_pictures_are_not_sharp(moving_robot):
@@ -365,6 +356,6 @@ def test_blurred_and_noisy_pictures_are_not_sharp(moving_robot):
     noisy = np.clip(0.2 * frames.astype(float) + np.random.default_rng(2).normal(128, 60, frames.shape), 0, 255).astype(
         np.uint8
     )
-    assert sharpness(frames, frames).min() == 1.0
-    assert max(sharpness(frames, blurred).max(), sharpness(blurred, frames).max()) < 0.6
-    assert sharpness(blurred, noisy).max() < 0.6
+    assert metrics.sharpness(frames, frames).min() == 1.0
+    assert max(metrics.sharpness(frames, blurred).max(), metrics.sharpness(blurred, frames).max()) < 0.6
+    assert metrics.sharpness(blurred, noisy).max() < 0.6

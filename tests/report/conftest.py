@@ -13,7 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.data.conftest import Sample, make_sample  # pyright: ignore[reportMissingImports]
-from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
+from tests.training.conftest import build_tracks  # pyright: ignore[reportMissingImports]
+from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.evaluation.policy.evaluate_policy import summarise_decisions
@@ -62,7 +63,7 @@ def write_episode_set(
 
 def write_tracks(folder: Path) -> None:
     """Tracks of two arms that cross each picture."""
-    n, v, shape = NUM_FRAMES, len(VIEWS), (NUM_FRAMES, len(VIEWS), 2)
+    n, shape = NUM_FRAMES, (NUM_FRAMES, len(VIEWS), 2)
     uv = np.full((*shape, 2), 36, np.float32)
     uv[..., 0, 0] = np.linspace(10, 50, n)[:, None]
     uv[..., 1, 0] = np.linspace(85, 60, n)[:, None]
@@ -70,25 +71,21 @@ def write_tracks(folder: Path) -> None:
     valid[6:, 1, 0] = False
     tools = np.tile(np.eye(4, dtype=np.float32), (n, 2, 1, 1))
     tools[:, 0, 1, 3] = np.linspace(0.3, 0.0, n)
+    moved = {
+        "image_size": (HEIGHT, WIDTH), "camera_motion": ("static", "kinematics", "kinematics"), "uv": uv, "valid": valid,
+        "depth": np.full(shape, 0.9, np.float32), "T_base_tool": tools,
+        "rot6d": np.tile(np.array([1, 0, 0, 0, 0.8, 0.6], np.float32), (*shape, 1)),
+        "gripper": np.tile(np.linspace(1, 0, n, dtype=np.float32)[:, None, None], (1, len(VIEWS), 2)),
+    }  # fmt: skip
     tracks = []
     for row in EPISODES:
-        cameras = sample(*row)[0].cameras
-        poses = [np.broadcast_to(cameras[view].T_base_camera, (n, 4, 4)) for view in VIEWS]
-        tracks.append(
-            EpisodeTracks(
-                episode_id=row[0], embodiment=row[1], views=VIEWS, arms=("left", "right"), image_size=(HEIGHT, WIDTH),
-                controls="action", camera_motion=("static", "kinematics", "kinematics"), uv=uv, valid=valid,
-                depth=np.full(shape, 0.9, np.float32), rot6d=np.tile(np.array([1, 0, 0, 0, 0.8, 0.6], np.float32), (*shape, 1)),
-                gripper=np.tile(np.linspace(1, 0, n, dtype=np.float32)[:, None, None], (1, v, 2)), T_base_tool=tools,
-                T_base_camera=np.stack(poses, axis=1).astype(np.float32),
-                K=np.stack([cameras[view].K for view in VIEWS]).astype(np.float32),
-                capsules=np.zeros((n, 1, 2, 3), np.float32), capsule_radii=np.ones(1, np.float32),
-            )
-        )  # fmt: skip
+        cameras = [sample(*row)[0].cameras[view] for view in VIEWS]
+        K = np.stack([camera.K for camera in cameras]).astype(np.float32)
+        poses = np.stack([np.broadcast_to(camera.T_base_camera, (n, 4, 4)) for camera in cameras], axis=1)
+        own = {"embodiment": row[1], "K": K, "T_base_camera": poses.astype(np.float32)}
+        tracks.append(build_tracks(row[0], n, 2, **moved, **own))
     write_index(folder, write_shard(folder, 0, tracks), sigma_px_ref=36.0)
     write_bytes_atomic(folder / "previews" / "0.png", png_bytes(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)))
-    numbers = {"episodes": 2, "valid": 50, "outside_image": 4}
-    write_json_atomic(folder / "summary.json", {"by_embodiment": {"aloha_viperx": numbers, "ur5e_pair": numbers}})
 
 
 def write_metrics(folder: Path) -> None:
@@ -140,6 +137,14 @@ def write_video_scores(folder: Path) -> None:
         "segmenters": [segmenter, {**segmenter, "name": "colour", "suffix": "[colour]", "description": "colour model"}],
     }  # fmt: skip
     write_json_atomic(folder / "summary.json", summary)
+
+
+def write_evaluation(folder: Path, scores: list[Score]) -> dict[str, Path]:
+    """An evaluation of videos with these scores, as an input."""
+    folder.mkdir(parents=True)
+    write_scores(folder, scores)
+    write_json_atomic(folder / "summary.json", summarise(scores, resamples=100, seed=0, by_view=True))
+    return {"evaluate_video": folder}
 
 
 def write_policy_scores(folder: Path) -> None:

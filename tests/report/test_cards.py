@@ -143,10 +143,13 @@ def test_a_filtered_set_shows_the_whole_way(curated: Path, tmp_path: Path) -> No
 KEY = "0123456789abcdef"
 
 
-@pytest.fixture
-def store(tmp_path: Path, make_model: Callable[..., Any], make_contract: Callable[..., Any]) -> Path:
+@pytest.fixture(scope="module")
+def store(
+    tmp_path_factory: pytest.TempPathFactory, make_model: Callable[..., Any], make_contract: Callable[..., Any]
+) -> Path:
     """A Stage II model, rollouts of it and of another one, and evaluations of both."""
-    model = tmp_path / "train_stage2" / KEY
+    root = tmp_path_factory.mktemp("store")
+    model = root / "train_stage2" / KEY
     metrics = {"validation/loss": 0.94, "scale": 7}
     facts = {"episodes": 53, "sources": {"shipped": 53}, "step": 16, "seed": 0, "metrics": metrics}
     save_checkpoint(model, make_model(), kind="stage2", action_contract=make_contract(), metadata=facts)
@@ -154,16 +157,16 @@ def store(tmp_path: Path, make_model: Callable[..., Any], make_contract: Callabl
     own = read_manifest(model)["digest"]
     digests = {"stage2": own, "stage2_shuffled": own, "banks_shipped_causal": own, "causal": "0"}
     for name, digest in digests.items():
-        (tmp_path / "rollout" / name).mkdir(parents=True)
+        (root / "rollout" / name).mkdir(parents=True)
         inputs = {"checkpoint": {"path": f"train_stage2/{KEY}", "digest": digest}}
-        write_manifest(tmp_path / "rollout" / name, {"step": "rollout", "key": name, "inputs": inputs})
+        write_manifest(root / "rollout" / name, {"step": "rollout", "key": name, "inputs": inputs})
     inputs = {f"rollouts.{name}": {"path": f"rollout/{name}", "digest": "1"} for name in digests}
     for step, write in (("evaluate_video", write_video_scores), ("evaluate_planning", write_planning_scores)):
-        folder = tmp_path / step / KEY
+        folder = root / step / KEY
         folder.mkdir(parents=True)
         write(folder)
         write_manifest(folder, {"step": step, "key": KEY, "inputs": inputs, "finished_at": "2026-11-26T00:00:00Z"})
-    return tmp_path
+    return root
 
 
 def test_a_model_is_described_by_its_files(store: Path, project_root: Path) -> None:

@@ -23,7 +23,6 @@ from worldline_core.store.atomic import write_json_atomic
     ("name", "kind", "says", "pictures"),
     [
         ("curate", "EpisodeSet", "quarantine: 1", {"contact_sheet.jpg"}),
-        ("render_actions", "ActionTracks", "6 episodes", {"aloha_viperx-0_controls.jpg"}),
         ("rollout.shipped_causal", "RolloutSet", "method: shipped_causal 12", {"aloha_viperx-0_prediction.jpg"}),
         ("evaluate_video", "Scores", "robot_iou_exact", set()),
     ],
@@ -61,7 +60,8 @@ def test_episodes_with_similar_names_get_different_files(tmp_path: Path) -> None
     names = ("run 1", "run_1")
     with EpisodeSetWriter(tmp_path / "set") as writer:
         for name in names:
-            writer.add(*sample(name, *EPISODES[0][1:])[:2])
+            episode, frames, *_ = sample(name, *EPISODES[0][1:])
+            writer.add(episode, {"head": frames["head"]})
     one, two = (
         {path.name for path in inspect(tmp_path / "set", tmp_path / "out", episode_id=n).written} for n in names
     )
@@ -72,7 +72,11 @@ def test_episodes_with_similar_names_get_different_files(tmp_path: Path) -> None
 def test_an_episode_is_shown_with_its_controls(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     folder, name = run_artifacts["render_actions"], "aloha_viperx-1"
     found = inspect(folder, tmp_path, episodes=run_artifacts["curate"], episode_id=name)
-    assert [path.name for path in found.written] == ["index.html", f"{name}_controls.jpg"]
+    assert (found.kind, [path.name for path in found.written]) == (
+        "ActionTracks",
+        ["index.html", f"{name}_controls.jpg"],
+    )
+    assert "6 episodes" in str(found)
 
 
 def test_tracks_find_their_episodes_by_the_manifest(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
@@ -129,13 +133,12 @@ def filtered(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
     i = episodes.position("ur5e_silver-test-s1-00002")
     episode = episodes.episode(i)
-    frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
-    dark = frames["head"].copy()
+    frames = episodes.frames(i, "head")
+    dark = frames.copy()
     dark[12:18] = dark[12:18] // 16
     with EpisodeSetWriter(root / "curate" / "key") as writer:
-        writer.add(replace(episode, episode_id="healthy"), frames)
-        writer.add(replace(episode, episode_id="dark"), {**frames, "head": dark})
-        writer.add(replace(episode, episode_id="black"), {**frames, "head": frames["head"] // 16})
+        for name, shown in (("healthy", frames), ("dark", dark), ("black", frames // 16)):
+            writer.add(replace(episode, episode_id=name), {"head": shown})
     folder = root / "filter" / "key"
     filter_episodes(CONFIG, {"episodes": root / "curate" / "key"}, folder)
     inputs = {"episodes": {"path": "curate/key", "digest": "0"}}

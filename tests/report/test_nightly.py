@@ -12,21 +12,11 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
+from tests.report.conftest import write_evaluation  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import ArtifactError, RegressionError
 from worldline_core.evaluation.paired import Series, differences, paired_tests, read_scores
-from worldline_core.evaluation.scores import Interval, Score, summarise, write_scores
+from worldline_core.evaluation.scores import Interval, Score, write_scores
 from worldline_core.report import comparison
-from worldline_core.report.comparison import (
-    REFERENCE_NIGHTS,
-    MetricChange,
-    accept_night,
-    compare_with_history,
-    night_tests,
-    read_history,
-    record_night,
-    refuse_regressions,
-    verdict_of,
-)
 
 METRICS = ("robot_iou", "robot_iou_exact", "ssim", "hsd", "psnr", "end_effector_error_px")
 METHODS = ("shipped_stage2", "shipped_causal", "copy_first_frame")
@@ -55,45 +45,49 @@ def scores(
     [("ssim", 0.9, "better"), ("ssim", 0.45, "same"), ("ssim", 0.2, "worse"), ("lpips", 0.9, "worse"), ("lpips", 0.2, "better")],
 )  # fmt: skip
 def test_verdicts(metric: str, mean: float, expected: str) -> None:
-    assert MetricChange(metric, Interval(mean, mean, mean, 9), Interval(0.5, 0.4, 0.6, 9)).verdict == expected
+    assert (
+        comparison.MetricChange(metric, Interval(mean, mean, mean, 9), Interval(0.5, 0.4, 0.6, 9)).verdict == expected
+    )
 
 
 def test_a_regression_stays_one_until_it_is_repaired_or_accepted(tmp_path: Path) -> None:
     history = tmp_path / "history"
-    first = record_night(history, "2026-11-19", scores(tmp_path / "first", 0.61))
+    first = comparison.record_night(history, "2026-11-19", scores(tmp_path / "first", 0.61))
     assert (first.previous, {change.verdict for change in first.changes}) == (None, {"new"})
-    assert record_night(history, "2026-11-20", scores(tmp_path / "a", 0.6)).regressions == []
+    assert comparison.record_night(history, "2026-11-20", scores(tmp_path / "a", 0.6)).regressions == []
     for night in ("2026-11-21", "2026-11-22"):
-        worse = record_night(history, night, scores(tmp_path / night, 0.5))
+        worse = comparison.record_night(history, night, scores(tmp_path / night, 0.5))
         assert (worse.previous, worse.regressions) == ("2026-11-20", [ERROR, IOU])
-    accept_night(history, "2026-11-22")
+    comparison.accept_night(history, "2026-11-22")
     with pytest.raises(ArtifactError, match="No such night"):
-        accept_night(history, "2")
-    again = record_night(history, "2026-11-23", scores(tmp_path / "d", 0.5))
+        comparison.accept_night(history, "2")
+    again = comparison.record_night(history, "2026-11-23", scores(tmp_path / "d", 0.5))
     assert (again.previous, again.regressions) == ("2026-11-22", [])
 
 
 def test_a_second_run_of_a_day_is_compared_with_the_first(tmp_path: Path) -> None:
     history = tmp_path / "history"
-    first = record_night(history, None, scores(tmp_path / "a", 0.6))
-    assert record_night(history, None, scores(tmp_path / "a", 0.6)) == first  # the same scores: the same night
-    second = record_night(history, None, scores(tmp_path / "b", 0.5))
+    first = comparison.record_night(history, None, scores(tmp_path / "a", 0.6))
+    assert (
+        comparison.record_night(history, None, scores(tmp_path / "a", 0.6)) == first
+    )  # the same scores: the same night
+    second = comparison.record_night(history, None, scores(tmp_path / "b", 0.5))
     assert (second.previous, len(second.regressions)) == (first.night, 2)
-    assert [night.night for night in read_history(history)] == [first.night, second.night]
+    assert [night.night for night in comparison.read_history(history)] == [first.night, second.night]
     with pytest.raises(ArtifactError, match="recorded with other scores"):
-        record_night(history, first.night, scores(tmp_path / "b", 0.5))
+        comparison.record_night(history, first.night, scores(tmp_path / "b", 0.5))
 
 
-def test_the_page_shows_trends_and_regressions(tmp_path: Path, run_artifacts: dict[str, Path]) -> None:
-    record_night(tmp_path, "2026-11-20", scores(tmp_path / "a", 0.99))
+def test_the_page_shows_trends_regressions_and_the_history(tmp_path: Path, run_artifacts: dict[str, Path]) -> None:
+    comparison.record_night(tmp_path, "first", scores(tmp_path / "a", 0.99))
     evaluations = ("evaluate_video", "evaluate_policy", "evaluate_planning")
-    compare_with_history({name: run_artifacts[name] for name in evaluations}, tmp_path, "2026-11-21")
+    comparison.compare_with_history({name: run_artifacts[name] for name in evaluations}, tmp_path, "second")
     page = (tmp_path / "index.html").read_text()
-    assert IOU in page
-    assert "became worse" in page
-    comparison = json.loads((tmp_path / "comparison.json").read_text())
-    assert IOU in comparison["regressions"]
-    assert {c["metric"] for c in comparison["changes"]} >= {"policy/all/true/accuracy", "planning/N=32/true/success"}
+    assert all(text in page for text in (IOU, "became worse", "first good"))
+    assert "second good" not in page
+    written = json.loads((tmp_path / "comparison.json").read_text())
+    assert IOU in written["regressions"]
+    assert {c["metric"] for c in written["changes"]} >= {"policy/all/true/accuracy", "planning/N=32/true/success"}
 
 
 def test_nights_that_end_at_once_are_all_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,7 +98,7 @@ def test_nights_that_end_at_once_are_all_recorded(tmp_path: Path, monkeypatch: p
     def work(number: int) -> None:
         found = scores(tmp_path / str(number), 0.6)
         meet.wait()
-        record_night(history, f"night {number}", found)
+        comparison.record_night(history, f"night {number}", found)
 
     with ThreadPoolExecutor(4) as threads:
         list(threads.map(work, range(4)))
@@ -113,11 +107,11 @@ def test_nights_that_end_at_once_are_all_recorded(tmp_path: Path, monkeypatch: p
 
 def test_a_metric_that_is_gone_is_a_regression(tmp_path: Path) -> None:
     history = tmp_path / "history"
-    record_night(history, "1", scores(tmp_path / "a", 0.6))
-    worse = record_night(history, "2", scores(tmp_path / "b", 0.6, ("end_effector_error_px",)))
+    comparison.record_night(history, "1", scores(tmp_path / "a", 0.6))
+    worse = comparison.record_night(history, "2", scores(tmp_path / "b", 0.6, ("end_effector_error_px",)))
     assert worse.regressions == [IOU]
     with pytest.raises(RegressionError, match=f"(?s)1 of 2 metrics.*{IOU}.*worldline nightly --accept 2"):
-        refuse_regressions(worse, history)
+        comparison.refuse_regressions(worse, history)
 
 
 NIGHT = '{"good": true, "metrics": {"x": {"count": 9, "high": 0.6, "low": 0.4, "mean": 0.5}}, "night": "2026-11-20"}\n'
@@ -136,7 +130,10 @@ NIGHT = '{"good": true, "metrics": {"x": {"count": 9, "high": 0.6, "low": 0.4, "
 )
 def test_a_damaged_history_is_named(tmp_path: Path, line: str, match: str) -> None:
     (tmp_path / "history.jsonl").write_text(line)
-    for use in (read_history, lambda folder: record_night(folder, "later", scores(tmp_path / "a", 0.6))):
+    for use in (
+        comparison.read_history,
+        lambda folder: comparison.record_night(folder, "later", scores(tmp_path / "a", 0.6)),
+    ):
         with pytest.raises(ArtifactError, match=rf"(?s)(?=.*history\.jsonl).*{match}"):
             use(tmp_path)
     assert (tmp_path / "history.jsonl").read_text() == line
@@ -145,12 +142,14 @@ def test_a_damaged_history_is_named(tmp_path: Path, line: str, match: str) -> No
 class World:
     """Recordings of different difficulty; a night measures them with noise that the metrics of a recording share in part."""
 
-    def __init__(self, seed: int, recordings: int = 40, noise: float = 0.02) -> None:
+    def __init__(
+        self, seed: int, recordings: int = 40, noise: float = 0.02, methods: tuple[str, ...] = METHODS
+    ) -> None:
         self.random, self.noise = np.random.default_rng(seed), noise
         self.names = [f"ep-{number:03d}" for number in range(recordings)]
         self.truth = {
             (method, metric): SCALE.get(metric, 1.0) * self.random.uniform(0.5, 0.9, recordings)
-            for method in METHODS
+            for method in methods
             for metric in METRICS
         }
 
@@ -174,29 +173,25 @@ class World:
             for (method, metric), values in self.night(loss).items()
             for name, value in values.items()
         ]
-        folder.mkdir(parents=True)
-        write_scores(folder, scores)
-        found = summarise(scores, resamples=100, seed=0, by_view=True)
-        (folder / "summary.json").write_text(json.dumps(found))
-        return {"evaluate_video": folder}
+        return write_evaluation(folder, scores)
 
 
 def verdicts(present: Series, good: list[Series]) -> dict[str, str]:
-    return {name: verdict_of(name, test) for name, test in night_tests(present, good).items()}
+    return {name: comparison.verdict_of(name, test) for name, test in comparison.night_tests(present, good).items()}
 
 
 def test_a_loss_of_three_points_of_iou_turns_the_night_red_and_is_named(tmp_path: Path) -> None:
-    world, history = World(1), tmp_path / "history"
+    world, history = World(1, methods=METHODS[:1]), tmp_path / "history"
     for number in "012":
-        assert record_night(history, number, world.write(tmp_path / number)).regressions == []
-    worse = record_night(history, "bad", world.write(tmp_path / "bad", loss=0.03))
+        assert comparison.record_night(history, number, world.write(tmp_path / number)).regressions == []
+    worse = comparison.record_night(history, "bad", world.write(tmp_path / "bad", loss=0.03))
     # The mean over all views is of the same values here: only the head was measured.
     assert worse.regressions == [IOU.removesuffix("@head"), IOU]
     with pytest.raises(RegressionError, match=rf"(?s)(?=.*{IOU})(?=.*40 recordings, most on ep-).*--accept bad"):
-        refuse_regressions(worse, history)
+        comparison.refuse_regressions(worse, history)
     # It stays red until it is repaired.
-    assert record_night(history, "still", world.write(tmp_path / "still", loss=0.03)).previous == "2"
-    assert record_night(history, "good again", world.write(tmp_path / "again")).regressions == []
+    assert comparison.record_night(history, "still", world.write(tmp_path / "still", loss=0.03)).previous == "2"
+    assert comparison.record_night(history, "good again", world.write(tmp_path / "again")).regressions == []
 
 
 @pytest.mark.slow
@@ -215,10 +210,10 @@ def test_false_alarms_are_rare_over_two_hundred_nights_of_pure_noise() -> None:
 
 def test_losses_are_found_almost_always() -> None:
     world = World(5)
-    good = [world.series() for _ in range(REFERENCE_NIGHTS)]
+    good = [world.series() for _ in range(comparison.REFERENCE_NIGHTS)]
     assert sum(verdicts(world.series(loss=0.03), good)[IOU] == "worse" for _ in range(20)) >= 19
     world = World(6, noise=0.01)
-    good = [world.series() for _ in range(REFERENCE_NIGHTS)]
+    good = [world.series() for _ in range(comparison.REFERENCE_NIGHTS)]
     for number in range(1, 11):  # a slow drift, before it is three points
         present = world.series(loss=0.003 * number)
         if verdicts(present, good)[IOU] == "worse":
@@ -232,7 +227,7 @@ def test_the_same_scores_and_rounding_are_no_change() -> None:
 
     def changed(by: float) -> dict[str, str]:
         present = {name: {r: value + by for r, value in values.items()} for name, values in night.items()}
-        return verdicts(present, [night] * REFERENCE_NIGHTS)
+        return verdicts(present, [night] * comparison.REFERENCE_NIGHTS)
 
     for by in (0.0, -1e-6):
         assert "worse" not in changed(by).values()
@@ -279,10 +274,3 @@ def test_scores_of_every_evaluation_are_read_under_the_names_of_the_summaries(
     found = read_scores(tmp_path, subgroups=True)
     assert found["policy/all/a/accuracy"] == found["policy/lift/a/accuracy"] == {"e0": 0, "e1": 1, "e2": 0, "e3": 1}
     assert found["planning/N=8/a/success"] == found["planning/N=8|ur5e/a/success"] == {"bank": 0.5}
-
-
-def test_the_page_shows_the_history(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
-    scores = {"evaluate_video": run_artifacts["evaluate_video"]}
-    for night in ("first", "second"):
-        compare_with_history(scores, tmp_path, night)
-    assert "second good, first good" in (tmp_path / "index.html").read_text()

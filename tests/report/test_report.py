@@ -53,11 +53,6 @@ def pages(folder: Path) -> dict[str, str]:
     return found
 
 
-def run_parts(folder: Path) -> dict[str, str]:
-    text = (folder / "run" / "run.js").read_text()
-    return json.loads(text.removeprefix("window.WORLDLINE_RUN = ").rstrip(";\n"))
-
-
 def test_pages_are_whole_and_need_nothing_else(full_report: Path) -> None:
     references = set()
     for name, text in pages(full_report).items():
@@ -120,24 +115,25 @@ def test_times_and_versions_stay_out_of_the_reproducible_page(full_report: Path)
     for fact in ("2026-11-21T05:00:00Z", ">12.5<", "torch 2.11"):
         assert fact not in text
         assert fact in run
-    parts = run_parts(full_report)
+    parts = json.loads(run.removeprefix("window.WORLDLINE_RUN = ").rstrip(";\n"))
     assert set(parts) == set(re.findall(r'data-run="(\w+)"', text))
     assert Page(parts["cost"]).open == []
-
-
-def test_cost_shows_the_time_of_a_frame(full_report: Path) -> None:
-    cost = run_parts(full_report)["cost"]
-    assert re.search(r"<td[^>]*>bfloat16</td>.*\s*<td[^>]*>100\.0</td>", cost)
-    assert "a slow machine" in cost
+    assert re.search(r"<td[^>]*>bfloat16</td>.*\s*<td[^>]*>100\.0</td>", parts["cost"])  # the time of a frame
+    assert "a slow machine" in parts["cost"]
 
 
 def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
     found = pages(full_report)
-    assert "+0.21" in found["quality"]  # over shuffled actions
-    assert "lpips" in found["quality"]
-    assert "no weights in the configured folder" in found["quality"]
-    assert "0.930" in found["quality"]  # the segmenter's own accuracy
-    assert ", colour</th>" in found["quality"]  # by a second segmenter
+    assert 'src="media/episode0_shipped_head.mp4"' in found["index"]
+    tiles = [found["index"].count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")]
+    assert tiles == [3, 0, 0]
+    for shown in (
+        "+0.21",  # over shuffled actions
+        "lpips", "no weights in the configured folder",
+        "0.930",  # the segmenter's own accuracy
+        ", colour</th>",  # by a second segmenter
+    ):  # fmt: skip
+        assert shown in found["quality"], shown
     assert "recorded videos (ceiling)" in found["decisions"]
     assert re.search(r"0\.95</span>.*?0\.50.*?</td><td[^>]*>0\.95</td>", found["decisions"])
     for cells in (
@@ -152,22 +148,28 @@ def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
     assert "truncated_video" in found["data"]
 
 
-def test_missing_parts_are_said_to_be_missing(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
-    metrics = report(ReportConfig(), {name: run_artifacts[name] for name in ("curate", "train_stage1")}, tmp_path)
+@pytest.mark.parametrize(
+    ("given", "missing", "says"),
+    [
+        (
+            ("curate", "train_stage1"), ["videos", "quality", "decisions"],
+            {
+                "index": "6 of 7 episodes were kept; no prediction was measured yet.",
+                "data": "No action tracks with previews were given",
+            },
+        ),
+        ((), [*SECTIONS], {"index": "Nothing was measured yet."}),
+    ],
+)  # fmt: skip
+def test_missing_parts_are_said_to_be_missing(
+    run_artifacts: dict[str, Path], tmp_path: Path, given: tuple[str, ...], missing: list[str], says: dict[str, str]
+) -> None:
+    metrics = report(ReportConfig(), {name: run_artifacts[name] for name in given}, tmp_path)
     found = pages(tmp_path)
     assert [name for name, text in found.items() if Page(text).open] == []
-    assert metrics["missing"] == ["videos", "quality", "decisions"]
-    assert all("Missing:" in found[anchor] for anchor in metrics["missing"])
-    assert "6 of 7 episodes were kept; no prediction was measured yet." in found["index"]
-    assert "No action tracks with previews were given" in found["data"]
-
-
-def test_a_report_of_nothing_is_a_page(tmp_path: Path) -> None:
-    metrics = report(ReportConfig(), {}, tmp_path)
-    assert (metrics["sections"], len(metrics["missing"])) == (1, len(SECTIONS))
-    found = pages(tmp_path)
-    assert "Nothing was measured yet." in found["index"]
-    assert [name for name, text in found.items() if Page(text).open] == []
+    assert (metrics["missing"], metrics["sections"]) == (missing, 1 + len(SECTIONS) - len(missing))
+    assert all("Missing:" in found[anchor] for anchor in missing)
+    assert all(text in found[name] for name, text in says.items())
 
 
 def test_a_damaged_artifact_is_named(tmp_path: Path) -> None:

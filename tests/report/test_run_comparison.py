@@ -15,8 +15,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from flows.command_line import main
+from tests.report.conftest import write_evaluation  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import ArtifactError, ConfigError
-from worldline_core.evaluation.scores import SCORES_FILE, Score, summarise, write_scores
+from worldline_core.evaluation.scores import SCORES_FILE, Score
 from worldline_core.report.comparison import as_table, compare_runs, figures_of, record_night
 
 NUMBER = 24
@@ -33,11 +34,7 @@ def evaluation(folder: Path, better_by: float, method: str = "model", first: int
         for metric, of_all in values.items():
             value = float(of_all[number])
             scores.append(Score(method, f"e{number}", robot, "test", "head", 1, metric, value, outcome=outcome))
-    folder.mkdir(parents=True)
-    write_scores(folder, scores)
-    summary = summarise(scores, resamples=100, seed=0, by_view=True)
-    (folder / "summary.json").write_text(json.dumps(summary))
-    return folder
+    return write_evaluation(folder, scores)["evaluate_video"]
 
 
 def test_differences_are_of_the_same_recordings_by_metric_and_group(tmp_path: Path) -> None:

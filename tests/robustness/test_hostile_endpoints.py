@@ -15,7 +15,7 @@ import pytest
 
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VLMConfig
-from worldline_core.evaluation.policy.evidence import GraspEvidence
+from worldline_core.evaluation.policy.judge import GraspEvidence
 from worldline_core.evaluation.vlm import OpenAICompatibleModel, Text, parse_answer
 from worldline_core.evaluation.vlm import ask as ask_model
 

@@ -180,14 +180,30 @@ class TrustConfig(StrictModel):
     )
 
 
-class PolicyEvaluationConfig(StrictModel):
-    """Judge and trajectories of evaluate_policy."""
+JudgeName = Literal["measured", "learned", "qwen3_vl", "openai"]
 
-    judge: Literal["measured", "learned", "qwen3_vl", "openai"] = "measured"
+
+class _Judging(StrictModel):
+    """The judge of predicted videos, or the selector among them, and the intervals of the results."""
+
     vlm: VLMConfig = VLMConfig()
-    segmenter: SegmenterName = Field(default="learned", description="used by the measured judge")
+    segmenter: SegmenterName = Field(default="learned", description="used by the measured judge or selector")
     sam3_weights: Path | None = None
     views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
+    resamples: int = Field(default=2000, ge=100)
+    seed: int = Field(default=42, ge=0)
+
+    def _weights(self, judge: JudgeName) -> Mapping[str, Path | None]:
+        return {
+            "sam3": self.sam3_weights if judge == "measured" and self.segmenter == "sam3" else None,
+            "vlm": self.vlm.weights if judge == "qwen3_vl" else None,
+        }
+
+
+class PolicyEvaluationConfig(_Judging):
+    """Judge and trajectories of evaluate_policy."""
+
+    judge: JudgeName = "measured"
     splits: tuple[str, ...] = ("test", "ood_test")
     balanced: bool = True
     max_per_group: int | None = Field(default=None, ge=1, description="of each outcome in each split and family")
@@ -199,8 +215,6 @@ class PolicyEvaluationConfig(StrictModel):
         default=None,
         description="trust in each verdict; novelty is measured against the training splits of the episodes",
     )
-    resamples: int = Field(default=2000, ge=100)
-    seed: int = Field(default=42, ge=0)
 
     @model_validator(mode="after")
     def _all_attempts(self) -> PolicyEvaluationConfig:
@@ -209,30 +223,17 @@ class PolicyEvaluationConfig(StrictModel):
         return self
 
     def weights_read(self) -> Mapping[str, Path | None]:
-        return _judge_weights(self.judge, self)
+        return self._weights(self.judge)
 
 
-class PlanningConfig(StrictModel):
+class PlanningConfig(_Judging):
     """Selector and budgets of evaluate_planning."""
 
-    selector: Literal["measured", "learned", "qwen3_vl", "openai"] = "measured"
-    vlm: VLMConfig = VLMConfig()
-    segmenter: SegmenterName = Field(default="learned", description="used by the measured selector")
-    sam3_weights: Path | None = None
-    views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
+    selector: JudgeName = "measured"
     budgets: tuple[int, ...] = Field(default=(2, 4, 8, 16, 24, 32), min_length=1)
     runs: int = Field(
         default=5, ge=1, description="orders of each bank's candidates; smaller budgets are prefixes of an order"
     )
-    resamples: int = Field(default=2000, ge=100)
-    seed: int = Field(default=42, ge=0)
 
     def weights_read(self) -> Mapping[str, Path | None]:
-        return _judge_weights(self.selector, self)
-
-
-def _judge_weights(judge: str, config: PolicyEvaluationConfig | PlanningConfig) -> dict[str, Path | None]:
-    return {
-        "sam3": config.sam3_weights if judge == "measured" and config.segmenter == "sam3" else None,
-        "vlm": config.vlm.weights if judge == "qwen3_vl" else None,
-    }
+        return self._weights(self.selector)

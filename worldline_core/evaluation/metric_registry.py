@@ -32,7 +32,7 @@ class Metric:
         source: where the formula comes from.
         perfect: its value for a prediction that equals the recording.
         margin: a smaller loss is no regression of a night, whatever its interval says.
-        needs, compute: of metrics on request: its arguments, and ``module:function`` below ``worldline_core.evaluation``.
+        needs, compute: of metrics on request: its arguments, and the name of its function in `evaluation.metrics`.
     """
 
     name: str
@@ -55,8 +55,7 @@ class Metric:
 
     def load(self) -> Callable[..., Any]:
         """The function that computes a metric on request."""
-        module, _, function = f"{self.compute}".partition(":")
-        return getattr(importlib.import_module(f"worldline_core.evaluation.{module}"), function)
+        return getattr(importlib.import_module("worldline_core.evaluation.metrics"), f"{self.compute}")
 
 
 _PAPER = "the paper, appendix"
@@ -116,38 +115,38 @@ _METRICS = (
     ),
     Metric(
         "hsd", "HSD", "Reciprocal of the symmetric Hausdorff distance of the true and the found path of each arm that moves.",
-        _EWMBENCH, perfect=1.0, margin=0.01, needs="tool_paths", compute="video.metrics_on_request:hausdorff_score",
+        _EWMBENCH, perfect=1.0, margin=0.01, needs="tool_paths", compute="hausdorff_score",
     ),
     Metric(
         "ndtw", "nDTW",
         "Reciprocal of the distance of both paths under dynamic time warping, per step of the true path, of each arm that"
         " moves.",
-        _EWMBENCH, perfect=1.0, margin=0.01, needs="tool_paths", compute="video.metrics_on_request:time_warping_score",
+        _EWMBENCH, perfect=1.0, margin=0.01, needs="tool_paths", compute="time_warping_score",
     ),
     Metric(
         "dyn", "DYN",
         "Agreement of the distributions of speeds and accelerations of each arm that moves, by their Wasserstein distances.",
         f"{_EWMBENCH}, distances relative to the true path's own motion", perfect=1.0, margin=0.01, needs="tool_paths",
-        compute="video.metrics_on_request:dynamics_score",
+        compute="dynamics_score",
     ),
     Metric(
         "scene_consistency", "Scene consistency",
         "SSIM of the predicted head view with its own first frame, where the recording stays as it was and no robot is.",
         "this project, after EWMBench's scene consistency, which compares features", perfect=1.0, margin=0.003,
-        needs="frames", compute="video.metrics_on_request:scene_consistency",
+        needs="frames", compute="scene_consistency",
     ),
     Metric(
         "action_following", "Action following",
         "d' / (d + d'): mean distance of the tools from their true places under the true controls (d) and under changed"
         " ones (d'); 0.5 where the controls do not matter.",
-        "this project", perfect=1.0, margin=0.01, needs="changed_controls", compute="video.metrics_on_request:action_following",
+        "this project", perfect=1.0, margin=0.01, needs="changed_controls", compute="action_following",
     ),
     Metric(
         "counterfactual_direction", "Counterfactual direction",
         "Share of frames in which the difference of two predictions of one start under two controls points the way that"
         " the controls say; 0.5 by chance.",
         "this project", perfect=1.0, margin=0.01, needs="changed_controls",
-        compute="video.metrics_on_request:counterfactual_direction",
+        compute="counterfactual_direction",
     ),
 )  # fmt: skip
 METRICS: dict[str, Metric] = {metric.name: metric for metric in _METRICS}

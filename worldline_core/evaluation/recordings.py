@@ -52,6 +52,12 @@ class Trajectory:
     def num_frames(self) -> int:
         return min(len(frames) for frames in self.frames.values())
 
+    def at(self, indices: Iterable[int]) -> tuple[dict[str, NDArray[Any]], NDArray[Any] | None]:
+        """Chosen frames by view, and the tool centres in them."""
+        chosen = list(indices)
+        frames = {view: video[chosen] for view, video in self.frames.items()}
+        return frames, None if self.points is None else self.points[chosen]
+
 
 def rows_of(episodes: EpisodeSet, episode_ids: Iterable[str]) -> list[EpisodeRow]:
     """Rows of episodes that were predicted, in the order of their ids.

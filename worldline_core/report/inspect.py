@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,11 +22,11 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
+from worldline_core.evaluation.recordings import stride_of
 from worldline_core.exports.export import shown_tracks
 from worldline_core.pages.page import render, words
 from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
-from worldline_core.report.data import FINDINGS_FILE, choose_rows, sheet_rows
-from worldline_core.report.videos import compared_rows
+from worldline_core.report.data import FINDINGS_FILE, MOMENTS, choose_rows, sheet_rows
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import kind_of, linked_folder, read_json, read_rows, verify_artifact
 from worldline_core.store.atomic import write_bytes_atomic
@@ -196,3 +197,21 @@ class _Page:
             if rows:
                 self.picture(f"reason_{safe_stem(reason)}", contact_sheet(rows, tile_height=96))
         return bool(reasons)
+
+
+def compared_rows(rollout: RolloutSet, episodes: EpisodeSet, episode_id: str, views: Sequence[str]) -> list[SheetRow]:
+    """Moments of an episode in some views, recorded above predicted, for a contact sheet.
+
+    Raises: DataError when the set has no prediction of this episode.
+    """
+    if episode_id not in rollout.episode_ids:
+        raise DataError("No prediction of this episode", where=rollout.root, got=episode_id)
+    position, rows = episodes.position(episode_id), list[SheetRow]()
+    stride = stride_of(rollout, episodes.rows[position])
+    for view in views:
+        predicted = VideoFrames(rollout.clip(episode_id, view))
+        moments = evenly_spaced(len(predicted), MOMENTS)
+        recorded = np.asarray(episodes.frames(position, view, [stride * moment for moment in moments]))
+        rows.append(SheetRow(f"{words(view)}, recorded", recorded))
+        rows.append(SheetRow(f"{words(view)}, predicted by {rollout.method}", predicted[moments]))
+    return rows

@@ -36,8 +36,8 @@ from worldline_core.report.results import (
     provenance_section,
     quality_section,
     training_section,
+    videos_section,
 )
-from worldline_core.report.videos import videos_section
 from worldline_core.store.artifact_files import JsonObject
 from worldline_core.store.atomic import remove_unfinished
 

@@ -1,24 +1,35 @@
-"""Pages of what was measured and made: "Video quality", "Policy and planning", "Training", "Provenance" with the models' cards."""
+"""Pages of what was measured and made: "Predicted videos", "Video quality", "Policy and planning", "Training", "Provenance" with the models' cards.
+
+Episodes are never picked by hand: shown are the best, the median and the worst by a stated score.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup, escape
 
 from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.evaluation.metric_registry import METRICS, metric_of
 from worldline_core.evaluation.paired import EVALUATIONS
 from worldline_core.model.model_card import DESCRIPTIONS, Measurement, model_card, model_facts
 from worldline_core.pages.page import Line, Table, interval, line_chart, render, words
+from worldline_core.pictures import WrittenVideo, evenly_spaced, write_side_by_side
 from worldline_core.report.context import (
+    GROUPS,
     SPLIT_LABELS,
+    Method,
     ReportContext,
     Section,
     VideoScores,
@@ -41,6 +52,107 @@ from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.training_state import PROBE_LOG
 
 ALL = "all"
+
+# Predicted videos: truth and predictions side by side, in each view
+
+VIDEOS = "Predicted videos"
+MOST_COLUMNS, IN_A_LINE = 6, 3
+"""Width of one video: a phone shows three columns beside each other."""
+
+
+class ChosenEpisode(NamedTuple):
+    """An episode, the reason why it is shown, and its score."""
+
+    episode_id: str
+    reason: str
+    score: float | None = None
+
+
+def best_median_worst(values: Mapping[str, float], *, lower_is_better: bool = False) -> list[tuple[str, str, float]]:
+    """(label, episode, value) of the median, best and worst of a score; ties by name."""
+    ranked = sorted(values.items(), key=lambda item: (-item[1] if lower_is_better else item[1], item[0]))
+    chosen: dict[tuple[str, float], str] = {}
+    for label, place in (("median", (len(ranked) - 1) // 2), ("best", -1), ("worst", 0)) if ranked else ():
+        chosen.setdefault(ranked[place], label)
+    return [(label, *item) for item, label in chosen.items()]
+
+
+def choose_episodes(scores: VideoScores, available: Sequence[str]) -> list[ChosenEpisode]:
+    """Median, best and worst by the main method's headline of the first held-out group, and the median of every further one.
+
+    ``available`` have predicted videos; without scores the first, middle and last of them are taken.
+    """
+    chosen: list[ChosenEpisode] = []
+    for group in scores.groups:
+        first = scores.primary(group)
+        metric = first and scores.headline(group, first.name)
+        if first is None or metric is None or group == "train":
+            continue
+        values = scores.series.get(f"video/{group}/{first.name}/{metric.name}@head", {})
+        shown = {name: value for name, value in values.items() if name in available}
+        ranked = best_median_worst(shown, lower_is_better=metric.lower_is_better)[: 1 if chosen else 3]
+        where = f"of {len(values)} on {SPLIT_LABELS[group]}"
+        chosen += [ChosenEpisode(episode, f"{label} {where}", value) for label, episode, value in ranked]
+    ordered = sorted(available)
+    return chosen or [
+        ChosenEpisode(ordered[i], f"number {i + 1} of {len(ordered)} by name (no scores)")
+        for i in evenly_spaced(len(ordered), 3)
+    ]
+
+
+def videos_section(context: ReportContext) -> Section:
+    """A card for each chosen episode."""
+    episodes, predicted = context.episodes, {n for rollout in context.rollouts.values() for n in rollout.episode_ids}
+    known = predicted & {row.episode_id for row in episodes.rows} if episodes else set[str]()
+    chosen = choose_episodes(context.video_scores, sorted(known)) if known else []
+    if episodes is None or not chosen:
+        missing = "no prediction of a given episode was given (inputs rollout.<method>, and filter or curate)."
+        return Section("videos", VIDEOS, missing=missing)
+    lead = "Every column starts from the same first frame; from there on a model sees only the controls."
+    if any(item.score is not None for item in chosen):
+        lead += (
+            " The episodes are not chosen by hand: they are the median, the best and the worst by the first model's prediction of"
+            " the robot."
+        )
+    cards = [card(context, episodes, *item) for item in enumerate(chosen)]
+    context.first_card = next((found for found in cards if found["panels"]), None)
+    return context.section("videos", VIDEOS, lead, cards=cards)
+
+
+def methods_of_group(context: ReportContext, episode_id: str, group: str) -> list[Method]:
+    """Methods with a prediction of this episode: those with the group's weights, then baselines without any."""
+    methods = in_order([name for name, rollout in context.rollouts.items() if episode_id in rollout.episode_ids])
+    own = [m for m in methods if m.group == group]
+    return [*own, *[m for m in methods if m.group == "baseline"]][: MOST_COLUMNS - 1] if own else []
+
+
+def card(context: ReportContext, episodes: EpisodeSet, number: int, item: ChosenEpisode) -> dict[str, Any]:
+    """One episode: its description, and by view the truth beside each group's predictions."""
+    name, position = item.episode_id, episodes.position(item.episode_id)
+    row = episodes.rows[position]
+
+    def panel(view: str) -> tuple[str, list[tuple[WrittenVideo, str]]]:
+        written: list[tuple[WrittenVideo, str]] = []
+        for group in ("shipped", "run"):
+            shown = [(m.label, context.rollouts[m.name]) for m in methods_of_group(context, name, group)]
+            columns = {
+                label: VideoFrames(videos.clip(name, view)) for label, videos in shown if view in videos.views(name)
+            }
+            if columns:
+                columns = {"true": VideoFrames(episodes.clip(position, view)), **columns}
+                path, height = context.media / f"episode{number}_{group}_{view}.mp4", context.config.tile_height
+                made = write_side_by_side(path, columns, row.fps, tile_height=height, most=IN_A_LINE)
+                written.append((made, f"{GROUPS[group].capitalize()} ({words(view)} view, {made.num_frames} frames)."))
+        return view, written
+
+    # The report runs last and alone; encoder and resizing let go of the interpreter, so threads use the other cores.
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        panels = [found for found in pool.map(panel, [view for view in VIEWS if view in row.views]) if found[1]]
+    return {"item": item, "row": row, "number": number, "panels": panels}
+
+
+# Video quality
+
 QUALITY = (
     "Mean over time for each trajectory, then over trajectories, with 95\u202f% bootstrap intervals over trajectories. Robot IoU,"
     " exact: a segmenter's mask of the prediction against the recording's exact mask. Robot IoU, segmenter: the same segmenter"

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import string
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import StrictBool, StrictInt
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.policy.evidence import route
+from worldline_core.evaluation.policy.judge import route
 from worldline_core.evaluation.policy.learned_judge import LearnedJudge
 from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure
 from worldline_core.evaluation.recordings import Trajectory
@@ -31,6 +30,8 @@ GROUP_SIZE = 4
 SURVIVORS = 2
 _WHOLE, _LATE = 10, 6
 _LATE_FROM = 0.6
+
+Letters = tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -58,33 +59,19 @@ class CandidateVideo:
         return digest.hexdigest()
 
 
-@dataclass(frozen=True)
-class CandidateScore:
-    """P2's answer, 0..100."""
-
-    score: float
-    well_formed: bool = True
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """P1's answer: letters, as many as were asked for."""
-
-    labels: tuple[str, ...]
-    well_formed: bool = True
-
-
 class Selector(Protocol):
-    """Ranks candidates of one scene."""
+    """Ranks candidates of one scene; with each answer, False where it could not be read."""
 
     @property
     def name(self) -> str: ...
 
-    def compare(self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int) -> Comparison:
+    def compare(
+        self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
+    ) -> tuple[Letters, bool]:
         """P1: letters of the ``select_count`` candidates (by letter) most likely to complete the task."""
         ...
 
-    def score(self, instruction: str, candidate: CandidateVideo) -> CandidateScore:
+    def score(self, instruction: str, candidate: CandidateVideo) -> tuple[float, bool]:
         """P2: 0..100, how likely this candidate completes the task."""
         ...
 
@@ -104,62 +91,48 @@ def planning_indices(num_frames: int) -> tuple[int, ...]:
 def shown_video(video: Trajectory) -> CandidateVideo:
     """The sixteen frames of a whole video that a selector sees."""
     indices = planning_indices(video.num_frames)
-    frames = {view: shown[list(indices)] for view, shown in video.frames.items()}
-    points = None if video.points is None else video.points[list(indices)]
+    frames, points = video.at(indices)
     return CandidateVideo(frames, indices, video.fps, video.num_frames, points)
 
 
-class ScoringSelector(ABC):
-    """Scores each video by itself; a comparison takes the best scores."""
+class ScoringSelector:
+    """Scores each video by its own likelihood to complete the task, 0..1; a comparison takes the best scores."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str, likelihood: Callable[[str, CandidateVideo], float]) -> None:
+        self.name, self.likelihood = name, likelihood
         # Smaller budgets show the same videos again.
-        self._scores: dict[tuple[str, str], CandidateScore] = {}
+        self._scores: dict[tuple[str, str], float] = {}
 
-    @abstractmethod
-    def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
-        """0..1, how likely this candidate completes the task."""
-
-    def compare(self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int) -> Comparison:
+    def compare(
+        self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
+    ) -> tuple[Letters, bool]:
         """The highest scores; of equals, those shown first."""
-        ranked = sorted(candidates, key=lambda letter: -self.score(instruction, candidates[letter]).score)
-        return Comparison(tuple(ranked[:select_count]))
+        ranked = sorted(candidates, key=lambda letter: -self.score(instruction, candidates[letter])[0])
+        return tuple(ranked[:select_count]), True
 
-    def score(self, instruction: str, candidate: CandidateVideo) -> CandidateScore:
+    def score(self, instruction: str, candidate: CandidateVideo) -> tuple[float, bool]:
         """0..100."""
         key = (instruction, candidate.digest)
         if key not in self._scores:
-            self._scores[key] = CandidateScore(round(100.0 * self.likelihood(instruction, candidate), 3))
-        return self._scores[key]
+            self._scores[key] = round(100.0 * self.likelihood(instruction, candidate), 3)
+        return self._scores[key], True
 
 
-class MeasuredSelector(ScoringSelector):
-    """Likelihood by the measured judge's facts with soft thresholds."""
+def measured_selector(segmenter: Segmenter) -> ScoringSelector:
+    """Likelihood by the measured judge's facts with soft thresholds; `UNSEEN_SCORE` where nothing can be measured."""
 
-    name = "measured"
-
-    def __init__(self, segmenter: Segmenter) -> None:
-        super().__init__()
-        self.segmenter = segmenter
-
-    def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
-        """`UNSEEN_SCORE` where nothing can be measured."""
-        measured = measure(self.segmenter, instruction, route(instruction), candidate.frames, candidate.points)
+    def likelihood(instruction: str, candidate: CandidateVideo) -> float:
+        measured = measure(segmenter, instruction, route(instruction), candidate.frames, candidate.points)
         return UNSEEN_SCORE if measured is None else measured.score()
 
+    return ScoringSelector("measured", likelihood)
 
-class LearnedSelector(ScoringSelector):
-    """Likelihood by the learned judge."""
 
-    name = "learned"
-
-    def __init__(self, judge: LearnedJudge) -> None:
-        super().__init__()
-        self.judge = judge
-
-    def likelihood(self, instruction: str, candidate: CandidateVideo) -> float:
-        """Raises: DataError for a task that the judge does not know."""
-        return self.judge.probability(instruction, candidate.frames, candidate.indices, candidate.total_frames)
+def learned_selector(judge: LearnedJudge) -> ScoringSelector:
+    """Likelihood by the learned judge; a task that it does not know raises DataError."""
+    return ScoringSelector(
+        "learned", lambda text, video: judge.probability(text, video.frames, video.indices, video.total_frames)
+    )
 
 
 class _ComparisonAnswer(Answer):
@@ -185,23 +158,23 @@ class VLMSelector:
         self.model = model
         self.name = model.name
 
-    def compare(self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int) -> Comparison:
+    def compare(
+        self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
+    ) -> tuple[Letters, bool]:
         """P1. A malformed answer has no labels."""
         parts: list[Part] = [Text(f"Task instruction: {instruction}")]
         for letter, candidate in candidates.items():
             parts += [Text(f"Candidate {letter}:"), _side_by_side(candidate)]
         parts.append(Text(PROMPTS["compare"].format(select_count=select_count)))
         answer, well_formed = ask(self.model, parts, _ComparisonAnswer)
-        return Comparison(tuple(label.strip().upper() for label in answer.selected_labels), well_formed)
+        return tuple(label.strip().upper() for label in answer.selected_labels), well_formed
 
-    def score(self, instruction: str, candidate: CandidateVideo) -> CandidateScore:
+    def score(self, instruction: str, candidate: CandidateVideo) -> tuple[float, bool]:
         """P2. A malformed answer, or a score outside of 0..100, scores 0."""
         question = Text(f"Task instruction: {instruction}\nCandidate video:")
         parts = [question, _side_by_side(candidate), Text(PROMPTS["score"].format())]
         answer, well_formed = ask(self.model, parts, _ScoreAnswer)
-        if not 0 <= answer.score <= 100:
-            return CandidateScore(0.0, well_formed=False)
-        return CandidateScore(float(answer.score), well_formed)
+        return (float(answer.score), well_formed) if 0 <= answer.score <= 100 else (0.0, False)
 
 
 def _side_by_side(candidate: CandidateVideo) -> Video:
@@ -246,9 +219,10 @@ def choose(
         if len(group) <= count:
             return list(group)
         shown = dict(zip(string.ascii_uppercase, group, strict=False))
-        answer = selector.compare(instruction, {letter: load(number) for letter, number in shown.items()}, count)
-        labels = list(dict.fromkeys(label for label in answer.labels if label in shown))[:count]
-        well_formed.append(answer.well_formed and len(labels) == count)
+        videos = {letter: load(number) for letter, number in shown.items()}
+        letters, readable = selector.compare(instruction, videos, count)
+        labels = list(dict.fromkeys(letter for letter in letters if letter in shown))[:count]
+        well_formed.append(readable and len(labels) == count)
         # An answer that names too few is filled up in the order shown, which the shuffle made arbitrary; it is counted.
         labels += [letter for letter in shown if letter not in labels][: count - len(labels)]
         return [number for letter, number in shown.items() if letter in labels]
@@ -261,9 +235,8 @@ def choose(
         rounds.append(survivors)
     scores: dict[int, float] = {}
     for candidate in survivors:
-        answer = selector.score(instruction, load(candidate))
-        well_formed.append(answer.well_formed)
-        scores[candidate] = answer.score
+        scores[candidate], readable = selector.score(instruction, load(candidate))
+        well_formed.append(readable)
     best = max(scores.values())
     (winner,) = best_of([candidate for candidate in survivors if scores[candidate] == best], 1)
     return Choice(winner, scores, rounds, well_formed.count(False), len(well_formed))

@@ -247,4 +247,4 @@ def recorded(controls: Float[np.ndarray, "m n j"]) -> Propose:
 
 def judged(selector: Selector) -> Score:
     """Score of a selector of open-loop planning (measured, or a vision-language model), 0..1."""
-    return lambda video: selector.score(video.instruction, shown_video(video)).score / 100.0
+    return lambda video: selector.score(video.instruction, shown_video(video))[0] / 100.0

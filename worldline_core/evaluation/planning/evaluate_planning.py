@@ -26,11 +26,11 @@ from worldline_core.evaluation.evaluation_config import PlanningConfig
 from worldline_core.evaluation.planning.bracket import (
     CandidateVideo,
     Choice,
-    LearnedSelector,
-    MeasuredSelector,
     Selector,
     VLMSelector,
     choose,
+    learned_selector,
+    measured_selector,
     shown_order,
     shown_video,
 )
@@ -143,10 +143,10 @@ def list_banks(rows: list[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
 def open_selector(config: PlanningConfig, inputs: Mapping[str, Path]) -> Selector:
     """The selector of a config, from the inputs ``segmenter`` or ``judge``."""
     if config.selector == "learned":
-        return LearnedSelector(open_learned_judge(inputs.get("judge")))
+        return learned_selector(open_learned_judge(inputs.get("judge")))
     if config.selector == "measured":
         opened = open_segmenter(config.segmenter, learned=inputs.get("segmenter"), sam3=config.sam3_weights)
-        return MeasuredSelector(opened)
+        return measured_selector(opened)
     return VLMSelector(open_vlm(config.selector, config.vlm))
 
 

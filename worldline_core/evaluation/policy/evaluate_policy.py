@@ -296,9 +296,6 @@ def _accuracy(rows: Sequence[Mapping[str, Any]], key: str) -> dict[Any, float]:
     return {name: sum(items) / len(items) for name, items in sorted(values.items())}
 
 
-STATISTICS = ("pearson", "spearman", "mmrv", "rate_error")
-
-
 def pearson(a: Float[np.ndarray, "*r p"], b: Float[np.ndarray, "*r p"]) -> Float[np.ndarray, "*r"]:
     """Correlation along the last axis; NaN where one side is constant."""
     a, b = a - a.mean(-1, keepdims=True), b - b.mean(-1, keepdims=True)
@@ -388,10 +385,10 @@ def _agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) 
     }
     return {"policies": facts} | {
         name: {
-            "value": float(values[name]) if np.isfinite(values[name]) else None,
+            "value": float(value) if np.isfinite(value) else None,
             "over_starts_and_policies": _bounds(intervals[name]),
         }
-        for name in STATISTICS
+        for name, value in values.items()
     }
 
 

@@ -1,5 +1,10 @@
 """Judging one video: a judge states evidence, rules decide, and unsuccessful verdicts are verified.
 
+Evidence schemas: prompts P3..P5 of the paper. A fact is true, false, or null (hidden in every view); an answer that cannot be parsed
+becomes evidence in which every fact is null, and is counted. Router and rules: appendix "Evidence-based trajectory evaluation". The
+paper does not print its router; this one goes by the verbs. A null is never taken for the favourable value, and a wrong object or a
+drop fails.
+
 Sampled frames: appendix "Observation sampling". A success of the first pass stands. Otherwise (appendix "Verification of unsuccessful
 predictions"): six late groups at higher resolution where there are several views; logical reconciliation for state changes; a
 twelve-frame motion check for lifts and state changes.
@@ -7,56 +12,168 @@ twelve-frame motion check for lifts and state changes.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import cv2
 import numpy as np
+from pydantic import BeforeValidator, StrictBool
 
-from worldline_core.evaluation.policy.evidence import (
-    SCHEMAS,
-    Evidence,
-    EvidenceFamily,
-    MotionEvidence,
-    Reconciliation,
-    establishes_success,
-    overturns,
-    route,
-)
 from worldline_core.evaluation.recordings import Trajectory
-from worldline_core.evaluation.vlm import PROMPTS, Answer, Image, Part, Text, Video, VisionLanguageModel, ask
+from worldline_core.evaluation.vlm import (
+    PROMPTS,
+    Answer,
+    AnswerText,
+    Image,
+    Part,
+    Text,
+    Video,
+    VisionLanguageModel,
+    ask,
+)
+
+EvidenceFamily = Literal["grasp", "lift", "state_change"]
+Fact = StrictBool | None
 
 
-@dataclass(frozen=True)
-class Extracted[T: Answer]:
-    """Stated evidence; ``well_formed`` is False when the answer could not be read (then every fact is null)."""
+def _number(value: Any) -> Any:
+    # Confidence decides nothing, so an odd one does not spoil the facts beside it.
+    known = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9  # NaN is not
+    return value if known else 0.0
 
-    evidence: T
-    well_formed: bool = True
+
+class _Evidence(Answer):
+    wrong_object_or_drop: Fact = None
+    observations: AnswerText = ""
+    confidence: Annotated[float, BeforeValidator(_number)] = 0.0
+
+
+class GraspEvidence(_Evidence):
+    """P3, grasp: the target must remain held across at least two late observations."""
+
+    REQUIRED: ClassVar[tuple[str, ...]] = ("target_held_for_two_late_steps",)
+    target_held_for_two_late_steps: Fact = None
+
+
+class LiftEvidence(_Evidence):
+    """P3, lift: held, visibly displaced in the head view, and off its original support."""
+
+    REQUIRED: ClassVar[tuple[str, ...]] = (
+        "head_view_confirms_target_displacement",
+        "target_held_for_two_late_steps",
+        "target_on_original_support_at_end",
+    )
+    head_view_confirms_target_displacement: Fact = None
+    target_held_for_two_late_steps: Fact = None
+    target_on_original_support_at_end: Fact = None
+
+
+class StateChangeEvidence(_Evidence):
+    """P3, state change (placing, inserting, opening, pressing, ...): the instructed final state is visible."""
+
+    REQUIRED: ClassVar[tuple[str, ...]] = ("required_final_state_visible",)
+    required_final_state_visible: Fact = None
+
+
+class Reconciliation(Answer):
+    """P4: whether observations already made establish completion."""
+
+    REQUIRED: ClassVar[tuple[str, ...]] = ("observations_prove_completion",)
+    observations_prove_completion: Fact = None
+    reason: AnswerText = ""
+
+
+class MotionEvidence(Answer):
+    """P5: whether the motion in the whole video shows the task's effect."""
+
+    REQUIRED: ClassVar[tuple[str, ...]] = ("task_effect_completed",)
+    task_effect_completed: Fact = None
+    observations: AnswerText = ""
+
+
+Evidence = GraspEvidence | LiftEvidence | StateChangeEvidence
+SCHEMAS: dict[EvidenceFamily, type[GraspEvidence] | type[LiftEvidence] | type[StateChangeEvidence]] = {
+    "grasp": GraspEvidence,
+    "lift": LiftEvidence,
+    "state_change": StateChangeEvidence,
+}
+
+
+_STATE_CHANGE = (
+    "place", "put", "set", "insert", "stack", "drop", "pour", "fold",
+    "open", "close", "press", "push", "pull", "click", "turn", "rotate",
+    "switch", "slide", "move", "hang", "scoop", "transfer", "sweep", "wipe",
+    "plug", "screw", "hand", "give", "pass", "arrange", "sort",
+)  # fmt: skip
+_LIFT = ("lift", "pick", "raise", "hold up", "take")
+_GRASP = ("grasp", "grab", "grip", "seize", "hold")
+
+
+def route(instruction: str) -> EvidenceFamily:
+    """The family whose evidence decides the instruction.
+
+    The last demand wins: "pick up the cup and place it" is a state change, "grasp and lift" is a lift. An instruction
+    with none of the known verbs is a state change, the family that asks for the whole instructed effect.
+    """
+    text = instruction.lower()
+    if _contains(text, _STATE_CHANGE):
+        return "state_change"
+    if _contains(text, _LIFT):
+        return "lift"
+    return "grasp" if _contains(text, _GRASP) else "state_change"
+
+
+def _contains(text: str, words: tuple[str, ...]) -> bool:
+    endings = r"(?:s|es|ed|ing|ping|ting|ding)?"
+    return any(re.search(rf"\b{re.escape(word.rstrip('e'))}e?{endings}\b", text) for word in words)
+
+
+def establishes_success(evidence: Evidence) -> bool:
+    """Returns True if the evidence establishes that the task was completed."""
+    if evidence.wrong_object_or_drop is not False:
+        return False
+    if isinstance(evidence, GraspEvidence):
+        return evidence.target_held_for_two_late_steps is True
+    if isinstance(evidence, LiftEvidence):
+        return (
+            evidence.target_held_for_two_late_steps is True
+            and evidence.head_view_confirms_target_displacement is True
+            and evidence.target_on_original_support_at_end is False
+        )
+    return evidence.required_final_state_visible is True
+
+
+def overturns(done: Fact, evidence: Evidence) -> bool:
+    """P4 or P5 turns an unsuccessful verdict, but not against a wrong object or a drop that was seen."""
+    return done is True and evidence.wrong_object_or_drop is not True
 
 
 class Judge(Protocol):
-    """Extracts evidence; three questions in the paper's order."""
+    """Extracts evidence; three questions in the paper's order.
+
+    Each gives evidence, and False where the answer could not be read (then every fact is null).
+    """
 
     @property
     def name(self) -> str: ...
 
     def extract(
         self, trajectory: Trajectory, family: EvidenceFamily, indices: tuple[int, ...], height_px: int
-    ) -> Extracted[Evidence]:
+    ) -> tuple[Evidence, bool]:
         """P3: facts visible at the given frames, resized to ``height_px``."""
         ...
 
     def reconcile(
         self, trajectory: Trajectory, selected: str, first: str, verification: str
-    ) -> Extracted[Reconciliation]:
+    ) -> tuple[Reconciliation, bool]:
         """P4: whether the observations already made prove completion."""
         ...
 
     def inspect_motion(
         self, trajectory: Trajectory, indices: tuple[int, ...], earlier: str
-    ) -> Extracted[MotionEvidence]:
+    ) -> tuple[MotionEvidence, bool]:
         """P5: facts visible in the motion through the given frames of every view."""
         ...
 
@@ -121,16 +238,16 @@ def judge_trajectory(judge: Judge, trajectory: Trajectory) -> Judgement:
     """Judge one video by the evidence of the family that its instruction belongs to."""
     family, count = route(trajectory.instruction), trajectory.num_frames
     passes: list[Pass] = []
-    stated: list[Extracted[Any]] = []
+    stated: list[tuple[Any, bool]] = []
 
-    def take[T: Answer](name: Pass, answer: Extracted[T]) -> T:
+    def take[T: Answer](name: Pass, answer: tuple[T, bool]) -> T:
         passes.append(name)
         stated.append(answer)
-        return answer.evidence
+        return answer[0]
 
     def done(success: bool) -> Judgement:
-        malformed = sum(not answer.well_formed for answer in stated)
-        facts = [{"pass": n, **answer.evidence.model_dump()} for n, answer in zip(passes, stated, strict=True)]
+        malformed = sum(not well_formed for _, well_formed in stated)
+        facts = [{"pass": n, **evidence.model_dump()} for n, (evidence, _) in zip(passes, stated, strict=True)]
         return Judgement(success, family, passes[-1], malformed, len(stated), facts)
 
     first = take("first_pass", judge.extract(trajectory, family, first_pass_indices(count), FIRST_PASS_HEIGHT_PX))
@@ -146,7 +263,7 @@ def judge_trajectory(judge: Judge, trajectory: Trajectory) -> Judgement:
         verification = second.observations
         if establishes_success(second):
             return done(True)
-        if stated[-1].well_formed:
+        if stated[-1][1]:
             selected = second
 
     if family == "state_change":
@@ -172,7 +289,7 @@ class VLMJudge:
 
     def extract(
         self, trajectory: Trajectory, family: EvidenceFamily, indices: tuple[int, ...], height_px: int
-    ) -> Extracted[Evidence]:
+    ) -> tuple[Evidence, bool]:
         """P3. Grasps see the views of an instant side by side; lifts and state changes see them as separate images."""
         parts: list[Part] = [Text(PROMPTS["evidence"].format(instruction=trajectory.instruction))]
         shown = {_LABELS[view]: frames[list(indices)] for view, frames in trajectory.frames.items()}
@@ -186,27 +303,27 @@ class VLMJudge:
                 for label, picture in pictures.items():
                     parts += [Text(f"{instant}, {label}"), Image(picture)]
         schema = PROMPTS["evidence_schema"].format(schema=PROMPTS[family], instruction=trajectory.instruction)
-        return Extracted(*ask(self.model, [*parts, Text(schema)], SCHEMAS[family]))
+        return ask(self.model, [*parts, Text(schema)], SCHEMAS[family])
 
     def reconcile(
         self, trajectory: Trajectory, selected: str, first: str, verification: str
-    ) -> Extracted[Reconciliation]:
+    ) -> tuple[Reconciliation, bool]:
         """P4: words only."""
         prompt = PROMPTS["reconciliation"].format(
             instruction=trajectory.instruction, selected=selected, first=first, verification=verification
         )
-        return Extracted(*ask(self.model, [Text(prompt)], Reconciliation))
+        return ask(self.model, [Text(prompt)], Reconciliation)
 
     def inspect_motion(
         self, trajectory: Trajectory, indices: tuple[int, ...], earlier: str
-    ) -> Extracted[MotionEvidence]:
+    ) -> tuple[MotionEvidence, bool]:
         """P5: one video per view."""
         parts: list[Part] = []
         for view, frames in trajectory.frames.items():
             video = Video(frames[list(indices)], indices, trajectory.fps, len(frames))
             parts += [Text(f"View {_LABELS[view]}"), video]
         prompt = PROMPTS["motion"].format(instruction=trajectory.instruction, earlier=earlier)
-        return Extracted(*ask(self.model, [*parts, Text(prompt)], MotionEvidence))
+        return ask(self.model, [*parts, Text(prompt)], MotionEvidence)
 
 
 def _resized(frame: np.ndarray, height_px: int) -> np.ndarray:

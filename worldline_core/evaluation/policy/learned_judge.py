@@ -36,8 +36,7 @@ from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.evaluation.augmentation import change_colours, degrade, mix_ghosts, move, uniform
 from worldline_core.evaluation.evaluation_config import JudgeConfig
-from worldline_core.evaluation.policy.evidence import route
-from worldline_core.evaluation.policy.judge import Judgement
+from worldline_core.evaluation.policy.judge import Judgement, route
 from worldline_core.evaluation.recordings import HEAD, Pictures, Trajectory
 from worldline_core.evaluation.segmenters.coloured_things import HUES_DEG, own_colour, thing_share
 from worldline_core.evaluation.small_network import WEIGHTS_FILE, load_network

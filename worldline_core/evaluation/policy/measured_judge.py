@@ -11,14 +11,14 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.policy.evidence import (
+from worldline_core.evaluation.policy.judge import (
     SCHEMAS,
     Evidence,
     EvidenceFamily,
@@ -28,9 +28,9 @@ from worldline_core.evaluation.policy.evidence import (
     Reconciliation,
     StateChangeEvidence,
     establishes_success,
+    first_pass_indices,
     route,
 )
-from worldline_core.evaluation.policy.judge import Extracted, first_pass_indices
 from worldline_core.evaluation.recordings import HEAD, Trajectory
 from worldline_core.evaluation.segmenters.coloured_things import (
     ColouredThing,
@@ -100,18 +100,6 @@ def _above(value: float, threshold: float, width: float) -> float:
 
 def _text(value: float | None) -> str:
     return "(not visible)" if value is None else f"{value:.2f}"
-
-
-class MeasuredEffect(Protocol):
-    """A measured effect."""
-
-    def score(self, unseen: float = UNSEEN_SCORE) -> float:
-        """Likelihood that the task is done, 0..1: the facts with soft thresholds, multiplied; of a fact not visible, ``unseen``."""
-        ...
-
-    def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
-        """The facts about the things of these names."""
-        ...
 
 
 def _final_state(done: bool | None, words: str) -> StateChangeEvidence:
@@ -217,6 +205,11 @@ class PressMeasurement:
     def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
         words = f"{names[0]}: its colour fills {_text(self.growth)} times its first area in the end"
         return _final_state(None if self.growth is None else self.growth > MIN_GROWTH, words)
+
+
+MeasuredEffect = LiftMeasurement | PlaceMeasurement | PushMeasurement | PressMeasurement
+"""``score``: likelihood that the task is done, 0..1: the facts with soft thresholds, multiplied; of a fact not visible, ``unseen``.
+``evidence``: the facts about the things of these names."""
 
 
 def sight(frames: np.ndarray, thing: ColouredThing) -> Sighting:
@@ -373,9 +366,7 @@ def soft_score(segmenter: Segmenter, trajectory: Trajectory) -> tuple[float, dic
     Raises: DataError where nothing can be measured.
     """
     chosen = list(first_pass_indices(trajectory.num_frames))
-    chosen = [0] * (LATE_COUNT - len(chosen)) + chosen
-    frames = {view: video[chosen] for view, video in trajectory.frames.items()}
-    points = None if trajectory.points is None else trajectory.points[chosen]
+    frames, points = trajectory.at([0] * (LATE_COUNT - len(chosen)) + chosen)
     measured = measure(segmenter, trajectory.instruction, route(trajectory.instruction), frames, points)
     if measured is None:
         raise DataError(
@@ -413,28 +404,26 @@ class MeasuredEvidenceJudge:
 
     def extract(
         self, trajectory: Trajectory, family: EvidenceFamily, indices: tuple[int, ...], height_px: int
-    ) -> Extracted[Evidence]:
+    ) -> tuple[Evidence, bool]:
         """Facts at the given frames, measured at the recording's own resolution (``height_px`` adds nothing here)."""
-        return Extracted(self._facts(trajectory, family, indices))
+        return self._facts(trajectory, family, indices), True
 
     def reconcile(
         self, trajectory: Trajectory, selected: str, first: str, verification: str
-    ) -> Extracted[Reconciliation]:
+    ) -> tuple[Reconciliation, bool]:
         """Words prove nothing to a measuring judge: null."""
-        return Extracted(Reconciliation(reason="measurements are not reconciled by words"))
+        return Reconciliation(reason="measurements are not reconciled by words"), True
 
     def inspect_motion(
         self, trajectory: Trajectory, indices: tuple[int, ...], earlier: str
-    ) -> Extracted[MotionEvidence]:
+    ) -> tuple[MotionEvidence, bool]:
         """The same facts from frames spread evenly over the video; true only where they establish success."""
         evidence = self._facts(trajectory, route(trajectory.instruction), indices)
         done = True if establishes_success(evidence) else None
-        return Extracted(MotionEvidence(task_effect_completed=done, observations=evidence.observations))
+        return MotionEvidence(task_effect_completed=done, observations=evidence.observations), True
 
     def _facts(self, trajectory: Trajectory, family: EvidenceFamily, indices: tuple[int, ...]) -> Evidence:
-        chosen = list(indices)
-        frames = {view: video[chosen] for view, video in trajectory.frames.items()}
-        points = None if trajectory.points is None else trajectory.points[chosen]
+        frames, points = trajectory.at(indices)
         measured = measure(self.segmenter, trajectory.instruction, family, frames, points)
         evidence = facts(measured, trajectory.instruction, family)
         if measured is None:

@@ -9,7 +9,7 @@ blocky, and shows faint copies of a moving arm. Masks follow the geometry only.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -30,7 +30,7 @@ from worldline_core.evaluation.augmentation import change_colours, degrade, mix_
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frames_to_unit
 from worldline_core.evaluation.recordings import HEAD
-from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
+from worldline_core.evaluation.segmenters.segmenter import MaskStream, kinematic_masks
 from worldline_core.evaluation.small_network import WEIGHTS_FILE, load_network
 from worldline_core.geometry.cameras import ImageTransform
 from worldline_core.processor import bfloat16_by_default
@@ -141,7 +141,7 @@ class LearnedSegmenter:
             masks.append((torch.sigmoid(logits.float()) > self.threshold).cpu().numpy())
         return np.concatenate(masks) if masks else np.zeros(video.shape[:3], dtype=bool)
 
-    def stream(self) -> Callable[[np.ndarray, np.ndarray | None], np.ndarray]:
+    def stream(self) -> MaskStream:
         """Every frame is masked by itself."""
         return self.segment
 

@@ -21,7 +21,17 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames, pieces
 from worldline_core.errors import DataError
 from worldline_core.evaluation.metric_registry import Metric
-from worldline_core.evaluation.metrics import frame_iou, frames_to_unit, psnr, ssim
+from worldline_core.evaluation.metrics import (
+    Background,
+    SceneFrames,
+    ToolFinder,
+    frame_iou,
+    frames_to_unit,
+    invented_motion,
+    psnr,
+    sharpness,
+    ssim,
+)
 from worldline_core.evaluation.recordings import HEAD, stride_of, tool_points
 from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.evaluation.segmenters.coloured_things import (
@@ -31,10 +41,7 @@ from worldline_core.evaluation.segmenters.coloured_things import (
     own_colour,
     thing_share,
 )
-from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
-from worldline_core.evaluation.segmenters.segmenter import Segmenter
-from worldline_core.evaluation.video.background import Background, invented_motion, sharpness
-from worldline_core.evaluation.video.metrics_on_request import SceneFrames, ToolFinder
+from worldline_core.evaluation.segmenters.segmenter import Segmenter, kinematic_masks
 from worldline_core.model.lpips import LPIPS
 from worldline_core.rollout.rollout_set import RolloutSet
 

@@ -29,6 +29,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.evaluation.metric_registry import METRICS, requested
+from worldline_core.evaluation.metrics import ControlledPair
 from worldline_core.evaluation.recordings import HEAD, open_rollouts, open_tracks, rows_of, stride_of, tool_points
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
@@ -42,7 +43,6 @@ from worldline_core.evaluation.scores import (
 )
 from worldline_core.evaluation.segmenters.segmenter import Segmenter, open_segmenter
 from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement, finite_mean
-from worldline_core.evaluation.video.metrics_on_request import ControlledPair
 from worldline_core.model.lpips import load_lpips
 from worldline_core.progress import Progress
 from worldline_core.rollout.rollout_set import RolloutSet
