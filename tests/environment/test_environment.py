@@ -17,8 +17,7 @@ from worldline_core import WorldLine
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment import ENVIRONMENT
-from worldline_core.environment.environment import WorldLineEnv, WorldLineVectorEnv, shipped_segmenter
-from worldline_core.environment.spaces import RobotSpaces
+from worldline_core.environment.environment import RobotSpaces, WorldLineEnv, WorldLineVectorEnv, shipped_segmenter
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.policy.measured_judge import soft_score
 from worldline_core.evaluation.recordings import Trajectory

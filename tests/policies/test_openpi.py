@@ -20,8 +20,7 @@ from websockets.sync.server import ServerConnection, serve
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.http_exchange import IncompleteResponseError, exchange
-from worldline_core.policies.messages import pack, unpack
-from worldline_core.policies.openpi import OpenpiPolicy
+from worldline_core.policies.openpi import OpenpiPolicy, pack, unpack
 from worldline_core.serving.client import SimulatorClient
 
 

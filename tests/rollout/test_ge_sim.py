@@ -20,7 +20,7 @@ from PIL import Image
 from tests.rollout.conftest import SIZE, recorded, track, write_recordings
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.rollout.ge_sim import tool_band
+from worldline_core.rollout.baselines import tool_band
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet

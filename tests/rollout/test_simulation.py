@@ -19,12 +19,11 @@ from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.rollout.recorded_starts import RecordedStarts
-from worldline_core.rollout.robot import CommandedRobot
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
-from worldline_core.rollout.simulation import Session
+from worldline_core.rollout.simulation import CommandedRobot, Session
 
 FRAMES = 17
 
@@ -365,7 +364,7 @@ def test_misuse_is_refused_and_changes_nothing(causal, start):
     for controls, message in (
         (rows[:, :15], r"another shape.*frames 1 to 16.*\(1, 16, 14\).*got: \(1, 15, 14\)"),
         (rows[:, :, :13], r"another shape.*\(1, 16, 13\)"), (np.repeat(rows, 2, axis=0), r"another shape.*\(2, 16, 14\)"),
-        (broken, "not finite.*clip 0, row 3, left/elbow_joint"), (np.degrees(rows + 0.2), beyond), (rows * 100, beyond),
+        (broken, "not finite.*clip 0, frame 3, left/elbow_joint"), (np.degrees(rows + 0.2), beyond), (rows * 100, beyond),
         (rows.astype(complex), beyond), (np.ma.masked_greater(rows, 0.0), beyond),
     ):  # fmt: skip
         with pytest.raises(DataError, match=f"(?s){message}"):

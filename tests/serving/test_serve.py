@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 from flows.command_line import main
 from worldline_core import WorldLine
 from worldline_core.errors import ConfigError, DataError, UnavailableError
-from worldline_core.policies.messages import unpack
+from worldline_core.policies.openpi import unpack
 from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.serving import app
 from worldline_core.serving.app import listening_socket, server_token

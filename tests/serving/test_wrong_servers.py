@@ -18,7 +18,7 @@ msgpack = pytest.importorskip("msgpack")
 from websockets.sync.server import ServerConnection, serve
 
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.policies.messages import pack
+from worldline_core.policies.openpi import pack
 from worldline_core.serving.client import SimulatorClient
 
 UPGRADE = b"HTTP/1.1 101 S\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -102,7 +102,7 @@ def test_frames_that_are_no_messages(frame: bytes) -> None:
 
 def test_a_server_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     stop = threading.Event()
-    monkeypatch.setattr("worldline_core.policies.messages.CLOSE_S", 0.2)
+    monkeypatch.setattr("worldline_core.policies.openpi.CLOSE_S", 0.2)
 
     def handle(connection: ServerConnection) -> None:
         connection.send(pack(METADATA))

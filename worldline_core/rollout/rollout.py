@@ -25,8 +25,7 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.tokenizers import frames_to_video, require_device
 from worldline_core.processor import processor_name
 from worldline_core.progress import Progress
-from worldline_core.rollout.baselines import FirstFrameCopy, TextToVideo
-from worldline_core.rollout.ge_sim import GeSim, RefusedPredictionError
+from worldline_core.rollout.baselines import FirstFrameCopy, GeSim, RefusedPredictionError, TextToVideo
 from worldline_core.rollout.predictions import Prediction, batches, choose_episodes, plan_predictions
 from worldline_core.rollout.rollout_config import (
     BlockCausalConfig,

@@ -30,7 +30,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.pages.page import render
-from worldline_core.policies.messages import pack, unpack
+from worldline_core.policies.openpi import pack, unpack
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.serving.play_session import PlaySession
 from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig, is_loopback
