@@ -92,7 +92,7 @@ def test_a_session_is_the_simulation_of_one_process(url: str, small_world: World
 
 
 def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world: WorldLine, shipped: Path) -> None:
-    start = RecordedStarts(shipped / "recordings", view_sets=small_world.view_sets, fps=8).named(EPISODE)[1]
+    start = RecordedStarts(shipped / "recordings", view_sets=small_world.view_sets, fps=8).at(EPISODE)
     given: dict[str, Any] = {
         "images": start.images, "cameras": start.cameras, "embodiment": "ur5e_silver", "state": start.state,
     }  # fmt: skip

@@ -338,11 +338,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                 expected="members, the soft reward, and a number from 0 to 1",
             )  # fmt: skip
         shipped = shipped_folder()
-        self.world = (
-            model
-            if isinstance(model, WorldLine)
-            else WorldLine.from_pretrained(model or shipped / "models" / "causal", **options)
-        )
+        self.world = _opened(model or shipped / "models" / "causal", options)
         self.views = self.world.chosen_views(views)
         self.starts = RecordedStarts(
             Path(recordings or shipped / "recordings"),
@@ -363,8 +359,9 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         self._largest_disagreement = 1.0 if largest_disagreement is None else largest_disagreement
         self._random = [np.random.default_rng() for _ in range(num_envs)]
         self._episodes: list[RunningEpisode] = []
-        self._running = self._begun([0], self._chosen([0], each_start(None, self._usual_start, 1)))
-        self.frames_per_step = self._running.simulation.frames_per_step
+        self._running: CommandedSimulation
+        self._chosen([0], each_start(None, self._usual_start, 1))  # refuses what is not there before an episode begins
+        self.frames_per_step = self.world.unit(USUAL_CLIP_FRAMES)
         self.observe_every = observe_every or self.frames_per_step
         if self.observe_every < 1 or self.frames_per_step % self.observe_every:
             raise ConfigError(
@@ -399,11 +396,10 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         Raises: DataError: the commands have another shape or are not finite, or the episodes have ended or not begun.
         """
         commands = self.spaces.commands(actions, self.num_envs)
-        over = self._over
-        if not self._episodes or (over and not self._autoreset):
+        if not self._episodes or (self._over and not self._autoreset):
             raise DataError("An episode has ended or not begun", next_step="call reset first")
-        if over:
-            self._begin([None] * self.num_envs, each_start(None, self._usual_start, self.num_envs))
+        if self._over:
+            self.reset()
         else:
             self._advance(commands)
         last = self._over
@@ -435,8 +431,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
     @property
     def _over(self) -> bool:
-        doubted = [episode.doubted for episode in self._episodes]
-        return self._running.age == self.episode_frames or (bool(doubted) and all(doubted))
+        return self._running.age == self.episode_frames or all(episode.doubted for episode in self._episodes)
 
     def _member(
         self,
@@ -446,7 +441,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         options: dict[str, Any],
     ) -> WorldLineVectorEnv:
         """The same episodes in another model, which judges at least as often."""
-        world = model if isinstance(model, WorldLine) else WorldLine.from_pretrained(model, **options)
+        world = _opened(model, options)
         if world.contract.fps != self.world.contract.fps:
             raise ConfigError(
                 "A member predicts at another rate", where="members", expected=f"{self.world.contract.fps:g} frames per second",
@@ -465,15 +460,6 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         pairs = zip(numbered, asked, strict=True)
         return [self.starts.at(own if name is None else name, frame) for own, (name, frame) in pairs]
 
-    def _begun(self, seeds: Sequence[int], starts: Sequence[RecordedStart]) -> CommandedSimulation:
-        return CommandedSimulation(
-            self.world.start(
-                [start.images for start in starts], [start.cameras for start in starts], embodiment=self.kinematics,
-                state=np.stack([start.state for start in starts]), seed=seeds, limits=self._limits,
-                earlier=[start.earlier for start in starts],
-            )
-        )  # fmt: skip
-
     def _begin(self, given: Sequence[int | None], asked: Sequence[tuple[str | None, int]]) -> None:
         """Start with the given seeds, where there is none with one drawn by the episode's generator."""
         for slot, seed in enumerate(given):
@@ -484,8 +470,12 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         named = [(start.episode_id, frame) for start, (_, frame) in zip(starts, asked, strict=True)]
         for member in self._members:
             member._begin(seeds, named)
-        self._running = self._begun(seeds, starts)
-        simulation = self._running.simulation
+        simulation = self.world.start(
+            [start.images for start in starts], [start.cameras for start in starts], embodiment=self.kinematics,
+            state=np.stack([start.state for start in starts]), seed=seeds, limits=self._limits,
+            earlier=[start.earlier for start in starts],
+        )  # fmt: skip
+        self._running = CommandedSimulation(simulation)
         self._episodes = [
             RunningEpisode(
                 start, self._video_so_far(start, picture, simulated_points(simulation, slot)), picture,
@@ -556,6 +546,10 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         for slot, info in enumerate(self.infos()):
             gathered = self._add_info(gathered, info, slot)
         return gathered
+
+
+def _opened(model: Path | str | WorldLine, options: Mapping[str, Any]) -> WorldLine:
+    return model if isinstance(model, WorldLine) else WorldLine.from_pretrained(model, **options)
 
 
 class WorldLineEnv(gymnasium.Env[dict[str, Any], np.ndarray]):

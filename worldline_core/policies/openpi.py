@@ -154,8 +154,7 @@ class MessageSocket:
     Args:
         url: ``ws://host:port/path`` or ``wss://...``; reached directly, without a proxy.
         headers: sent with the connection request; the last word of each is a secret, hidden where the server repeats it.
-        deadline_s: for connecting, name resolution included, and for each request with its reply where :meth:`request`
-            names no other.
+        deadline_s: for connecting, name resolution included, and for each request with its reply.
         max_bytes: of one reply.
 
     Raises:
@@ -206,7 +205,7 @@ class MessageSocket:
                 next_step="start it, or correct the address (ws://HOST:PORT)",
             ) from error  # fmt: skip
 
-    def request(self, message: object, *, deadline_s: float | None = None) -> dict[str, Any]:
+    def request(self, message: object) -> dict[str, Any]:
         """Send one message and return the reply, a map.
 
         Raises:
@@ -216,26 +215,23 @@ class MessageSocket:
         from websockets.exceptions import ConnectionClosed
 
         content, begin = pack(message), time.monotonic()
-        deadline = self.deadline_s if deadline_s is None else deadline_s
         try:
-            within(deadline, lambda: self._connection.send(content))
+            within(self.deadline_s, lambda: self._connection.send(content))
         except TimeoutError as error:
-            raise self._late(deadline) from error
+            raise self._late() from error
         except ConnectionClosed as error:
             raise self._closed(error) from error
-        return self._receive(deadline, begin)
+        return self.receive(begin)
 
-    def receive(self) -> dict[str, Any]:
-        """The next message of the server; raises as :meth:`request`."""
-        return self._receive(self.deadline_s, time.monotonic())
-
-    def _receive(self, deadline: float, begin: float) -> dict[str, Any]:
+    def receive(self, begin: float | None = None) -> dict[str, Any]:
+        """The next message of the server, within the deadline from ``begin`` (monotonic) on; raises as :meth:`request`."""
         from websockets.exceptions import ConnectionClosed
 
+        waited = 0.0 if begin is None else time.monotonic() - begin
         try:
-            reply = self._connection.recv(timeout=max(0.0, begin + deadline - time.monotonic()))
+            reply = self._connection.recv(timeout=max(0.0, self.deadline_s - waited))
         except TimeoutError as error:
-            raise self._late(deadline) from error
+            raise self._late() from error
         except ConnectionClosed as error:
             if error.sent is not None and error.sent.code == 1009 and not error.rcvd_then_sent:
                 raise DataError(
@@ -256,10 +252,10 @@ class MessageSocket:
             raise
         return found
 
-    def _late(self, deadline: float) -> UnavailableError:
+    def _late(self) -> UnavailableError:
         self.close()
         return UnavailableError(
-            "The server did not answer in time", where=self.url, expected=f"a reply within {deadline:g} s",
+            "The server did not answer in time", where=self.url, expected=f"a reply within {self.deadline_s:g} s",
             next_step="connect again; allow more time where the server needs it",
         )  # fmt: skip
 
@@ -317,7 +313,7 @@ class OpenpiPolicy(MessageSocket):
             self.close()
             raise
 
-    def infer(self, observation: Mapping[str, Any], *, deadline_s: float | None = None) -> dict[str, Any]:
+    def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
         """The reply to an observation: ``actions`` as float64 ``(horizon, size)``, and whatever else the server adds
         (``server_timing``).
 
@@ -328,7 +324,7 @@ class OpenpiPolicy(MessageSocket):
             UnavailableError: the policy failed (with its own error text), is gone, or does not answer in time.
             DataError: the observation cannot be sent, or the reply has no finite numbers as actions.
         """
-        reply = self.request(observation, deadline_s=deadline_s)
+        reply = self.request(observation)
         actions: Any = reply.get("actions")
         array = isinstance(actions, np.ndarray)
         numbers = array and actions.dtype.kind in "fiu" and actions.ndim == 2 and actions.size

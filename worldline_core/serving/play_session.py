@@ -211,7 +211,10 @@ class PlaySession:
         await self._settled()
         self._hand = None
         seed = message.seed
-        self._row, self._start = row, start = await self._host.compute(lambda: self._host.starts.named(message.episode))
+        recorded = self._host.starts
+        self._row, self._start = row, start = await self._host.compute(
+            lambda: (recorded.row(message.episode), recorded.at(message.episode))
+        )
         simulation = await self._host.compute(lambda: self._host.simulate(message.episode, [seed]))
         kinematics = self._host.kinematics.get(row.embodiment)
         hand = await asyncio.to_thread(Teleoperation, start, kinematics, simulation.fps)
