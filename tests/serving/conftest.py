@@ -1,4 +1,4 @@
-"""A small random causal model with the shipped tokenizer and recordings, and servers of it."""
+"""Servers of a small random model and the shipped recordings."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ import pytest
 pytest.importorskip("msgpack")
 pytest.importorskip("uvicorn")
 
+from tests.rollout.conftest import shipped, small_world  # noqa: F401
 from worldline_core import WorldLine
-from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.serving.app import make_server
 from worldline_core.serving.serve_config import ServeConfig
 
@@ -24,22 +22,7 @@ Serve = Callable[..., "contextmanager[str]"]
 
 
 @pytest.fixture(scope="session")
-def shipped(project_root: Path) -> Path:
-    return project_root / "artifacts" / "shipped"
-
-
-@pytest.fixture(scope="session")
-def small_world(shipped: Path, make_model: Callable[..., WorldModel]) -> WorldLine:
-    """Blocks of one latent frame (four pictures), one Euler step."""
-    given = WorldLine.from_pretrained(shipped / "models" / "causal")
-    _, info = load_checkpoint(shipped / "models" / "causal", towers="generation")
-    model = make_model(latent_channels=32, num_layers=1)
-    spec = CausalSpec(block_size=1, sink_blocks=1, recent_blocks=2, anchor_blocks=None, sigmas=(1.0, 0.0))
-    return WorldLine(model, info.model_copy(update={"config": model.config, "causal": spec}), given.tokenizer)
-
-
-@pytest.fixture(scope="session")
-def serving(small_world: WorldLine, shipped: Path) -> Serve:
+def serving(small_world: WorldLine, shipped: Path) -> Serve:  # noqa: F811
     """``with serving(token=None, **settings) as url:`` a server on a free port, in a thread."""
 
     @contextmanager
