@@ -1,11 +1,7 @@
 """The simulator as a Gymnasium environment."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,22 +16,21 @@ from worldline_core.environment import ENVIRONMENT
 from worldline_core.environment.environment import RobotSpaces, WorldLineEnv, WorldLineVectorEnv, shipped_segmenter
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.policy.measured_judge import soft_score
-from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.rollout.recorded_starts import RecordedStarts
 
 ROBOT = "ur5e_silver"
-SHORT: dict[str, Any] = {"embodiment": ROBOT, "success": None}
+SHORT = {"embodiment": ROBOT, "success": None}
 
 
-def commands(starts: RecordedStarts, seeds: list[int], count: int) -> np.ndarray:
+def commands(starts, seeds, count):
     """Recorded commands of the starts that these seeds choose, ``(count, envs, j)``, the second moved a little."""
     recorded = (starts.commands(seed % len(starts)).astype(np.float32) for seed in seeds)
     return np.stack([rows[np.minimum(np.arange(count), len(rows) - 1)] for rows in recorded], axis=1)
 
 
 @pytest.mark.slow
-def test_gymnasiums_checker_finds_nothing(small_world: WorldLine) -> None:
+def test_gymnasiums_checker_finds_nothing(small_world):
     environment = gymnasium.make(ENVIRONMENT, model=small_world, observe_every=2, episode_frames=5, **SHORT).unwrapped
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
@@ -45,7 +40,7 @@ def test_gymnasiums_checker_finds_nothing(small_world: WorldLine) -> None:
     assert environment.metadata["render_fps"] == 8
 
 
-def test_episodes_are_simulations_of_recorded_starts(small_world: WorldLine, starts: RecordedStarts) -> None:
+def test_episodes_are_simulations_of_recorded_starts(small_world, starts):
     """Block by block: pictures are new when a block is full, the state at every step; the end is that of a simulation."""
     environment = WorldLineEnv(model=small_world, render_mode="rgb_array", episode_frames=6, **SHORT)
     observed, info = environment.reset(seed=1)
@@ -71,7 +66,7 @@ def test_episodes_are_simulations_of_recorded_starts(small_world: WorldLine, sta
         environment.step(driven[0])
 
 
-def test_pictures_may_be_asked_for_more_often(small_world: WorldLine, starts: RecordedStarts) -> None:
+def test_pictures_may_be_asked_for_more_often(small_world, starts):
     start, driven = starts[0], commands(starts, [0], 4)[:, 0]
     simulation = small_world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=0)
     environment = WorldLineEnv(model=small_world, observe_every=2, episode_frames=4, **SHORT)
@@ -85,7 +80,7 @@ def test_pictures_may_be_asked_for_more_often(small_world: WorldLine, starts: Re
 
 
 @pytest.mark.slow
-def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: RecordedStarts) -> None:
+def test_a_batch_is_its_environments_side_by_side(world, starts):
     """Against Gymnasium's own vector environment, to the end of the episodes and the first frame of the next ones."""
     options = {"model": world, "episode_frames": 18, **SHORT}
     succeeds = {starts[1].instruction}
@@ -109,9 +104,9 @@ def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: Reco
     assert [picture.shape for picture in ours.call("render")] == [(64, 3 * 96, 3)] * 2
 
 
-def test_what_cannot_be_seen_is_no_success(small_world: WorldLine, starts: RecordedStarts) -> None:
+def test_what_cannot_be_seen_is_no_success(small_world, starts):
     for verdict, rewarded in ((None, False), (True, True), (False, False), (np.True_, True)):
-        options: Any = SHORT | {"success": lambda _, v=verdict: v}
+        options = SHORT | {"success": lambda _, v=verdict: v}
         environment = WorldLineEnv(model=small_world, episode_frames=1, **options)
         environment.reset(seed=0)
         _, reward, terminated, truncated, info = environment.step(commands(starts, [0], 1)[0][0])
@@ -125,9 +120,9 @@ def test_what_cannot_be_seen_is_no_success(small_world: WorldLine, starts: Recor
 
 def test_episodes_begin_at_named_frames_with_what_came_before(small_world, shipped, starts):
     """The state is that of the commands so far, the judge sees the whole video, and the episode goes on as it was recorded."""
-    seen: list[Trajectory] = []
+    seen = []
     names, frames = [starts.rows[2].episode_id, starts.rows[0].episode_id], [0, 20]
-    options: Any = {**SHORT, "model": small_world, "episode_frames": 2, "success": lambda video: seen.append(video)}
+    options = {**SHORT, "model": small_world, "episode_frames": 2, "success": lambda video: seen.append(video)}
     environment = WorldLineVectorEnv(2, **options)
     observed, infos = environment.reset(seed=[3, 4], options={"start": names, "frame": frames})
     assert infos["episode_id"].tolist() == names
@@ -168,7 +163,7 @@ def test_episodes_begin_at_named_frames_with_what_came_before(small_world, shipp
 
 
 @pytest.mark.parametrize("robot", ["ur5e_silver", "so101", "agibot_g1"])
-def test_normalised_actions_are_the_robots_limits(robot: str) -> None:
+def test_normalised_actions_are_the_robots_limits(robot):
     embodiment = load_embodiment(robot)
     spaces = RobotSpaces(embodiment, ["head"], (4, 6), flat=True, normalised=True)
     limits = np.concatenate([[*arm.limits, sorted((arm.gripper.closed, arm.gripper.open))] for arm in embodiment.arms])
@@ -203,7 +198,7 @@ def test_normalised_actions_and_flat_observations_change_the_form_alone(small_wo
         np.testing.assert_allclose(given[view].astype(int), picture, rtol=0, atol=0 if small_world.bfloat16 else 1)
 
 
-def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLine, starts: RecordedStarts) -> None:
+def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world, starts):
     numbers = [0, 3, 4]  # a drawer that is closed, a button that is pressed, one that is not lifted
     environment = WorldLineVectorEnv(3, model=world, episode_frames=32, reward="soft", **SHORT)
     _, infos = environment.reset(seed=numbers)
@@ -223,7 +218,7 @@ def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLin
     assert (later["score"] > 0.8).tolist() == [True, True, False]
     segmenter = shipped_segmenter()
     video = environment._episodes[0].video
-    dark: Any = {view: np.concatenate([frames[:20], 0 * frames[:11]]) for view, frames in video.frames.items()}
+    dark = {view: np.concatenate([frames[:20], 0 * frames[:11]]) for view, frames in video.frames.items()}
     for instruction in ("lift the green drawer", "place the green drawer on the blue pad"):  # hiding gains nothing
         score, facts = soft_score(segmenter, replace(video, instruction=instruction, frames=dark, points=None))
         assert score < 0.1
@@ -233,21 +228,16 @@ def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLin
 
 
 @pytest.mark.slow
-def test_a_further_model_bounds_what_one_model_promises(world: WorldLine, shipped: Path) -> None:
+def test_a_further_model_bounds_what_one_model_promises(world, shipped):
     """Two models side by side are the two alone: the lower score, their difference, and a success that both see."""
-    options: dict[str, Any] = {
-        "episode_frames": 32,
-        "embodiment": ROBOT,
-        "reward": "soft",
-        "splits": ("test", "ood_test"),
-    }
+    options = {"episode_frames": 32, "embodiment": ROBOT, "reward": "soft", "splits": ("test", "ood_test")}
     stage2 = WorldLine.from_pretrained(shipped / "models" / "stage2", steps=1)
     given = {"model": world, "members": [stage2]}
     alone = [WorldLineVectorEnv(5, model=model, **options) for model in (world, stage2)]
     doubting = WorldLineVectorEnv(5, **given, largest_disagreement=0.05, **options)
     bounded = WorldLineVectorEnv(5, **given, **options)
     environments = [*alone, doubting, bounded]
-    found: list[Any] = [environment.reset(seed=0)[1] for environment in environments]
+    found = [environment.reset(seed=0)[1] for environment in environments]
     before, rewards = found[3]["score"], np.zeros((2, 5))
     for command in commands(bounded.starts, list(range(5)), 32):
         steps = [environment.step(command) for environment in environments]
@@ -264,7 +254,7 @@ def test_a_further_model_bounds_what_one_model_promises(world: WorldLine, shippe
 
 
 @pytest.mark.slow
-def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> None:
+def test_the_judge_sees_the_outcomes_of_recorded_commands(world):
     """Replayed in the environment, recorded episodes end as they did: all of five but one at least."""
     environment = WorldLineVectorEnv(5, model=world, episode_frames=32, embodiment=ROBOT, splits=("test", "ood_test"))
     recorded = [row.outcome == "success" for row in environment.starts.rows]
@@ -274,7 +264,7 @@ def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> N
     assert (infos["is_success"] == recorded).sum() >= 4
 
 
-def test_misuse_is_refused(small_world: WorldLine, shipped: Path, starts: RecordedStarts) -> None:
+def test_misuse_is_refused(small_world, shipped, starts):
     environment = WorldLineVectorEnv(2, model=small_world, **SHORT)
     with pytest.raises(DataError, match="call reset first"):
         environment.step(np.zeros((2, 14)))
@@ -286,12 +276,12 @@ def test_misuse_is_refused(small_world: WorldLine, shipped: Path, starts: Record
     texts, unknown = np.full((2, 14), "1"), np.full((2, 14), None)
     for commands in (texts, unknown, np.zeros((2, 14), complex), np.ones((2, 14), bool), [[1], [1, 2]], "x"):
         with pytest.raises(DataError, match="Not the commands of one step"):
-            environment.step(commands)  # type: ignore[arg-type]
+            environment.step(commands)
     for seed in (-1, 2**63, 1.5, "ab", [1], [1, 2, 3], []):
         with pytest.raises(DataError, match="Not the seeds"):
-            environment.reset(seed=seed)  # type: ignore[arg-type]
+            environment.reset(seed=seed)
     for seed in (np.int64(0), np.array([0, 1]), [0, np.int64(1)]):  # a zero of NumPy counted as no seed
-        _, infos = environment.reset(seed=seed)  # type: ignore[arg-type]
+        _, infos = environment.reset(seed=seed)
         assert infos["episode_id"].tolist() == [starts[number].episode_id for number in (0, 1)]
     for change in ({"num_envs": -1}, {"episode_frames": 2.5}, {"success": "measurd"}, {"reward": "sotf"}):
         with pytest.raises(ConfigError, match="Not an environment"):

@@ -1,22 +1,16 @@
 """LeRobot's own commands, unmodified, inside the simulator: a policy is trained on the shipped recordings, evaluated, and driven as
 on a robot; episodes are recorded by teleoperation."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 
-from worldline_core import WorldLine
 from worldline_core.config import read_yaml, validate
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
@@ -24,7 +18,6 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.rollout.recorded_starts import RecordedStarts
 
 pytest.importorskip("lerobot")
 
@@ -36,7 +29,7 @@ POLICY = (
 
 
 @pytest.fixture(scope="module")
-def lerobot(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+def lerobot(project_root, uv, tmp_path_factory):
     """Runs a command of LeRobot in a folder as a user would, with the wheels of both plug-ins installed and no hub; what it said."""
     built, site = tmp_path_factory.mktemp("wheels"), tmp_path_factory.mktemp("site")
     for name in ("lerobot_env_worldline", "lerobot_robot_worldline"):
@@ -47,7 +40,7 @@ def lerobot(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactor
     hub = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path_factory.mktemp("hf"))}
     settings = {**os.environ, **hub, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
 
-    def run(folder: Path, command: str, *arguments: str) -> str:
+    def run(folder, command, *arguments):
         result = subprocess.run(
             [sys.executable, "-P", "-m", f"lerobot.scripts.{command}", *arguments],
             cwd=folder, env=settings, capture_output=True, text=True, check=False, timeout=400,
@@ -59,7 +52,7 @@ def lerobot(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.fixture(scope="module")
-def policy(lerobot: Callable[..., str], project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def policy(lerobot, project_root, tmp_path_factory):
     """A small ACT policy, trained by LeRobot's training command."""
     if importlib.util.find_spec("accelerate") is None:
         pytest.skip("lerobot-train needs accelerate (the group dev has it)")
@@ -72,7 +65,7 @@ def policy(lerobot: Callable[..., str], project_root: Path, tmp_path_factory: py
     return folder / "out" / "checkpoints" / "last" / "pretrained_model"
 
 
-def recorded_by_eval(folder: Path) -> list[Any]:
+def recorded_by_eval(folder):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     roots = [next((folder / "out" / "recordings").rglob(f"env_{number}")) for number in range(2)]
@@ -119,11 +112,11 @@ RECORDED = (
 )  # fmt: skip
 
 
-def check_recorded(world: WorldLine, starts: RecordedStarts, root: Path, *, lossless: bool) -> list[np.ndarray]:
+def check_recorded(world, starts, root, *, lossless):
     """Each of two recorded episodes is a simulation under its commands, which are returned."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    driven, written = [], cast("Any", LeRobotDataset("local/any", root=root))
+    driven, written = [], LeRobotDataset("local/any", root=root)
     assert (written.num_episodes, written.fps, written.meta.robot_type) == (2, 8, "worldline")
     names = [f"{name.replace('/', '_')}.pos" for name in load_embodiment("ur5e_silver").state_names]
     assert written.features["action"]["names"] == written.features["observation.state"]["names"] == names

@@ -1,13 +1,7 @@
 """The simulator as a robot of LeRobot, and recorded commands as its teleoperator, without LeRobot's commands."""
 
-from __future__ import annotations
-
 import importlib
 import logging
-from collections.abc import Iterator
-from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,28 +11,26 @@ from PIL import Image
 pytest.importorskip("lerobot")
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from worldline_core import WorldLine
 from worldline_core.config import read_yaml
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.sources.calibration_file import read_calibration
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.rollout.recorded_starts import RecordedStarts, read_start
-from worldline_core.rollout.simulation import Simulation
+from worldline_core.rollout.recorded_starts import read_start
 
 ROBOT = "ur5e_silver"
 
 
 @pytest.fixture(scope="module")
-def plugin(project_root: Path) -> Iterator[ModuleType]:
+def plugin(project_root):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(project_root / "packaging" / "lerobot_robot_worldline")
         yield importlib.import_module("lerobot_robot_worldline")
 
 
 @pytest.fixture
-def robot(plugin: ModuleType, small_world: WorldLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def robot(plugin, small_world, tmp_path, monkeypatch):
     monkeypatch.setattr(plugin.robot.WorldLine, "from_pretrained", lambda *_, **__: small_world)
     made = plugin.WorldLineRobot(plugin.WorldLineRobotConfig(calibration_dir=tmp_path))
     yield made
@@ -47,20 +39,20 @@ def robot(plugin: ModuleType, small_world: WorldLine, tmp_path: Path, monkeypatc
 
 
 @pytest.fixture
-def replay(plugin: ModuleType, tmp_path: Path) -> Iterator[Any]:
+def replay(plugin, tmp_path):
     made = plugin.WorldLineReplay(plugin.WorldLineReplayConfig(calibration_dir=tmp_path))
     made.connect()
     yield made
     made.disconnect()
 
 
-def begun(world: WorldLine, starts: RecordedStarts, seed: int) -> Simulation:
+def begun(world, starts, seed):
     start = starts[seed]
     return world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=seed)
 
 
 @pytest.fixture
-def announcements() -> Iterator[None]:
+def announcements():
     """Messages of every level reach the robot, as LeRobot's commands let them."""
     root = logging.getLogger()
     level = root.level
@@ -69,9 +61,7 @@ def announcements() -> Iterator[None]:
     root.setLevel(level)
 
 
-def test_a_robot_is_driven_as_a_simulation(
-    robot: Any, replay: Any, small_world: WorldLine, starts: RecordedStarts
-) -> None:
+def test_a_robot_is_driven_as_a_simulation(robot, replay, small_world, starts):
     assert robot.action_features == replay.action_features
     assert list(robot.action_features)[:2] == ["left_shoulder_pan_joint.pos", "left_shoulder_lift_joint.pos"]
     pictures = dict.fromkeys(VIEWS, (64, 96, 3))
@@ -94,7 +84,7 @@ def test_a_robot_is_driven_as_a_simulation(
     assert np.array_equal(robot.get_observation()["head"], after)
 
 
-def test_a_robot_is_connected_or_not(robot: Any) -> None:
+def test_a_robot_is_connected_or_not(robot):
     for call in (robot.get_observation, robot.disconnect, lambda: robot.send_action({})):
         with pytest.raises(DeviceNotConnectedError, match="not connected"):
             call()
@@ -107,7 +97,7 @@ def test_a_robot_is_connected_or_not(robot: Any) -> None:
     assert not robot.is_connected and len(logging.getLogger().handlers) == handlers - 1
 
 
-def test_pictures_are_predicted_when_they_are_looked_at(robot: Any, replay: Any) -> None:
+def test_pictures_are_predicted_when_they_are_looked_at(robot, replay):
     """LeRobot sends robots home by hundreds of commands, whose pictures nobody sees."""
     robot.connect()
     for _ in range(10):
@@ -133,7 +123,7 @@ def test_pictures_may_be_observed_more_often(plugin, robot, small_world, starts)
     assert not robot.is_connected
 
 
-def test_actions_of_other_robots_are_refused(robot: Any, replay: Any) -> None:
+def test_actions_of_other_robots_are_refused(robot, replay):
     robot.connect()
     action = replay.get_action()
     with pytest.raises(DataError, match=r"missing: left_elbow_joint.pos; unknown: shoulder_pan.pos"):
@@ -205,7 +195,7 @@ def test_commands_at_another_rate_are_told(plugin, robot, replay, caplog, monkey
     assert not warned or "at 30 Hz" in found[0]
 
 
-def test_units_and_names_are_those_of_leader_arms(plugin: ModuleType) -> None:
+def test_units_and_names_are_those_of_leader_arms(plugin):
     """LeRobot's SO-101 leader sends these names, degrees, and a gripper of 0 to 100."""
     kinematics = ArmKinematics(load_embodiment("so101"))
     leader = plugin.device.Columns(kinematics, use_degrees=True)
@@ -218,9 +208,7 @@ def test_units_and_names_are_those_of_leader_arms(plugin: ModuleType) -> None:
     np.testing.assert_array_equal(list(plugin.device.Columns(kinematics, use_degrees=False).named(row).values()), row)
 
 
-def test_a_robot_begins_at_given_pictures(
-    robot: Any, small_world: WorldLine, starts: RecordedStarts, tmp_path: Path
-) -> None:
+def test_a_robot_begins_at_given_pictures(robot, small_world, starts, tmp_path):
     start, folder, entries = starts[1], tmp_path, {}
     for view, camera in start.cameras.items():
         Image.fromarray(start.images[view]).save(folder / f"{view}.png")

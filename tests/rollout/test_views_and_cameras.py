@@ -193,7 +193,7 @@ def test_stage2_goes_on_where_its_last_clip_ended(mixed, inputs):
     session = world.session(images, [42])
     last = session.step(world.action_maps([tracks], range(0, 17, 4), views=VIEWS))[0]
     again = world.session(pictures(last), [42])
-    again._sampler._noise = session._sampler._noise  # type: ignore[attr-defined]
+    again._sampler._noise = session._sampler._noise
     maps = world.action_maps([tracks], range(16, 33, 4), views=VIEWS)
     assert np.array_equal(again.step(maps)[0]["head"], chained[2])
     with pytest.raises(ValidationError, match=r"clip_frames\n.*1 \+ a multiple of 4"):
@@ -213,7 +213,7 @@ def test_a_causal_rollout_begins_anew_at_its_own_picture_every_few_blocks(mixed,
         assert not np.array_equal(pieces[3][view], free[3][view])
     session = world.session(pictures(pieces[2]), [42])
     for _ in range(2):  # the noise goes on
-        session._sampler.noise.draw((3, world.model.config.latent_channels, 4, *world.contract.grid_size))  # type: ignore[union-attr]
+        session._sampler.noise.draw((3, world.model.config.latent_channels, 4, *world.contract.grid_size))
     for block in (3, 4):
         maps = world.action_maps([tracks], range(16 * (block - 1), 16 * block + 1, 4), views=VIEWS)
         assert np.array_equal(session.step(maps)[0]["head"], pieces[block]["head"])

@@ -1,12 +1,8 @@
 """Servers of a small random model and the shipped recordings."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -14,19 +10,16 @@ pytest.importorskip("msgpack")
 pytest.importorskip("uvicorn")
 
 from tests.rollout.conftest import shipped, small_world  # noqa: F401
-from worldline_core import WorldLine
 from worldline_core.serving.app import make_server
 from worldline_core.serving.serve_config import ServeConfig
 
-Serve = Callable[..., "contextmanager[str]"]
-
 
 @pytest.fixture(scope="session")
-def serving(small_world: WorldLine, shipped: Path) -> Serve:  # noqa: F811
+def serving(small_world, shipped):  # noqa: F811
     """``with serving(token=None, **settings) as url:`` a server on a free port, in a thread."""
 
     @contextmanager
-    def serve(token: str | None = None, world: WorldLine = small_world, **settings: object) -> Iterator[str]:
+    def serve(token=None, world=small_world, **settings):
         config = ServeConfig.model_validate({"port": 0, "episodes": shipped / "recordings", **settings})
         server = make_server(world, config, token)
         thread = threading.Thread(target=server.run)
