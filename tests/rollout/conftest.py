@@ -16,6 +16,8 @@ from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import fit_patch_tokenizer
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec, MixtureConfig, NativeVectors
+from worldline_core.rollout.rollout import rollout
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.encode_latents import encode_latents
 
@@ -144,6 +146,12 @@ def inputs(tmp_path_factory, make_contract, make_spec):
         save(name, kind, film, action_contract=contract if takes == "either" else undrawn, vectors=vectors)
     folders = {name: root / name for name in ("episodes", "tracks", "tokenizer")}
     return folders | {"checkpoint": root / "causal"}
+
+
+def rolled(config, inputs, output, **changes):
+    """The set of a rollout, and what it counted."""
+    summary = rollout(config.model_copy(update=changes), inputs, output)
+    return RolloutSet.open(output), summary
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from tests.rollout.conftest import NAMES, SIZE, SPEC, recorded, write_recordings
+from tests.rollout.conftest import NAMES, SIZE, SPEC, recorded, rolled, write_recordings
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError, UnavailableError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
@@ -39,26 +39,19 @@ N = CONFIG.num_frames
 
 @pytest.fixture(scope="module")
 def predicted(inputs, tmp_path_factory):
-    output = tmp_path_factory.mktemp("predicted")
-    return output, rollout(CONFIG, inputs, output)
+    return rolled(CONFIG, inputs, tmp_path_factory.mktemp("predicted"))
 
 
 def model(inputs, name):
     return inputs | {"checkpoint": inputs["checkpoint"].parent / name}
 
 
-def rolled(config, inputs, output, **changes):
-    rollout(config.model_copy(update=changes), inputs, output)
-    return RolloutSet.open(output)
-
-
 def test_every_chosen_episode_is_predicted_in_every_view_and_seed(predicted):
-    output, summary = predicted
+    rollouts, summary = predicted
     assert summary == {
         "method": "causal", "episodes": 4, "predictions": 8, "frames": 8 * N, "checkpoint_kind": "causal", "steps": 4,
         "found": 5, "kept": 4, "left_out": {"in other splits": 1},
     }  # fmt: skip
-    rollouts = RolloutSet.open(output)
     assert (rollouts.method, rollouts.episode_ids) == ("causal", sorted(NAMES.keys() - {"a-0"}))
     assert (rollouts.seeds("b-1"), set(rollouts.views("b-1"))) == ([42, 43], set(VIEWS))
     one, other = (rollouts.frames("b/0 x", "left_wrist", seed) for seed in (42, 43))
@@ -73,7 +66,7 @@ def speed_of(output):
 
 @pytest.mark.slow
 def test_times_lie_beside_the_predictions_and_outside_their_digest(inputs, predicted, tmp_path):
-    output, _ = predicted
+    output = predicted[0].root
     speed, dtype = speed_of(output), "bfloat16" if CONFIG.bfloat16 else "float32"
     assert speed.items() >= {"steps": 4, "batch_size": 2, "device": "cpu", "dtype": dtype}.items()
     assert speed["frames"] == 6 * N  # the first of four batches of two warms up
@@ -126,13 +119,15 @@ def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(inputs, tmp_p
 def test_controls_matter_and_zero_differs_from_shuffled(inputs, predicted, tmp_path):
     with pytest.raises(DataError, match="too short"):
         rolled(CONFIG, inputs, tmp_path / "short", num_frames=16)
-    seen = {RolloutSet.open(predicted[0]).frames("b-1", "head", 42).tobytes()}
+    seen = {predicted[0].frames("b-1", "head", 42).tobytes()}
     for actions in ("zero", "shuffled"):
-        found = rolled(CONFIG, inputs, tmp_path / actions, actions=actions, seeds=(42,), embodiments=("aloha_viperx",))
+        found, _ = rolled(
+            CONFIG, inputs, tmp_path / actions, actions=actions, seeds=(42,), embodiments=("aloha_viperx",)
+        )
         seen.add(found.frames("b-1", "head").tobytes())
     film = RolloutConfig(method="film", sampler=FullClipConfig(steps=2), num_frames=5, embodiments=("aloha_viperx",))
     for actions in ("true", "zero", "shuffled"):  # a model with FiLM takes the recording's vectors
-        found = rolled(film, model(inputs, "film"), tmp_path / f"film_{actions}", actions=actions)
+        found, _ = rolled(film, model(inputs, "film"), tmp_path / f"film_{actions}", actions=actions)
         seen.add(found.frames("b-1", "head").tobytes())
     assert len(seen) == 6
 
@@ -140,20 +135,20 @@ def test_controls_matter_and_zero_differs_from_shuffled(inputs, predicted, tmp_p
 @pytest.mark.slow
 def test_compiled_layers_predict_the_same(inputs, tmp_path):
     few = {"bfloat16": False, "seeds": (42,), "embodiments": ("ur5e_pair",)}
-    plain = rolled(CONFIG, inputs, tmp_path / "plain", **few).frames("a-1", "head", 42).astype(int)
+    plain = rolled(CONFIG, inputs, tmp_path / "plain", **few)[0].frames("a-1", "head", 42).astype(int)
     with torch._dynamo.config.patch(recompile_limit=100):
-        compiled = rolled(CONFIG, inputs, tmp_path / "compiled", compile=True, **few).frames("a-1", "head", 42)
+        compiled = rolled(CONFIG, inputs, tmp_path / "compiled", compile=True, **few)[0].frames("a-1", "head", 42)
         assert torch._dynamo.utils.counters["stats"]["unique_graphs"] > 0
     assert np.abs(compiled - plain).max() <= 2
 
 
 def test_copying_needs_only_recordings_and_repeats_the_first_frame(inputs, tmp_path):
     config = RolloutConfig(method="copy", sampler=CopyFirstFrameConfig(), max_episodes_per_embodiment=1)
-    assert rollout(config, {"episodes": inputs["episodes"]}, tmp_path)["checkpoint_kind"] is None
-    frames = RolloutSet.open(tmp_path).frames("a-1", "head").astype(int)
+    found, summary = rolled(config, {"episodes": inputs["episodes"]}, tmp_path)
+    assert (summary["checkpoint_kind"], found.episode_ids) == (None, ["a-1", "b-1"])
+    frames = found.frames("a-1", "head").astype(int)
     assert np.abs(frames - recorded(1)[0].astype(int)).mean() < 4
     assert np.abs(frames[-1] - frames[0]).max() <= 2
-    assert RolloutSet.open(tmp_path).episode_ids == ["a-1", "b-1"]
 
 
 def test_vectors_drive_a_rollout_of_recordings_without_tracks(inputs, tmp_path):
@@ -162,7 +157,7 @@ def test_vectors_drive_a_rollout_of_recordings_without_tracks(inputs, tmp_path):
     given = {"episodes": made["episodes"], "tokenizer": inputs["tokenizer"]}
     film, stage2 = (given | {"checkpoint": inputs["checkpoint"].parent / name} for name in ("film", "stage2"))
     config = RolloutConfig(sampler=FullClipConfig(steps=1), num_frames=9, bfloat16=False)
-    seen = {rolled(config, film, tmp_path / actions, actions=actions).frames("b", "head").tobytes()
+    seen = {rolled(config, film, tmp_path / actions, actions=actions)[0].frames("b", "head").tobytes()
             for actions in ("true", "shuffled", "delayed")}  # fmt: skip
     assert len(seen) == 3
     with pytest.raises(ConfigError, match=r"(?s)drawn from action tracks.*run render_actions"):
@@ -174,9 +169,8 @@ def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text
     sampler = TextToVideoConfig(steps=2)
     config = RolloutConfig(method="base", sampler=sampler, num_frames=7, embodiments=("aloha_viperx",), bfloat16=False)
     base = {name: folder for name, folder in model(inputs, "base").items() if name != "tracks"}
-    summary = rollout(config, base, tmp_path / "base")
+    found, summary = rolled(config, base, tmp_path / "base")
     assert (summary["checkpoint_kind"], summary["steps"], summary["frames"]) == ("base", 2, 3 * 5)
-    found = RolloutSet.open(tmp_path / "base")
     reference = found.frames("b-1", "head").astype(int)
     assert (set(found.views("b-1")), reference.shape) == (set(VIEWS), (5, *SIZE, 3))
     # A prediction does not depend on those beside it, but on its text and seed; controls reach nothing.
@@ -184,12 +178,12 @@ def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text
         ("alone", True, {"batch_size": 1}), ("seed", False, {"seeds": (7,)}),
         ("cut", False, {"sampler": TextToVideoConfig(steps=2, text=TextConfig(max_length=2))}),
     ):  # fmt: skip
-        frames = rolled(config, base, tmp_path / name, **change).frames("b-1", "head")
+        frames = rolled(config, base, tmp_path / name, **change)[0].frames("b-1", "head")
         assert (np.abs(frames - reference).max() <= 2) == same, name
     backbone, info = load_checkpoint(base["checkpoint"])
     stage1 = base | {"checkpoint": tmp_path / "stage1"}
     save_checkpoint(stage1["checkpoint"], backbone, kind="stage1", action_contract=None, metadata=info.metadata)
-    assert np.array_equal(rolled(config, stage1, tmp_path / "one").frames("b-1", "head"), reference)
+    assert np.array_equal(rolled(config, stage1, tmp_path / "one")[0].frames("b-1", "head"), reference)
     for folder, message in (
         ("stage2", "wrong kind"), ("silent", "how this model reads text"), ("foreign", "another tokenizer"),
     ):  # fmt: skip
@@ -293,7 +287,7 @@ def test_a_small_decoder_shows_the_same_latents_otherwise(inputs, tmp_path):
         return RolloutConfig(num_frames=5 if sampler.steps == 1 else 17, embodiments=("ur5e_pair",), sampler=sampler)
 
     def video(name, checkpoint, sampler):
-        return rolled(config(sampler), model(inputs, checkpoint), tmp_path / name).frames("a-1", "head").tobytes()
+        return rolled(config(sampler), model(inputs, checkpoint), tmp_path / name)[0].frames("a-1", "head").tobytes()
 
     assert video("without", "causal", BlockCausalConfig()) != video("causal", "causal", BlockCausalConfig(decoder=own))
     for checkpoint, sampler in (("stage2", FullClipConfig), ("base", TextToVideoConfig)):
