@@ -214,7 +214,7 @@ def _described(dtype="<f4", shape=(2,), data=b"\0" * 8):
         msgpack.packb({b"__npgeneric__": True, b"dtype": "<f8", b"data": None}),
         _described("(1f4,f4"), _described("(,)f4"), _described("01f4,f4"), _described("(99999999,)f4"), _described("g"),
         b"", b"\xc1", b"\xdf\xff\xff\xff\xff", b"\x91" * 3000, b"\x93\x01", b"\x01\x02", msgpack.packb(msgpack.ExtType(4, b"x")),
-        msgpack.packb([[]] * 65_537), msgpack.packb([{str(n): 1 for n in range(60_000)}] * 18), b"\xdc\xff\xff" + b"\xdc\xff\xff" * 9, b"\x81\xa1a\xa2\xff\xfe",
+        msgpack.packb([[]] * 65_537), msgpack.packb([{str(n): 1 for n in range(60_000)}, *[[0] * 65_000] * 16]), b"\xdc\xff\xff" + b"\xdc\xff\xff" * 9, b"\x81\xa1a\xa2\xff\xfe",
         struct.pack(">BI", 0xC6, 1 << 31),
     ],
 )  # fmt: skip

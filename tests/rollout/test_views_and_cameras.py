@@ -379,7 +379,8 @@ def test_an_observation_as_files_may_lack_cameras(tmp_path):
     robot = load_embodiment(ROBOT)
     for view, picture in IMAGES.items():
         Image.fromarray(picture).save(tmp_path / f"{view}.png")
-    (tmp_path / "state.yaml").write_text("".join(f"{name}: 0.0\n" for name in robot.state_names))
+    state = dict.fromkeys(robot.state_names, 0.0)
+    (tmp_path / "state.yaml").write_text(json.dumps(state))
     found = read_start(tmp_path, robot, VIEWS, needs_cameras=False)
     assert (set(found.images), found.cameras) == (set(VIEWS), {})
     with pytest.raises(Exception, match=r"calibration\.yaml"):
@@ -395,10 +396,17 @@ def test_an_observation_as_files_may_lack_cameras(tmp_path):
     found = read_start(tmp_path, robot, VIEWS)
     tools = ArmKinematics(robot).tool_poses(found.state[None]).numpy()[0]
     by_view = {arm.camera_view: tool for arm, tool in zip(robot.arms, tools, strict=True)}
-    assert any("wrist" in view for view in VIEWS)
     for view in VIEWS:
         expected = by_view[view] @ mount if "wrist" in view else np.eye(4)
         assert np.allclose(found.cameras[view].T_base_camera, expected, atol=1e-6)
+    for name, content, said in (
+        ("calibration.yaml", {"views": {"head": still}}, r"(?s)each view.*view left_wrist.*got: nothing"),
+        ("left_wrist.png", None, r"(?s)Not a picture to start from.*left_wrist.png"),
+        ("state.yaml", state | {robot.state_names[0]: "zero"}, r"(?s)Not the robot's state.*left/shoulder_pan_joint"),
+    ):
+        (tmp_path / name).write_text(json.dumps(content))
+        with pytest.raises(DataError, match=said):
+            read_start(tmp_path, robot, VIEWS)
 
 
 def test_what_was_refused_for_its_controls_is_no_vector_either(tmp_path):

@@ -250,7 +250,7 @@ def test_who_may_connect(serving, monkeypatch):
 
 
 def test_connections_that_say_nothing_are_closed_and_bounded(serving, monkeypatch):
-    monkeypatch.setattr(app, "TAKE_S", 0.3)
+    monkeypatch.setattr(app, "TAKE_S", 0.6)
     with serving(max_connections=4) as url:
         host, _, port = url.removeprefix("ws://").partition(":")
         slow = [socket.create_connection((host, int(port))) for _ in range(7)]

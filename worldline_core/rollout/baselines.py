@@ -176,6 +176,8 @@ _JPEG_QUALITY, _MAX_JSON_BYTES = 95, 1 << 16
 _PATIENCE = 3
 """Refused predictions in a row after which the server counts as out of order."""
 _BACKGROUND, _AXIS_M, _AXIS_WIDTH = 50, 0.1, 8
+_TOOL_OFFSET_M = 0.15
+"""From the end link of an arm to the tool, along its z."""
 # The sequential maps "Greens" and "Reds" of ColorBrewer, from light to dark.
 _DISC = (
     np.array([(247, 252, 245), (229, 245, 224), (199, 233, 192), (161, 217, 155), (116, 196, 118), (65, 171, 93),
@@ -271,7 +273,7 @@ class GeSim:
 
     def _condition(self, tracks: EpisodeTracks, K: np.ndarray) -> None:
         """Send the pictures of the tools and the camera poses of the coming frames."""
-        band = tool_band(tracks, K, self._config.image_size, self._config.tool_offset_m)
+        band = tool_band(tracks, K, self._config.image_size)
         poses = tracks.T_base_camera.swapaxes(0, 1)
         shape = [3, band.shape[1], band.shape[0], *band.shape[2:4]]
         sections = [_packed(_jpeg(views) for views in band), _floats(poses)]
@@ -329,12 +331,10 @@ class GeSim:
         )
 
 
-def tool_band(tracks: EpisodeTracks, K: np.ndarray, size: tuple[int, int], tool_offset_m: float) -> np.ndarray:
-    """Pictures of the tools, uint8 (t, v, H, W, 3) RGB; a tool behind the camera or outside of the picture is not drawn.
+def tool_band(tracks: EpisodeTracks, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Pictures of the tools, uint8 (t, v, H, W, 3) RGB, for K (v, 3, 3) in pixels of ``size``.
 
-    Args:
-        K: (v, 3, 3) in pixels of ``size``.
-        tool_offset_m: to the tool, along its z, from the end link, whose distance decides the size of the disc.
+    A tool behind the camera or outside of the picture is not drawn. The distance of the end link decides the size of the disc.
     """
     T_camera_tool = np.linalg.inv(tracks.T_base_camera)[:, :, None] @ tracks.T_base_tool[:, None].astype(np.float64)
     ends = np.array([[0, 0, 0, 1], [_AXIS_M, 0, 0, 1], [0, _AXIS_M, 0, 1], [0, 0, _AXIS_M, 1]]).T
@@ -342,7 +342,7 @@ def tool_band(tracks: EpisodeTracks, K: np.ndarray, size: tuple[int, int], tool_
     depth = points[..., 2, :]
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = (K[:, None] @ points)[..., :2, :] / depth[..., None, :]
-    link = (T_camera_tool @ np.array([0, 0, -tool_offset_m, 1]))[..., :3]
+    link = (T_camera_tool @ np.array([0, 0, -_TOOL_OFFSET_M, 1]))[..., :3]
     radius = np.clip(1 - np.linalg.norm(link, axis=-1) - 0.07 / (0.8 - 0.07), 0, 1) * 100
     closed = ((1 - tracks.gripper[:, 0]) * (120 - 35) + 35) / 120
     band = np.full((*depth.shape[:2], *size, 3), _BACKGROUND, np.uint8)
