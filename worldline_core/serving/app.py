@@ -258,7 +258,9 @@ def make_server(world: WorldLine, config: ServeConfig, token: str | None) -> uvi
     host = SessionHost(world, config)
     host.warm_up()
     settings = uvicorn.Config(
-        make_app(host, token), config.host, config.port, http=patient_http(2 * config.max_connections, TAKE_S), ws=QuietWebSocket, ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
-        timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning", server_header=False,
+        make_app(host, token), config.host, config.port, http=patient_http(2 * config.max_connections, TAKE_S),
+        ws=QuietWebSocket, ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0,
+        ws_ping_timeout=20.0, timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning",
+        server_header=False,
     )  # fmt: skip
     return uvicorn.Server(settings)
