@@ -107,7 +107,7 @@ class Tree:
     def rollout(self, blocks: int) -> int:
         """One whole prediction under controls that are known."""
         starts: Any = self.host.starts
-        start = starts.named(EPISODE)[1] if hasattr(starts, "named") else starts.read(EPISODE)
+        start = starts.at(EPISODE) if hasattr(starts, "at") else starts.read(EPISODE)
         state = start.state if hasattr(start, "state") else start.episode.action[0]
         rows = state + np.cumsum(
             np.random.default_rng(0).normal(0, 0.005, (1 + blocks * self.block, len(state))), axis=0

@@ -1,11 +1,7 @@
 """The simulator as a Gymnasium environment."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,27 +13,25 @@ from worldline_core import WorldLine
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment import ENVIRONMENT
-from worldline_core.environment.environment import WorldLineEnv, WorldLineVectorEnv, shipped_segmenter
-from worldline_core.environment.spaces import RobotSpaces
+from worldline_core.environment.environment import RobotSpaces, WorldLineEnv, WorldLineVectorEnv, shipped_segmenter
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.policy.measured_judge import soft_score
-from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.rollout.recorded_starts import RecordedStarts
 
 ROBOT = "ur5e_silver"
-SHORT: dict[str, Any] = {"embodiment": ROBOT, "success": None}
+SHORT = {"embodiment": ROBOT, "success": None}
 
 
-def commands(starts: RecordedStarts, seeds: list[int], count: int) -> np.ndarray:
+def commands(starts, seeds, count):
     """Recorded commands of the starts that these seeds choose, ``(count, envs, j)``, the second moved a little."""
     recorded = (starts.commands(seed % len(starts)).astype(np.float32) for seed in seeds)
     return np.stack([rows[np.minimum(np.arange(count), len(rows) - 1)] for rows in recorded], axis=1)
 
 
 @pytest.mark.slow
-def test_gymnasiums_checker_finds_nothing(world: WorldLine) -> None:
-    environment = gymnasium.make(ENVIRONMENT, model=world, observe_every=8, episode_frames=20, **SHORT).unwrapped
+def test_gymnasiums_checker_finds_nothing(small_world):
+    environment = gymnasium.make(ENVIRONMENT, model=small_world, observe_every=2, episode_frames=5, **SHORT).unwrapped
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         check_env(environment)
@@ -46,47 +40,47 @@ def test_gymnasiums_checker_finds_nothing(world: WorldLine) -> None:
     assert environment.metadata["render_fps"] == 8
 
 
-def test_episodes_are_simulations_of_recorded_starts(world: WorldLine, starts: RecordedStarts) -> None:
+def test_episodes_are_simulations_of_recorded_starts(small_world, starts):
     """Block by block: pictures are new when a block is full, the state at every step; the end is that of a simulation."""
-    environment = WorldLineEnv(model=world, render_mode="rgb_array", episode_frames=20, **SHORT)
+    environment = WorldLineEnv(model=small_world, render_mode="rgb_array", episode_frames=6, **SHORT)
     observed, info = environment.reset(seed=1)
     start = starts[1]
     assert info == {"is_success": False, "episode_id": start.episode_id, "task": start.instruction}
     assert observed["pixels"]["head"].shape == (64, 96, 3)
-    simulation = world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=1)
+    simulation = small_world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=1)
     assert np.array_equal(observed["pixels"]["head"], simulation.pictures[0]["head"])
-    driven = commands(starts, [1], 20)[:, 0]
-    first, block = observed["pixels"]["head"], simulation.step(driven[:16])[0]["head"]
+    driven = commands(starts, [1], 6)[:, 0]
+    first, block = observed["pixels"]["head"], simulation.step(driven[:4])[0]["head"]
     for number, command in enumerate(driven, start=1):
         observed, reward, terminated, truncated, info = environment.step(command)
-        if number < 20:
-            assert np.array_equal(observed["pixels"]["head"], first if number < 16 else block[-1])
-        if number <= 16:
+        if number < 6:
+            assert np.array_equal(observed["pixels"]["head"], first if number < 4 else block[-1])
+        if number <= 4:
             np.testing.assert_allclose(observed["agent_pos"], simulation.states[0, number - 1], atol=1e-6)
-        assert (reward, terminated, truncated) == (0.0, False, number == 20)
+        assert (reward, terminated, truncated) == (0.0, False, number == 6)
     # What was commanded until the end, the last command held.
-    ended = simulation.step(np.concatenate((driven[16:], np.repeat(driven[-1:], 12, axis=0))))[0]["head"][3]
+    ended = simulation.step(np.concatenate((driven[4:], np.repeat(driven[-1:], 2, axis=0))))[0]["head"][1]
     assert np.array_equal(observed["pixels"]["head"], ended)
     assert np.array_equal(environment.render()[:, :96], ended)
     with pytest.raises(DataError, match=r"(?s)episode has ended.*call reset first"):
         environment.step(driven[0])
 
 
-def test_pictures_may_be_asked_for_more_often(world: WorldLine, starts: RecordedStarts) -> None:
-    start, driven = starts[0], commands(starts, [0], 16)[:, 0]
-    simulation = world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=0)
-    environment = WorldLineEnv(model=world, observe_every=8, episode_frames=16, **SHORT)
+def test_pictures_may_be_asked_for_more_often(small_world, starts):
+    start, driven = starts[0], commands(starts, [0], 4)[:, 0]
+    simulation = small_world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=0)
+    environment = WorldLineEnv(model=small_world, observe_every=2, episode_frames=4, **SHORT)
     environment.reset(seed=0)
     seen = [environment.step(command)[0]["pixels"]["head"] for command in driven]
-    foreseen = simulation.copy().step(np.concatenate((driven[:8], np.repeat(driven[7:8], 8, axis=0))))[0]["head"]
-    assert np.array_equal(seen[7], foreseen[7])
-    assert np.array_equal(seen[6], simulation.pictures[0]["head"])
-    assert np.array_equal(seen[14], seen[7])
-    assert np.array_equal(seen[15], simulation.step(driven)[0]["head"][-1])
+    foreseen = simulation.copy().step(np.concatenate((driven[:2], np.repeat(driven[1:2], 2, axis=0))))[0]["head"]
+    assert np.array_equal(seen[1], foreseen[1])
+    assert np.array_equal(seen[0], simulation.pictures[0]["head"])
+    assert np.array_equal(seen[2], seen[1])
+    assert np.array_equal(seen[3], simulation.step(driven)[0]["head"][-1])
 
 
 @pytest.mark.slow
-def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: RecordedStarts) -> None:
+def test_a_batch_is_its_environments_side_by_side(world, starts):
     """Against Gymnasium's own vector environment, to the end of the episodes and the first frame of the next ones."""
     options = {"model": world, "episode_frames": 18, **SHORT}
     succeeds = {starts[1].instruction}
@@ -110,30 +104,30 @@ def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: Reco
     assert [picture.shape for picture in ours.call("render")] == [(64, 3 * 96, 3)] * 2
 
 
-def test_what_cannot_be_seen_is_no_success(world: WorldLine, starts: RecordedStarts) -> None:
+def test_what_cannot_be_seen_is_no_success(small_world, starts):
     for verdict, rewarded in ((None, False), (True, True), (False, False), (np.True_, True)):
-        options: Any = SHORT | {"success": lambda _, v=verdict: v}
-        environment = WorldLineEnv(model=world, episode_frames=1, **options)
+        options = SHORT | {"success": lambda _, v=verdict: v}
+        environment = WorldLineEnv(model=small_world, episode_frames=1, **options)
         environment.reset(seed=0)
         _, reward, terminated, truncated, info = environment.step(commands(starts, [0], 1)[0][0])
         assert (reward, terminated, truncated) == (float(rewarded), rewarded, not rewarded)
         assert info["is_success"] == rewarded
-    environment = WorldLineEnv(model=world, episode_frames=1, **SHORT | {"success": lambda _: "no"})
+    environment = WorldLineEnv(model=small_world, episode_frames=1, **SHORT | {"success": lambda _: "no"})
     environment.reset(seed=0)
     with pytest.raises(DataError, match=r"(?s)Not a judgement.*got: no"):
         environment.step(commands(starts, [0], 1)[0][0])
 
 
-def test_episodes_begin_at_named_frames_with_what_came_before(world, shipped, starts):
+def test_episodes_begin_at_named_frames_with_what_came_before(small_world, shipped, starts):
     """The state is that of the commands so far, the judge sees the whole video, and the episode goes on as it was recorded."""
-    seen: list[Trajectory] = []
+    seen = []
     names, frames = [starts.rows[2].episode_id, starts.rows[0].episode_id], [0, 20]
-    options: Any = {**SHORT, "model": world, "episode_frames": 2, "success": lambda video: seen.append(video)}
+    options = {**SHORT, "model": small_world, "episode_frames": 2, "success": lambda video: seen.append(video)}
     environment = WorldLineVectorEnv(2, **options)
     observed, infos = environment.reset(seed=[3, 4], options={"start": names, "frame": frames})
     assert infos["episode_id"].tolist() == names
     begun = [starts.at(*chosen) for chosen in zip(names, frames, strict=True)]
-    simulation = world.start(
+    simulation = small_world.start(
         [start.images for start in begun], [start.cameras for start in begun], embodiment=ROBOT, seed=[3, 4],
         state=np.stack([start.state for start in begun]), earlier=[start.earlier for start in begun],
     )  # fmt: skip
@@ -143,7 +137,7 @@ def test_episodes_begin_at_named_frames_with_what_came_before(world, shipped, st
         *_, ended, _ = environment.step(simulation.state)
     assert ended.all()
     assert [video.num_frames for video in seen] == [3, 23]
-    recorded = starts.before(begun[1], world.image_size)
+    recorded = starts.before(begun[1], small_world.image_size)
     assert all(np.array_equal(seen[1].frames[view][:20], video) for view, video in recorded.items())
     assert seen[1].points is not None and len(seen[1].points) == 23
     assert np.abs(np.diff(seen[1].points, axis=0)).max() < 12  # an arm moves on, it does not jump
@@ -169,7 +163,7 @@ def test_episodes_begin_at_named_frames_with_what_came_before(world, shipped, st
 
 
 @pytest.mark.parametrize("robot", ["ur5e_silver", "so101", "agibot_g1"])
-def test_normalised_actions_are_the_robots_limits(robot: str) -> None:
+def test_normalised_actions_are_the_robots_limits(robot):
     embodiment = load_embodiment(robot)
     spaces = RobotSpaces(embodiment, ["head"], (4, 6), flat=True, normalised=True)
     limits = np.concatenate([[*arm.limits, sorted((arm.gripper.closed, arm.gripper.open))] for arm in embodiment.arms])
@@ -190,9 +184,9 @@ def test_normalised_actions_are_the_robots_limits(robot: str) -> None:
     RobotSpaces(turning, ["head"], (4, 6), flat=True, normalised=False)
 
 
-def test_normalised_actions_and_flat_observations_change_the_form_alone(world, starts):
-    plain = WorldLineEnv(model=world, episode_frames=2, **SHORT)
-    flat = WorldLineEnv(model=world, episode_frames=2, flat_observation=True, normalised_actions=True, **SHORT)
+def test_normalised_actions_and_flat_observations_change_the_form_alone(small_world, starts):
+    plain = WorldLineEnv(model=small_world, episode_frames=2, **SHORT)
+    flat = WorldLineEnv(model=small_world, episode_frames=2, flat_observation=True, normalised_actions=True, **SHORT)
     for one in (plain, flat):
         one.reset(seed=0)
     for command in commands(starts, [0], 2)[:, 0]:
@@ -201,10 +195,10 @@ def test_normalised_actions_and_flat_observations_change_the_form_alone(world, s
     assert flat.observation_space.contains(given)
     np.testing.assert_allclose(given["agent_pos"], observed["agent_pos"], atol=1e-5)
     for view, picture in observed["pixels"].items():  # float32 shows the last digit of the commands
-        np.testing.assert_allclose(given[view].astype(int), picture, rtol=0, atol=0 if world.bfloat16 else 1)
+        np.testing.assert_allclose(given[view].astype(int), picture, rtol=0, atol=0 if small_world.bfloat16 else 1)
 
 
-def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLine, starts: RecordedStarts) -> None:
+def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world, starts):
     numbers = [0, 3, 4]  # a drawer that is closed, a button that is pressed, one that is not lifted
     environment = WorldLineVectorEnv(3, model=world, episode_frames=32, reward="soft", **SHORT)
     _, infos = environment.reset(seed=numbers)
@@ -224,7 +218,7 @@ def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLin
     assert (later["score"] > 0.8).tolist() == [True, True, False]
     segmenter = shipped_segmenter()
     video = environment._episodes[0].video
-    dark: Any = {view: np.concatenate([frames[:20], 0 * frames[:11]]) for view, frames in video.frames.items()}
+    dark = {view: np.concatenate([frames[:20], 0 * frames[:11]]) for view, frames in video.frames.items()}
     for instruction in ("lift the green drawer", "place the green drawer on the blue pad"):  # hiding gains nothing
         score, facts = soft_score(segmenter, replace(video, instruction=instruction, frames=dark, points=None))
         assert score < 0.1
@@ -234,21 +228,16 @@ def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world: WorldLin
 
 
 @pytest.mark.slow
-def test_a_further_model_bounds_what_one_model_promises(world: WorldLine, shipped: Path) -> None:
+def test_a_further_model_bounds_what_one_model_promises(world, shipped):
     """Two models side by side are the two alone: the lower score, their difference, and a success that both see."""
-    options: dict[str, Any] = {
-        "episode_frames": 32,
-        "embodiment": ROBOT,
-        "reward": "soft",
-        "splits": ("test", "ood_test"),
-    }
+    options = {"episode_frames": 32, "embodiment": ROBOT, "reward": "soft", "splits": ("test", "ood_test")}
     stage2 = WorldLine.from_pretrained(shipped / "models" / "stage2", steps=1)
     given = {"model": world, "members": [stage2]}
     alone = [WorldLineVectorEnv(5, model=model, **options) for model in (world, stage2)]
     doubting = WorldLineVectorEnv(5, **given, largest_disagreement=0.05, **options)
     bounded = WorldLineVectorEnv(5, **given, **options)
     environments = [*alone, doubting, bounded]
-    found: list[Any] = [environment.reset(seed=0)[1] for environment in environments]
+    found = [environment.reset(seed=0)[1] for environment in environments]
     before, rewards = found[3]["score"], np.zeros((2, 5))
     for command in commands(bounded.starts, list(range(5)), 32):
         steps = [environment.step(command) for environment in environments]
@@ -265,7 +254,7 @@ def test_a_further_model_bounds_what_one_model_promises(world: WorldLine, shippe
 
 
 @pytest.mark.slow
-def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> None:
+def test_the_judge_sees_the_outcomes_of_recorded_commands(world):
     """Replayed in the environment, recorded episodes end as they did: all of five but one at least."""
     environment = WorldLineVectorEnv(5, model=world, episode_frames=32, embodiment=ROBOT, splits=("test", "ood_test"))
     recorded = [row.outcome == "success" for row in environment.starts.rows]
@@ -275,8 +264,8 @@ def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> N
     assert (infos["is_success"] == recorded).sum() >= 4
 
 
-def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: RecordedStarts) -> None:
-    environment = WorldLineVectorEnv(2, model=world, **SHORT)
+def test_misuse_is_refused(small_world, shipped, starts):
+    environment = WorldLineVectorEnv(2, model=small_world, **SHORT)
     with pytest.raises(DataError, match="call reset first"):
         environment.step(np.zeros((2, 14)))
     environment.reset(seed=3)
@@ -287,18 +276,18 @@ def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: RecordedStar
     texts, unknown = np.full((2, 14), "1"), np.full((2, 14), None)
     for commands in (texts, unknown, np.zeros((2, 14), complex), np.ones((2, 14), bool), [[1], [1, 2]], "x"):
         with pytest.raises(DataError, match="Not the commands of one step"):
-            environment.step(commands)  # type: ignore[arg-type]
+            environment.step(commands)
     for seed in (-1, 2**63, 1.5, "ab", [1], [1, 2, 3], []):
         with pytest.raises(DataError, match="Not the seeds"):
-            environment.reset(seed=seed)  # type: ignore[arg-type]
+            environment.reset(seed=seed)
     for seed in (np.int64(0), np.array([0, 1]), [0, np.int64(1)]):  # a zero of NumPy counted as no seed
-        _, infos = environment.reset(seed=seed)  # type: ignore[arg-type]
+        _, infos = environment.reset(seed=seed)
         assert infos["episode_id"].tolist() == [starts[number].episode_id for number in (0, 1)]
     for change in ({"num_envs": -1}, {"episode_frames": 2.5}, {"success": "measurd"}, {"reward": "sotf"}):
         with pytest.raises(ConfigError, match="Not an environment"):
-            WorldLineVectorEnv(**{"num_envs": 2, "model": world, **SHORT, **change})
-    with pytest.raises(ConfigError, match=r"(?s)divisor of 16.*observe_every 5"):
-        WorldLineEnv(model=world, observe_every=5, **SHORT)
+            WorldLineVectorEnv(**{"num_envs": 2, "model": small_world, **SHORT, **change})
+    with pytest.raises(ConfigError, match=r"(?s)divisor of 4.*observe_every 5"):
+        WorldLineEnv(model=small_world, observe_every=5, **SHORT)
     for fps, reason in ((8.0, "of another split"), (10.0, "of another rate")):
         found = RecordedStarts(shipped / "recordings", view_sets=[VIEWS], fps=fps, splits=("test",))
         with pytest.raises(DataError, match=rf"(?s)of one robot.*left out.*{reason}"):

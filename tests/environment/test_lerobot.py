@@ -1,22 +1,16 @@
 """LeRobot's own commands, unmodified, inside the simulator: a policy is trained on the shipped recordings, evaluated, and driven as
 on a robot; episodes are recorded by teleoperation."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 
-from worldline_core import WorldLine
 from worldline_core.config import read_yaml, validate
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
@@ -24,7 +18,6 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.rollout.recorded_starts import RecordedStarts
 
 pytest.importorskip("lerobot")
 
@@ -36,7 +29,7 @@ POLICY = (
 
 
 @pytest.fixture(scope="module")
-def lerobot(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+def lerobot(project_root, uv, tmp_path_factory):
     """Runs a command of LeRobot in a folder as a user would, with the wheels of both plug-ins installed and no hub; what it said."""
     built, site = tmp_path_factory.mktemp("wheels"), tmp_path_factory.mktemp("site")
     for name in ("lerobot_env_worldline", "lerobot_robot_worldline"):
@@ -44,17 +37,13 @@ def lerobot(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactor
     installing = (uv, "pip", "install", "-q", "--no-deps", "--python", sys.executable, "--target", site)
     subprocess.run([*installing, *sorted(built.glob("*.whl"))], check=True)
     path = os.pathsep.join([str(project_root), str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
-    settings = {
-        "PYTHONPATH": path,
-        "HF_HUB_OFFLINE": "1",
-        "HF_HOME": str(tmp_path_factory.mktemp("hf")),
-        "OMP_NUM_THREADS": "1",
-    }
+    hub = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path_factory.mktemp("hf"))}
+    settings = {**os.environ, **hub, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
 
-    def run(folder: Path, command: str, *arguments: str) -> str:
+    def run(folder, command, *arguments):
         result = subprocess.run(
             [sys.executable, "-P", "-m", f"lerobot.scripts.{command}", *arguments],
-            cwd=folder, env={**os.environ, **settings}, capture_output=True, text=True, check=False, timeout=400,
+            cwd=folder, env=settings, capture_output=True, text=True, check=False, timeout=400,
         )  # fmt: skip
         assert result.returncode == 0, (result.stdout + result.stderr)[-4000:]
         return result.stdout + result.stderr
@@ -63,7 +52,7 @@ def lerobot(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.fixture(scope="module")
-def policy(lerobot: Callable[..., str], project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def policy(lerobot, project_root, tmp_path_factory):
     """A small ACT policy, trained by LeRobot's training command."""
     if importlib.util.find_spec("accelerate") is None:
         pytest.skip("lerobot-train needs accelerate (the group dev has it)")
@@ -74,6 +63,13 @@ def policy(lerobot: Callable[..., str], project_root: Path, tmp_path_factory: py
         "--steps=20", "--batch_size=4", "--num_workers=0", "--save_freq=20", "--log_freq=10", "--output_dir=out",
     )  # fmt: skip
     return folder / "out" / "checkpoints" / "last" / "pretrained_model"
+
+
+def recorded_by_eval(folder):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    roots = [next((folder / "out" / "recordings").rglob(f"env_{number}")) for number in range(2)]
+    return [LeRobotDataset("eval", root=root) for root in roots]
 
 
 @pytest.mark.slow
@@ -90,11 +86,7 @@ def test_lerobot_eval_runs_a_policy_inside_the_simulator(lerobot, policy, tmp_pa
     if not recording:
         assert len(list((tmp_path / "out" / "videos").rglob("*.mp4"))) == 2
         return
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    for number in range(2):
-        root = next((tmp_path / "out" / "recordings").rglob(f"env_{number}"))
-        written: Any = LeRobotDataset("eval", root=root)
+    for written in recorded_by_eval(tmp_path):
         assert (written.num_episodes, written.num_frames, written.fps) == (1, 16, 8)
         assert {"action", "observation.state", "observation.images.head", "next.success"} <= set(written.features)
 
@@ -109,10 +101,7 @@ def test_lerobot_eval_runs_the_same_policy_in_mujoco(lerobot, policy, starts, tm
     )  # fmt: skip
     report = json.loads((tmp_path / "out" / "eval_info.json").read_text())
     assert report["per_task"][0]["metrics"]["successes"] == [False, False]
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    for number in range(2):
-        written: Any = LeRobotDataset("eval", root=next((tmp_path / "out" / "recordings").rglob(f"env_{number}")))
+    for number, written in enumerate(recorded_by_eval(tmp_path)):
         assert (written.num_episodes, written.num_frames) == (1, 3)
         np.testing.assert_allclose(written[0]["observation.state"], starts[number + 1].state, atol=1e-4)
 
@@ -123,11 +112,11 @@ RECORDED = (
 )  # fmt: skip
 
 
-def check_recorded(world: WorldLine, starts: RecordedStarts, root: Path, *, lossless: bool) -> list[np.ndarray]:
+def check_recorded(world, starts, root, *, lossless):
     """Each of two recorded episodes is a simulation under its commands, which are returned."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    driven, written = [], cast("Any", LeRobotDataset("local/any", root=root))
+    driven, written = [], LeRobotDataset("local/any", root=root)
     assert (written.num_episodes, written.fps, written.meta.robot_type) == (2, 8, "worldline")
     names = [f"{name.replace('/', '_')}.pos" for name in load_embodiment("ur5e_silver").state_names]
     assert written.features["action"]["names"] == written.features["observation.state"]["names"] == names
@@ -158,31 +147,17 @@ def check_recorded(world: WorldLine, starts: RecordedStarts, root: Path, *, loss
     return driven
 
 
-def check_replayed(world: WorldLine, starts: RecordedStarts, root: Path) -> None:
-    for number, commands in enumerate(check_recorded(world, starts, root, lossless=True)):
-        np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
-
-
-REPLAY = (
-    "--robot.type=worldline", "--teleop.type=worldline_replay", "--dataset.repo_id=local/simulated", "--dataset.video=false",
-    *RECORDED,
-)  # fmt: skip
-
-
 @pytest.mark.slow
-def test_lerobot_record_writes_what_recorded_commands_lead_to(lerobot, world, starts, tmp_path):
-    assert "Commands come at" not in lerobot(tmp_path, "lerobot_record", *REPLAY)
-    check_replayed(world, starts, tmp_path / "out")
-
-
-@pytest.mark.slow
-def test_lerobot_record_goes_on_with_a_dataset(lerobot, world, starts, tmp_path):
+def test_lerobot_record_writes_what_recorded_commands_lead_to_and_goes_on(lerobot, world, starts, tmp_path):
     """Another command records the second episode; it begins at the second start."""
     pytest.importorskip("deepdiff", reason="--resume compares features with deepdiff, of LeRobot's core_scripts")
-    asked = [option.replace("num_episodes=2", "num_episodes=1") for option in (*REPLAY, "--robot.dataset_root=out")]
-    lerobot(tmp_path, "lerobot_record", *asked)
+    replay = ("--robot.type=worldline", "--teleop.type=worldline_replay", "--robot.dataset_root=out")
+    written = ("--dataset.repo_id=local/simulated", "--dataset.video=false", *RECORDED)
+    asked = [option.replace("num_episodes=2", "num_episodes=1") for option in (*replay, *written)]
+    assert "Commands come at" not in lerobot(tmp_path, "lerobot_record", *asked)
     lerobot(tmp_path, "lerobot_record", *asked, "--resume=true")
-    check_replayed(world, starts, tmp_path / "out")
+    for number, commands in enumerate(check_recorded(world, starts, tmp_path / "out", lossless=True)):
+        np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
     assert len(list((tmp_path / "out" / "meta" / "cameras").iterdir())) == 2
 
 

@@ -1,13 +1,7 @@
 """The simulator as a robot of LeRobot, and recorded commands as its teleoperator, without LeRobot's commands."""
 
-from __future__ import annotations
-
 import importlib
 import logging
-from collections.abc import Iterator
-from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,29 +11,26 @@ from PIL import Image
 pytest.importorskip("lerobot")
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from worldline_core import WorldLine
 from worldline_core.config import read_yaml
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.sources.calibration_file import read_calibration
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.rollout.recorded_starts import RecordedStarts, read_start
-from worldline_core.rollout.simulation import Simulation
 
 ROBOT = "ur5e_silver"
 
 
 @pytest.fixture(scope="module")
-def plugin(project_root: Path) -> Iterator[ModuleType]:
+def plugin(project_root):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(project_root / "packaging" / "lerobot_robot_worldline")
         yield importlib.import_module("lerobot_robot_worldline")
 
 
 @pytest.fixture
-def robot(plugin: ModuleType, world: WorldLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    monkeypatch.setattr(plugin.robot.WorldLine, "from_pretrained", lambda *_, **__: world)
+def robot(plugin, small_world, tmp_path, monkeypatch):
+    monkeypatch.setattr(plugin.robot.WorldLine, "from_pretrained", lambda *_, **__: small_world)
     made = plugin.WorldLineRobot(plugin.WorldLineRobotConfig(calibration_dir=tmp_path))
     yield made
     if made.is_connected:
@@ -47,20 +38,20 @@ def robot(plugin: ModuleType, world: WorldLine, tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.fixture
-def replay(plugin: ModuleType, tmp_path: Path) -> Iterator[Any]:
+def replay(plugin, tmp_path):
     made = plugin.WorldLineReplay(plugin.WorldLineReplayConfig(calibration_dir=tmp_path))
     made.connect()
     yield made
     made.disconnect()
 
 
-def begun(world: WorldLine, starts: RecordedStarts, seed: int) -> Simulation:
+def begun(world, starts, seed):
     start = starts[seed]
     return world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=seed)
 
 
 @pytest.fixture
-def announcements() -> Iterator[None]:
+def announcements():
     """Messages of every level reach the robot, as LeRobot's commands let them."""
     root = logging.getLogger()
     level = root.level
@@ -69,14 +60,14 @@ def announcements() -> Iterator[None]:
     root.setLevel(level)
 
 
-def test_a_robot_is_driven_as_a_simulation(robot: Any, replay: Any, world: WorldLine, starts: RecordedStarts) -> None:
+def test_a_robot_is_driven_as_a_simulation(robot, replay, small_world, starts):
     assert robot.action_features == replay.action_features
     assert list(robot.action_features)[:2] == ["left_shoulder_pan_joint.pos", "left_shoulder_lift_joint.pos"]
     pictures = dict.fromkeys(VIEWS, (64, 96, 3))
     assert robot.observation_features == {**dict.fromkeys(robot.action_features, float), **pictures}
     robot.connect()
-    simulation = begun(world, starts, 0)
-    before, block = simulation.pictures[0]["head"], starts.commands(0)[:16]
+    simulation = begun(small_world, starts, 0)
+    before, block = simulation.pictures[0]["head"], starts.commands(0)[:4]
     after = simulation.step(block)[0]["head"][-1]
     for number, command in enumerate(block):
         observation = robot.get_observation()
@@ -92,49 +83,46 @@ def test_a_robot_is_driven_as_a_simulation(robot: Any, replay: Any, world: World
     assert np.array_equal(robot.get_observation()["head"], after)
 
 
-def test_a_robot_is_connected_or_not(robot: Any) -> None:
+def test_a_robot_is_connected_or_not(robot):
     for call in (robot.get_observation, robot.disconnect, lambda: robot.send_action({})):
         with pytest.raises(DeviceNotConnectedError, match="not connected"):
             call()
-    assert not robot.is_connected
     robot.connect()
-    assert robot.is_connected
-    assert robot.is_calibrated
+    assert robot.is_connected and robot.is_calibrated
+    handlers = len(logging.getLogger().handlers)
     with pytest.raises(DeviceAlreadyConnectedError, match="already connected"):
         robot.connect()
-    handlers = len(logging.getLogger().handlers)
     robot.disconnect()
-    assert not robot.is_connected
-    assert len(logging.getLogger().handlers) == handlers - 1
+    assert not robot.is_connected and len(logging.getLogger().handlers) == handlers - 1
 
 
-def test_pictures_are_predicted_when_they_are_looked_at(robot: Any, replay: Any) -> None:
+def test_pictures_are_predicted_when_they_are_looked_at(robot, replay):
     """LeRobot sends robots home by hundreds of commands, whose pictures nobody sees."""
     robot.connect()
-    for _ in range(40):
+    for _ in range(10):
         robot.send_action(replay.get_action())
     assert robot._running.simulation.num_frames == 1
     robot.get_observation()
-    assert robot._running.simulation.num_frames == 33
-    assert len(robot._running.commands) == 8
+    assert robot._running.simulation.num_frames == 9
+    assert len(robot._running.commands) == 2
 
 
-def test_pictures_may_be_observed_more_often(plugin, robot, world, starts):
-    robot.config.observe_every = 8
+def test_pictures_may_be_observed_more_often(plugin, robot, small_world, starts):
+    robot.config.observe_every = 2
     robot.connect()
     commands = starts.commands(0)
-    for command in commands[:8]:
+    for command in commands[:2]:
         robot.send_action(robot._columns.named(command))
-    held = np.concatenate((commands[:8], np.repeat(commands[7:8], 8, axis=0)))
-    assert np.array_equal(robot.get_observation()["head"], begun(world, starts, 0).step(held)[0]["head"][7])
+    held = commands[[0, 1, 1, 1]]
+    assert np.array_equal(robot.get_observation()["head"], begun(small_world, starts, 0).step(held)[0]["head"][1])
     robot.disconnect()
-    robot.config.observe_every = 5
-    with pytest.raises(ConfigError, match=r"(?s)observe_every.*divisor of the model's 16.*got: 5"):
+    robot.config.observe_every = 3
+    with pytest.raises(ConfigError, match=r"(?s)observe_every.*divisor of the model's 4 .*got: 3"):
         robot.connect()
     assert not robot.is_connected
 
 
-def test_actions_of_other_robots_are_refused(robot: Any, replay: Any) -> None:
+def test_actions_of_other_robots_are_refused(robot, replay):
     robot.connect()
     action = replay.get_action()
     with pytest.raises(DataError, match=r"missing: left_elbow_joint.pos; unknown: shoulder_pan.pos"):
@@ -150,11 +138,11 @@ def test_actions_of_other_robots_are_refused(robot: Any, replay: Any) -> None:
 
 
 @pytest.mark.usefixtures("announcements")
-def test_episodes_begin_where_lerobot_announces_them(robot, replay, world, starts):
+def test_episodes_begin_where_lerobot_announces_them(robot, replay, small_world, starts):
     robot.connect()
     assert starts.commands(0)[0].tolist() != starts.commands(1)[0].tolist()
     for episode in (0, 1, 1, 0):
-        simulation = begun(world, starts, episode)
+        simulation = begun(small_world, starts, episode)
         logging.info("Recording episode %d", episode)
         observation = robot.get_observation()
         assert np.array_equal(observation["head"], simulation.pictures[0]["head"])
@@ -206,7 +194,7 @@ def test_commands_at_another_rate_are_told(plugin, robot, replay, caplog, monkey
     assert not warned or "at 30 Hz" in found[0]
 
 
-def test_units_and_names_are_those_of_leader_arms(plugin: ModuleType) -> None:
+def test_units_and_names_are_those_of_leader_arms(plugin):
     """LeRobot's SO-101 leader sends these names, degrees, and a gripper of 0 to 100."""
     kinematics = ArmKinematics(load_embodiment("so101"))
     leader = plugin.device.Columns(kinematics, use_degrees=True)
@@ -219,7 +207,7 @@ def test_units_and_names_are_those_of_leader_arms(plugin: ModuleType) -> None:
     np.testing.assert_array_equal(list(plugin.device.Columns(kinematics, use_degrees=False).named(row).values()), row)
 
 
-def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: RecordedStarts, tmp_path: Path) -> None:
+def test_a_robot_begins_at_given_pictures(robot, small_world, starts, tmp_path):
     start, folder, entries = starts[1], tmp_path, {}
     for view, camera in start.cameras.items():
         Image.fromarray(start.images[view]).save(folder / f"{view}.png")
@@ -227,21 +215,12 @@ def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: 
         entries[view] = {"width": width, "height": height, "K": camera.K.tolist(), "T": camera.T_base_camera.tolist()}
         entries[view] |= {"maps": "camera_to_base", "axes": "opencv"}
     (folder / "calibration.yaml").write_text(yaml.safe_dump({"views": entries}))
-    names = load_embodiment(ROBOT).state_names
-    state = dict(zip(names, start.state.tolist(), strict=True))
+    state = dict(zip(load_embodiment(ROBOT).state_names, start.state.tolist(), strict=True))
     (folder / "state.yaml").write_text(yaml.safe_dump(state))
     robot.config.observation, robot.config.seed = str(folder), 1
     robot.connect()
-    simulation = begun(world, starts, 1)
+    simulation = begun(small_world, starts, 1)
     assert np.array_equal(robot.get_observation()["head"], simulation.pictures[0]["head"])
-    for command in starts.commands(1)[:16]:
+    for command in starts.commands(1)[:4]:
         robot.send_action(robot._columns.named(command))
-    assert np.array_equal(robot.get_observation()["head"], simulation.step(starts.commands(1)[:16])[0]["head"][-1])
-    for name, content, said in (
-        ("calibration.yaml", {"views": {"head": entries["head"]}}, r"(?s)each view.*view left_wrist.*got: nothing"),
-        ("left_wrist.png", None, r"(?s)Not a picture to start from.*left_wrist.png"),
-        ("state.yaml", state | {names[0]: "zero"}, r"(?s)Not the robot's state.*left/shoulder_pan_joint"),
-    ):
-        (folder / name).write_text(yaml.safe_dump(content))
-        with pytest.raises(DataError, match=said):
-            read_start(folder, load_embodiment(ROBOT), VIEWS)
+    assert np.array_equal(robot.get_observation()["head"], simulation.step(starts.commands(1)[:4])[0]["head"][-1])

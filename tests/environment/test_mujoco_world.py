@@ -1,15 +1,10 @@
 """MuJoCo's twin of the simulator's environment, and policies compared in both."""
 
-from __future__ import annotations
-
 import json
 import sys
 import warnings
 import weakref
-from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -19,7 +14,6 @@ from gymnasium.utils.env_checker import check_env
 pytest.importorskip("mujoco")
 
 from benchmarks import policies_inside
-from worldline_core import WorldLine
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment import MUJOCO_ENVIRONMENT
@@ -40,14 +34,14 @@ POLICIES = {
 
 
 @pytest.fixture(scope="module")
-def physics() -> Iterator[MujocoEnv]:
+def physics():
     environment = gymnasium.make(MUJOCO_ENVIRONMENT, embodiment=ROBOT, episode_frames=32).unwrapped
     yield environment
     environment.close()
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def compared(tmp_path_factory):
     """Three policies at two starts."""
     folder = tmp_path_factory.mktemp("policies") / "recordings"
     grid = BankGrid(embodiments=(ROBOT,), families=("press",), scenes=("scene_12", "scene_13"), count=2)
@@ -56,7 +50,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def driven(physics: MujocoEnv, number: int, commands: np.ndarray) -> tuple[np.ndarray, bool, dict[str, Any]]:
+def driven(physics, number, commands):
     """States, whether the episode ended in success, and the last information."""
     observed, info = physics.reset(seed=number)
     states, ended = [observed["agent_pos"]], False
@@ -69,7 +63,7 @@ def driven(physics: MujocoEnv, number: int, commands: np.ndarray) -> tuple[np.nd
 
 
 @pytest.mark.slow
-def test_recorded_commands_lead_where_they_led(physics: MujocoEnv, shipped: Path) -> None:
+def test_recorded_commands_lead_where_they_led(physics, shipped):
     """Of every task: the recorded first picture, the same states, the same end; twice, because a start leaves nothing behind."""
     recordings = EpisodeSet.open(shipped / "recordings")
     for number in [*range(len(physics.starts)), 0]:
@@ -106,7 +100,7 @@ def test_both_worlds_begin_alike_at_any_frame_and_score_alike(physics, world, sh
     """In MuJoCo the things have moved as they did when it was recorded; commands are held within the same limits."""
     recordings = EpisodeSet.open(shipped / "recordings")
     name, frame = physics.starts.rows[0].episode_id, 20
-    options: Any = {"start": name, "frame": frame, "reward": "soft", "normalised_actions": True, "observe_every": 2}
+    options = {"start": name, "frame": frame, "reward": "soft", "normalised_actions": True, "observe_every": 2}
     twin = MujocoEnv(embodiment=ROBOT, episode_frames=4, **options)
     inside = WorldLineEnv(embodiment=ROBOT, success=None, episode_frames=4, model=world, **options)
     episode = recordings.episode(recordings.position(name))
@@ -138,7 +132,7 @@ def test_both_worlds_begin_alike_at_any_frame_and_score_alike(physics, world, sh
         with pytest.raises(DataError, match=said):
             twin.reset(options=asked)
     with pytest.raises(ConfigError, match="reward sotf"):
-        MujocoEnv(embodiment=ROBOT, reward="sotf")  # type: ignore[arg-type]
+        MujocoEnv(embodiment=ROBOT, reward="sotf")
     # Software OpenGL needs its renderers back, not when and on which thread the garbage collector comes by.
     renderers = weakref.ref(twin._recorder._renderer)
     del twin, begun, one
@@ -146,13 +140,12 @@ def test_both_worlds_begin_alike_at_any_frame_and_score_alike(physics, world, sh
 
 
 @pytest.mark.slow
-def test_it_is_an_environment_with_the_spaces_of_the_simulator(physics: MujocoEnv, world: WorldLine) -> None:
+def test_it_is_an_environment_with_the_spaces_of_the_simulator(physics, world):
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         check_env(physics)
     assert not [str(one.message) for one in found if "symmetric and normalized space" not in str(one.message)]
-    both: dict[str, Any] = {"flat_observation": True, "normalised_actions": True, "limits": False, "observe_every": 8}
-    options: dict[str, Any]
+    both = {"flat_observation": True, "normalised_actions": True, "limits": False, "observe_every": 8}
     for options in ({"views": VIEWS[::-1]}, both):
         twin = MujocoEnv(embodiment=ROBOT, **options)
         inside = WorldLineEnv(model=world, embodiment=ROBOT, success=None, **options)
@@ -167,10 +160,10 @@ def test_a_start_is_drawn_by_the_policies_in_the_order_of_their_recording(compar
     starts = RecordedStarts(compared, embodiment=ROBOT, splits=("test",), view_sets=[("head",)], fps=8)
     assert len(EpisodeSet.open(compared)) == 6
     assert len({row.bank for row in starts.rows}) == len(starts) == 2  # attempts of one bank are one start
-    drawn: list[list[str]] = []
+    drawn = []
     original = RecordPoliciesConfig.draw
 
-    def draw(config: RecordPoliciesConfig, recorder: Any, spec: Any) -> Any:
+    def draw(config, recorder, spec):
         drawn.append(list(config.policies))
         return original(config, recorder, spec)
 

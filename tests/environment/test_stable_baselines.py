@@ -1,10 +1,7 @@
 """Stable-Baselines3 in both worlds: its checker, its vector environments, and training over a batch."""
 
-from __future__ import annotations
-
 import sys
 import warnings
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,20 +14,19 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from worldline_core import WorldLine
 from worldline_core.environment import ENVIRONMENT, MUJOCO_ENVIRONMENT
 from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.environment.stable_baselines import WorldLineVecEnv
 from worldline_core.errors import UnavailableError
 from worldline_core.rollout.simulation import Session
 
-FORM: dict[str, Any] = {"embodiment": "ur5e_silver", "flat_observation": True, "normalised_actions": True}
+FORM = {"embodiment": "ur5e_silver", "flat_observation": True, "normalised_actions": True}
 
 
 @pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def calls(monkeypatch):
     """How many environments each call of the model stepped."""
-    counts: list[int] = []
+    counts = []
     original = Session.step
     monkeypatch.setattr(Session, "step", lambda one, maps: counts.append(len(maps)) or original(one, maps))
     return counts
@@ -38,8 +34,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [ENVIRONMENT, MUJOCO_ENVIRONMENT])
-def test_its_checker_finds_nothing(world: WorldLine, name: str, request: pytest.FixtureRequest) -> None:
-    options: dict[str, Any] = {"model": world} if name == ENVIRONMENT else {}
+def test_its_checker_finds_nothing(world, name, request):
+    options = {"model": world} if name == ENVIRONMENT else {}
     if name == MUJOCO_ENVIRONMENT:
         request.getfixturevalue("rendering")
     environment = gymnasium.make(name, episode_frames=6, observe_every=2, reward="soft", **FORM, **options)
@@ -51,9 +47,9 @@ def test_its_checker_finds_nothing(world: WorldLine, name: str, request: pytest.
 
 
 @pytest.mark.slow
-def test_a_batch_is_its_own_vector_of_single_environments(world: WorldLine, calls: list[int]) -> None:
+def test_a_batch_is_its_own_vector_of_single_environments(world, calls):
     """To the end of two episodes: observations, rewards, terminal observations, time limits; but one call of the model for all."""
-    options: dict[str, Any] = {"model": world, "episode_frames": 6, "observe_every": 4, "reward": "soft"}
+    options = {"model": world, "episode_frames": 6, "observe_every": 4, "reward": "soft"}
     options["success"] = lambda video: "drawer" in video.instruction
     ours = WorldLineVecEnv(2, **FORM, **options)
     theirs = DummyVecEnv([lambda: WorldLineEnv(**FORM, **options)] * 2)
@@ -89,10 +85,10 @@ def test_a_batch_is_its_own_vector_of_single_environments(world: WorldLine, call
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["PPO", "SAC"])
-def test_training_runs_over_a_batch(world: WorldLine, calls: list[int], kind: str) -> None:
+def test_training_runs_over_a_batch(world, calls, kind):
     """With one call of the model for all environments at each step with new pictures; equal seeds give equal weights."""
 
-    def trained() -> Any:
+    def trained():
         env = VecMonitor(WorldLineVecEnv(
             4, model=world, embodiment="ur5e_silver", reward="soft", success=None, episode_frames=4, observe_every=2,
         ))  # fmt: skip
@@ -109,7 +105,7 @@ def test_training_runs_over_a_batch(world: WorldLine, calls: list[int], kind: st
     assert all(np.array_equal(first[key].numpy(), second[key].numpy()) for key in first)
 
 
-def test_without_it_the_adapter_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_it_the_adapter_says_what_to_install(monkeypatch):
     module = "worldline_core.environment.stable_baselines"
     monkeypatch.delitem(sys.modules, module)
     for name in [name for name in sys.modules if name.startswith("stable_baselines3")]:

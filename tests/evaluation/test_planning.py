@@ -14,7 +14,7 @@ from worldline_core.evaluation.planning import bracket
 from worldline_core.evaluation.planning.closed_loop import ClosedLoopPlanner, Situation, judged, recorded
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
-from worldline_core.rollout.robot import CommandedRobot
+from worldline_core.rollout.simulation import CommandedRobot
 
 
 def load(candidate):

@@ -1,13 +1,10 @@
 """Every example runs as its docstring says, on the shipped recordings, in small."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +20,7 @@ from worldline_core.store.store import ArtifactStore
 pytestmark = pytest.mark.slow
 
 
-def _run(project_root: Path, name: str, *arguments: object, cwd: Path | None = None) -> str:
+def _run(project_root, name, *arguments, cwd=None):
     result = subprocess.run(
         [sys.executable, project_root / "examples" / name, *map(str, arguments)],
         cwd=cwd or project_root, capture_output=True, text=True, check=False,
@@ -32,19 +29,19 @@ def _run(project_root: Path, name: str, *arguments: object, cwd: Path | None = N
     return result.stdout
 
 
-def test_predict_a_video(project_root: Path, tmp_path: Path) -> None:
+def test_predict_a_video(project_root, tmp_path):
     printed = _run(project_root, "predict_video.py", "--frames", 17, "--output", tmp_path / "prediction.mp4")
     assert "17 frames" in printed
     assert decode_video(tmp_path / "prediction.mp4", expected_frames=17).shape == (17, 64, 2 * 96, 3)
 
 
-def test_check_calibration(project_root: Path, tmp_path: Path) -> None:
+def test_check_calibration(project_root, tmp_path):
     printed = _run(project_root, "check_calibration.py", "--episodes", 2, "--output", tmp_path)
     assert "2 episodes: 2 consistent" in printed
     assert (tmp_path / "index.html").is_file()
 
 
-def test_evaluate_videos_of_another_simulator(project_root: Path, tmp_path: Path) -> None:
+def test_evaluate_videos_of_another_simulator(project_root, tmp_path):
     calls = outline(chain, PipelineConfig.load("smoke"))
     store = ArtifactStore(tmp_path / "artifacts")
     for call in (calls["curate"], calls["filter"]):
@@ -59,13 +56,13 @@ def test_evaluate_videos_of_another_simulator(project_root: Path, tmp_path: Path
     assert all(word in printed for word in ("1 episodes", "robot_iou", "psnr@head"))
 
 
-def test_plan_over_a_bank(project_root: Path, tmp_path: Path) -> None:
+def test_plan_over_a_bank(project_root, tmp_path):
     printed = _run(project_root, "plan_over_bank.py", "--candidates", 2, "--artifacts", tmp_path)
     assert "true" in printed
     assert "N =  2: success" in printed
 
 
-def test_train_on_a_lerobot_dataset(project_root: Path, tmp_path: Path) -> None:
+def test_train_on_a_lerobot_dataset(project_root, tmp_path):
     dataset = tmp_path / "dataset"
     shutil.copytree(project_root / "artifacts/shipped/recordings/datasets/viperx_pearl", dataset)
     shutil.rmtree(dataset / "meta" / "worldline")  # what a foreign dataset does not have
@@ -77,7 +74,7 @@ def test_train_on_a_lerobot_dataset(project_root: Path, tmp_path: Path) -> None:
     assert json.loads(trained.read_text())["metrics"]["steps"] == 2
 
 
-def test_practise_a_controller_inside(project_root: Path, tmp_path: Path) -> None:
+def test_practise_a_controller_inside(project_root, tmp_path):
     pytest.importorskip("mujoco")
     recordings = tmp_path / "biased"
     config = "configs/recording/biased_controllers.yaml"

@@ -1,31 +1,26 @@
 """The openpi client against a server that is written here from the protocol's description, with its own array code."""
 
-from __future__ import annotations
-
 import math
 import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 import pytest
 
 msgpack = pytest.importorskip("msgpack")
 
-from websockets.sync.server import ServerConnection, serve
+from websockets.sync.server import serve
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.http_exchange import IncompleteResponseError, exchange
-from worldline_core.policies.messages import pack, unpack
-from worldline_core.policies.openpi import OpenpiPolicy
+from worldline_core.policies.openpi import OpenpiPolicy, pack, unpack
 from worldline_core.serving.client import SimulatorClient
 
 
-def encode(value: Any) -> Any:
+def encode(value):
     """Arrays as openpi's protocol describes them, independently of the project's code."""
     if isinstance(value, dict):
         return {name: encode(each) for name, each in value.items()}
@@ -35,7 +30,7 @@ def encode(value: Any) -> Any:
     return value
 
 
-def decode(value: Any) -> Any:
+def decode(value):
     if isinstance(value, dict) and value.get(b"__ndarray__"):
         return np.ndarray(value[b"shape"], np.dtype(value[b"dtype"]), value[b"data"])
     if isinstance(value, dict):
@@ -44,12 +39,10 @@ def decode(value: Any) -> Any:
 
 
 @contextmanager
-def policy_server(
-    answer: Callable[[dict[str, Any]], Any], *, metadata: object = None, key: str | None = None
-) -> Iterator[str]:
+def policy_server(answer, *, metadata=None, key=None):
     """An openpi policy server: metadata first, a reply for every observation, errors as a text and code 1011."""
 
-    def handle(connection: ServerConnection) -> None:
+    def handle(connection):
         connection.send(msgpack.packb({"name": "scripted"} if metadata is None else metadata))
         for message in connection:
             begin = time.monotonic()
@@ -68,7 +61,7 @@ def policy_server(
             for each in found if isinstance(found, list) else [found]:
                 connection.send(each)
 
-    def check(connection: ServerConnection, request: Any) -> Any:
+    def check(connection, request):
         if key is not None and request.headers.get("Authorization") != f"Api-Key {key}":
             return connection.respond(401, "no\n")
         return None
@@ -81,10 +74,10 @@ def policy_server(
     thread.join(5)
 
 
-def test_many_chunks() -> None:
-    seen: list[dict[str, Any]] = []
+def test_many_chunks():
+    seen = []
 
-    def answer(observation: dict[str, Any]) -> dict[str, Any]:
+    def answer(observation):
         seen.append(observation)
         return {"actions": observation["state"][None] + np.arange(8, dtype=np.float32)[:, None]}
 
@@ -107,11 +100,11 @@ def test_many_chunks() -> None:
         OpenpiPolicy(url, deadline_s=2)
 
 
-def fails(_: dict[str, Any]) -> Any:
+def fails(_):
     raise RuntimeError("no such camera: cam_high; wrong key abc")
 
 
-def actions(array: object) -> Callable[[dict[str, Any]], Any]:
+def actions(array):
     return lambda _: {"actions": array}
 
 
@@ -132,24 +125,24 @@ def actions(array: object) -> Callable[[dict[str, Any]], Any]:
         (actions(np.zeros((1 << 16, 14))), DataError, r"(?s)too large.*1,000,000 bytes"),
     ],
 )
-def test_bad_servers_are_named(answer: Callable[[dict[str, Any]], Any], error: type[Exception], match: str) -> None:
+def test_bad_servers_are_named(answer, error, match):
     given = policy_server(answer)
     with given as url, OpenpiPolicy(url, max_bytes=1_000_000) as policy, pytest.raises(error, match=match):
         policy.infer({"state": np.zeros(3)})
 
 
-def test_a_deadline_is_for_the_whole_exchange() -> None:
+def test_a_deadline_is_for_the_whole_exchange():
     stop = threading.Event()
 
-    def trickle(_: dict[str, Any]) -> Iterator[bytes]:
+    def trickle(_):
         """One reply in fragments that never ends."""
         while not stop.wait(0.05):
             yield b"\x00"
 
     with policy_server(trickle) as url, OpenpiPolicy(url) as policy:
-        begin = time.monotonic()
+        policy.deadline_s, begin = 0.3, time.monotonic()
         with pytest.raises(UnavailableError, match=r"(?s)did not answer in time.*within 0.3 s"):
-            policy.infer({}, deadline_s=0.3)
+            policy.infer({})
         assert time.monotonic() - begin < 2
         stop.set()
         with pytest.raises(UnavailableError, match="closed the connection"):
@@ -159,7 +152,7 @@ def test_a_deadline_is_for_the_whole_exchange() -> None:
 
 
 @pytest.mark.parametrize("client", ["policy", "simulator", "judge"])
-def test_a_deadline_begins_before_names_are_resolved(client: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_deadline_begins_before_names_are_resolved(client, monkeypatch):
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: stop.wait(10))
     stop, begin = threading.Event(), time.monotonic()
     with pytest.raises((UnavailableError, IncompleteResponseError), match=r"within 0\.3 s"):
@@ -172,13 +165,13 @@ def test_a_deadline_begins_before_names_are_resolved(client: str, monkeypatch: p
 
 
 @pytest.mark.parametrize("key", ["abc\r\nX-Evil: 1", "\0", "schl\u00fcssel"])
-def test_a_key_that_no_header_can_carry_is_refused_unseen(key: str) -> None:
+def test_a_key_that_no_header_can_carry_is_refused_unseen(key):
     with pytest.raises(ConfigError, match="The header Authorization cannot be sent") as caught:
         OpenpiPolicy("ws://127.0.0.1:9", api_key=key)
     assert key[:3] not in str(caught.value)
 
 
-def test_a_key_is_sent_without_white_space_and_never_shown(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_key_is_sent_without_white_space_and_never_shown(caplog):
     refused = pytest.raises(UnavailableError, match=r"wrong key \*\*\*")
     with policy_server(fails, key="abc") as url, OpenpiPolicy(url, api_key="abc\r") as policy, refused as caught:
         policy.infer({})
@@ -186,13 +179,13 @@ def test_a_key_is_sent_without_white_space_and_never_shown(caplog: pytest.LogCap
 
 
 @pytest.mark.parametrize("url", ["ws://[half", "ws://127.0.0.1:99999", f"ws://{'a' * 70}", "ws://\ud800", "ws://"])
-def test_an_address_that_is_none_is_named(url: str) -> None:
+def test_an_address_that_is_none_is_named(url):
     with pytest.raises(UnavailableError, match="No server answers"):
         OpenpiPolicy(url, deadline_s=2)
 
 
 @pytest.mark.parametrize("dtype", ["?", "u1", "<i8", ">i4", "<f2", "<f4", "<f8", "S3", "<U5"])
-def test_arrays_come_back_as_they_were(dtype: str) -> None:
+def test_arrays_come_back_as_they_were(dtype):
     values = np.arange(12).reshape(3, 4).astype(dtype)
     given = {"a": values, "t": values.T, "empty": values[:0], "one": values[0, 0], "zero": np.array(values[0, 0])}
     found = unpack(pack(given), "here")
@@ -203,7 +196,7 @@ def test_arrays_come_back_as_they_were(dtype: str) -> None:
     found["a"][0, 0] = found["a"][1, 1]  # a copy, not the message's own bytes
 
 
-def _described(dtype: object = "<f4", shape: object = (2,), data: object = b"\0" * 8) -> bytes:
+def _described(dtype="<f4", shape=(2,), data=b"\0" * 8):
     return msgpack.packb({"x": {b"__ndarray__": True, b"data": data, b"dtype": dtype, b"shape": shape}})
 
 
@@ -221,16 +214,16 @@ def _described(dtype: object = "<f4", shape: object = (2,), data: object = b"\0"
         msgpack.packb({b"__npgeneric__": True, b"dtype": "<f8", b"data": None}),
         _described("(1f4,f4"), _described("(,)f4"), _described("01f4,f4"), _described("(99999999,)f4"), _described("g"),
         b"", b"\xc1", b"\xdf\xff\xff\xff\xff", b"\x91" * 3000, b"\x93\x01", b"\x01\x02", msgpack.packb(msgpack.ExtType(4, b"x")),
-        msgpack.packb([[]] * 65_537), msgpack.packb([{str(n): 1 for n in range(60_000)}] * 18), b"\xdc\xff\xff" + b"\xdc\xff\xff" * 9, b"\x81\xa1a\xa2\xff\xfe",
+        msgpack.packb([[]] * 65_537), msgpack.packb([{str(n): 1 for n in range(60_000)}, *[[0] * 65_000] * 16]), b"\xdc\xff\xff" + b"\xdc\xff\xff" * 9, b"\x81\xa1a\xa2\xff\xfe",
         struct.pack(">BI", 0xC6, 1 << 31),
     ],
 )  # fmt: skip
-def test_hostile_messages_are_refused(content: bytes) -> None:
+def test_hostile_messages_are_refused(content):
     with pytest.raises(DataError, match="A message is not understood"):
         unpack(content, "somebody")
 
 
-def test_what_cannot_be_sent_is_named() -> None:
+def test_what_cannot_be_sent_is_named():
     for wrong in (np.array([object()]), np.zeros(2, "V4"), np.complex64(1), {1, 2}, math, 1 << 70):
         with pytest.raises(DataError, match="cannot be sent"):
             pack({"x": wrong})

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.training.conftest import build_episode, build_tracks, cameras_of
-from worldline_core import Camera
+from worldline_core import Camera, WorldLine
 from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
@@ -16,6 +16,8 @@ from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import fit_patch_tokenizer
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec, MixtureConfig, NativeVectors
+from worldline_core.rollout.rollout import rollout
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.encode_latents import encode_latents
 
@@ -146,6 +148,26 @@ def inputs(tmp_path_factory, make_contract, make_spec):
     return folders | {"checkpoint": root / "causal"}
 
 
+def rolled(config, inputs, output, **changes):
+    """The set of a rollout, and what it counted."""
+    summary = rollout(config.model_copy(update=changes), inputs, output)
+    return RolloutSet.open(output), summary
+
+
+@pytest.fixture(scope="session")
+def shipped(project_root):
+    return project_root / "artifacts" / "shipped"
+
+
+@pytest.fixture(scope="session")
+def small_world(shipped, make_model):
+    """A causal model of random weights with the shipped tokenizer: blocks of one latent frame (four pictures), one Euler step."""
+    given = WorldLine.from_pretrained(shipped / "models" / "causal")
+    model = make_model(latent_channels=32, num_layers=1)
+    spec = CausalSpec(block_size=1, sink_blocks=1, recent_blocks=2, anchor_blocks=None, sigmas=(1.0, 0.0))
+    return WorldLine(model, given.info.model_copy(update={"config": model.config, "causal": spec}), given.tokenizer)
+
+
 ROBOT = "ur5e_silver"
 
 
@@ -175,9 +197,9 @@ class HeldOut:
 
 
 @pytest.fixture(scope="session")
-def held_out(project_root):
+def held_out(shipped):
     """Two recordings of a UR5e pair."""
-    recordings = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
+    recordings = EpisodeSet.open(shipped / "recordings")
     found = [i for i, row in enumerate(recordings.rows) if row.embodiment == ROBOT and row.split == "test"]
     return [
         HeldOut(

@@ -20,7 +20,7 @@ from PIL import Image
 from tests.rollout.conftest import SIZE, recorded, track, write_recordings
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.rollout.ge_sim import tool_band
+from worldline_core.rollout.baselines import tool_band
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -239,7 +239,7 @@ def test_the_tools_are_drawn_where_they_are():
     poses[:, 0, :3, 3], poses[:, 1, :3, 3] = (0.1, 0, 0.5), (0, 0, -0.5)
     tracks = replace(track("a", 0, 2), T_base_tool=poses, gripper=np.full((2, 3, 2), 0.5, np.float32))
     K = np.tile(np.array([[100.0, 0, 200], [0, 100, 150], [0, 0, 1]]), (3, 1, 1))
-    picture = tool_band(tracks, K, (300, 400), 0.15)[1, 0]
+    picture = tool_band(tracks, K, (300, 400))[1, 0]
     # The end link is 0.35 m in front of, and 0.1 m beside the camera.
     radius = int((1 - np.hypot(0.1, 0.35) - 0.07 / 0.73) * 100)
     x, y = 220, 150

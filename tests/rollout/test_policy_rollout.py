@@ -15,7 +15,6 @@ from worldline_core.errors import DataError, UnavailableError
 from worldline_core.rollout.policy_rollout import rollout_policy
 from worldline_core.rollout.rollout_config import PolicyRolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet
-from worldline_core.rollout.worldline import WorldLine
 
 
 def run(inputs, output, act, **changes):
@@ -35,15 +34,16 @@ def test_chunks_are_thinned_queued_and_asked_for_again(inputs, tmp_path):
 
     def act(observation):
         asked.append(observation)
-        return actions(observation)
+        return actions(observation, 40)
 
-    done = run(inputs, tmp_path / "a", act, down_sample=2, length_scale=2.5)
+    inputs = inputs | {"checkpoint": inputs["checkpoint"].parent / "small_blocks"}
+    options = {"down_sample": 2, "length_scale": 1.5}
+    done = run(inputs, tmp_path / "a", act, **options)
     episodes, found = EpisodeSet.open(inputs["episodes"]), RolloutSet.open(tmp_path / "a")
     tests = [row.episode_id for row in episodes.rows if row.split == "test"]
-    length = math.ceil(len(range(0, N, 2)) * 2.5)
-    world = WorldLine.from_pretrained(inputs["checkpoint"], tokenizer=inputs["tokenizer"], bfloat16=False, steps=1)
-    step = world.unit(33)
-    chunks = math.ceil((length - 1) / (40 // step * step))  # of 40 queued actions whole steps are used
+    length = math.ceil(len(range(0, N, 2)) * 1.5)
+    used = 16  # of 20 queued actions, which are two steps of 8 and a rest
+    chunks = math.ceil((length - 1) / used)
     assert (done["episodes"], done["frames"], done["asked"]) == (4, 4 * length, 4 * chunks)
     assert sorted(found.episode_ids) == sorted(tests)
     assert len(asked) == 4 * chunks
@@ -52,14 +52,11 @@ def test_chunks_are_thinned_queued_and_asked_for_again(inputs, tmp_path):
     episode = episodes.episode(episodes.position(tests[0]))
     assert np.allclose(asked[0]["state"], episode.action[0], atol=1e-6)
     assert asked[0]["prompt"] == episode.instruction
-    assert np.allclose(
-        asked[1]["state"] - asked[0]["state"],
-        0.002 * (2 * (40 // step * step) - 1) * (np.arange(14) % 7 < 6),
-        atol=1e-5,
-    )
+    moved = 0.002 * (2 * used - 1) * (np.arange(14) % 7 < 6)
+    assert np.allclose(asked[1]["state"] - asked[0]["state"], moved, atol=1e-5)
     frames = found.frames(tests[0], "right_wrist")
     assert frames.shape == (length, *SIZE, 3)
-    again = run(inputs, tmp_path / "a", lambda _: {}, down_sample=2, length_scale=2.5)  # finished videos are kept
+    again = run(inputs, tmp_path / "a", lambda _: {}, **options)  # finished videos are kept
     assert (again["frames"], again["asked"]) == (4 * length, 0)
 
 
@@ -80,18 +77,10 @@ def test_what_no_robot_can_do_costs_its_recording_alone(inputs, tmp_path):
 @pytest.mark.parametrize(
     ("act", "error", "match"),
     [
-        (
-            lambda observation: actions(observation, 3),
-            DataError,
-            r"do not fit the robot\n.*\n *expected: at least 16 rows",
-        ),
-        (
-            lambda observation: {"actions": np.zeros((80, 7))},
-            DataError,
-            r"(?s)do not fit the robot.*14 columns.*\(80, 7\)",
-        ),
+        (lambda seen: actions(seen, 3), DataError, r"(?s)do not fit the robot.*expected: at least 16 rows"),
+        (lambda _: {"actions": np.zeros((80, 7))}, DataError, r"(?s)do not fit the robot.*14 columns.*\(80, 7\)"),
         (lambda _: None, UnavailableError, "closed the connection"),
-        (lambda observation: {"actions": np.full((80, 14), 100.0)}, DataError, "drove no recording"),
+        (lambda _: {"actions": np.full((80, 14), 100.0)}, DataError, "drove no recording"),
     ],
 )
 def test_a_policy_that_cannot_be_used_ends_the_step(inputs, tmp_path, act, error, match):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from tests.rollout.conftest import NAMES, SIZE, SPEC, N, recorded, write_recordings
+from tests.rollout.conftest import NAMES, SIZE, SPEC, recorded, rolled, write_recordings
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError, UnavailableError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
@@ -33,31 +33,25 @@ from worldline_core.store.artifact_files import digest_folder
 from worldline_core.store.store import ArtifactStore
 from worldline_core.training.processes import join_processes
 
-CONFIG = RolloutConfig(method="causal", batch_size=2, seeds=(42, 43))
+CONFIG = RolloutConfig(method="causal", batch_size=2, seeds=(42, 43), num_frames=17)
+N = CONFIG.num_frames
 
 
 @pytest.fixture(scope="module")
 def predicted(inputs, tmp_path_factory):
-    output = tmp_path_factory.mktemp("predicted")
-    return output, rollout(CONFIG, inputs, output)
+    return rolled(CONFIG, inputs, tmp_path_factory.mktemp("predicted"))
 
 
 def model(inputs, name):
     return inputs | {"checkpoint": inputs["checkpoint"].parent / name}
 
 
-def rolled(config, inputs, output, **changes):
-    rollout(config.model_copy(update=changes), inputs, output)
-    return RolloutSet.open(output)
-
-
 def test_every_chosen_episode_is_predicted_in_every_view_and_seed(predicted):
-    output, summary = predicted
+    rollouts, summary = predicted
     assert summary == {
         "method": "causal", "episodes": 4, "predictions": 8, "frames": 8 * N, "checkpoint_kind": "causal", "steps": 4,
         "found": 5, "kept": 4, "left_out": {"in other splits": 1},
     }  # fmt: skip
-    rollouts = RolloutSet.open(output)
     assert (rollouts.method, rollouts.episode_ids) == ("causal", sorted(NAMES.keys() - {"a-0"}))
     assert (rollouts.seeds("b-1"), set(rollouts.views("b-1"))) == ([42, 43], set(VIEWS))
     one, other = (rollouts.frames("b/0 x", "left_wrist", seed) for seed in (42, 43))
@@ -72,16 +66,15 @@ def speed_of(output):
 
 @pytest.mark.slow
 def test_times_lie_beside_the_predictions_and_outside_their_digest(inputs, predicted, tmp_path):
-    output, _ = predicted
+    output = predicted[0].root
     speed, dtype = speed_of(output), "bfloat16" if CONFIG.bfloat16 else "float32"
     assert speed.items() >= {"steps": 4, "batch_size": 2, "device": "cpu", "dtype": dtype}.items()
     assert speed["frames"] == 6 * N  # the first of four batches of two warms up
     assert speed["seconds_per_frame"] == speed["seconds"] / speed["frames"] > 0
     assert "long_rollout" not in speed
     rolled(CONFIG, inputs, tmp_path, sampler=BlockCausalConfig(timed_blocks=6))
-    long = speed_of(tmp_path)["long_rollout"]
-    assert [len(long[name]) for name in ("block_seconds", "block_processor_seconds")] == [6, 6]
-    assert min(long["block_seconds"]) > 0
+    seconds = speed_of(tmp_path)["long_rollout"]["block_seconds"]
+    assert len(seconds) == 6 and min(seconds) > 0
     assert digest_folder(tmp_path) == digest_folder(output)
     rollout(CONFIG, inputs, output)  # nothing is left to predict
     assert speed_of(output) == speed
@@ -119,7 +112,6 @@ def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(inputs, tmp_p
     assert list(levels) == [1.0, 0.5] * (len(levels) // 2)
     speed = speed_of(tmp_path)
     assert (speed["steps"], len(speed["long_rollout"]["block_seconds"])) == (2, 3)
-    # Other steps can be asked for.
     other = config.model_copy(update={"sampler": BlockCausalConfig(steps=1)})
     assert rollout(other, given, tmp_path / "other")["steps"] == 1
 
@@ -127,14 +119,15 @@ def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(inputs, tmp_p
 def test_controls_matter_and_zero_differs_from_shuffled(inputs, predicted, tmp_path):
     with pytest.raises(DataError, match="too short"):
         rolled(CONFIG, inputs, tmp_path / "short", num_frames=16)
-    seen = {RolloutSet.open(predicted[0]).frames("b-1", "head", 42)[:17].tobytes()}
+    seen = {predicted[0].frames("b-1", "head", 42).tobytes()}
     for actions in ("zero", "shuffled"):
-        found = rolled(CONFIG, inputs, tmp_path / actions, actions=actions, seeds=(42,), num_frames=17)
-        assert found.frames("b-1", "head").shape == (17, *SIZE, 3)
+        found, _ = rolled(
+            CONFIG, inputs, tmp_path / actions, actions=actions, seeds=(42,), embodiments=("aloha_viperx",)
+        )
         seen.add(found.frames("b-1", "head").tobytes())
     film = RolloutConfig(method="film", sampler=FullClipConfig(steps=2), num_frames=5, embodiments=("aloha_viperx",))
     for actions in ("true", "zero", "shuffled"):  # a model with FiLM takes the recording's vectors
-        found = rolled(film, model(inputs, "film"), tmp_path / f"film_{actions}", actions=actions)
+        found, _ = rolled(film, model(inputs, "film"), tmp_path / f"film_{actions}", actions=actions)
         seen.add(found.frames("b-1", "head").tobytes())
     assert len(seen) == 6
 
@@ -142,59 +135,43 @@ def test_controls_matter_and_zero_differs_from_shuffled(inputs, predicted, tmp_p
 @pytest.mark.slow
 def test_compiled_layers_predict_the_same(inputs, tmp_path):
     few = {"bfloat16": False, "seeds": (42,), "embodiments": ("ur5e_pair",)}
-    plain = rolled(CONFIG, inputs, tmp_path / "plain", **few).frames("a-1", "head", 42).astype(int)
+    plain = rolled(CONFIG, inputs, tmp_path / "plain", **few)[0].frames("a-1", "head", 42).astype(int)
     with torch._dynamo.config.patch(recompile_limit=100):
-        compiled = rolled(CONFIG, inputs, tmp_path / "compiled", compile=True, **few).frames("a-1", "head", 42)
+        compiled = rolled(CONFIG, inputs, tmp_path / "compiled", compile=True, **few)[0].frames("a-1", "head", 42)
         assert torch._dynamo.utils.counters["stats"]["unique_graphs"] > 0
     assert np.abs(compiled - plain).max() <= 2
 
 
-def test_copying_needs_no_checkpoint_and_repeats_the_first_frame(inputs, tmp_path):
+def test_copying_needs_only_recordings_and_repeats_the_first_frame(inputs, tmp_path):
     config = RolloutConfig(method="copy", sampler=CopyFirstFrameConfig(), max_episodes_per_embodiment=1)
-    given = {name: path for name, path in inputs.items() if name != "checkpoint"}
-    assert rollout(config, given, tmp_path)["checkpoint_kind"] is None
-    frames = RolloutSet.open(tmp_path).frames("a-1", "head").astype(int)
+    found, summary = rolled(config, {"episodes": inputs["episodes"]}, tmp_path)
+    assert (summary["checkpoint_kind"], found.episode_ids) == (None, ["a-1", "b-1"])
+    frames = found.frames("a-1", "head").astype(int)
     assert np.abs(frames - recorded(1)[0].astype(int)).mean() < 4
     assert np.abs(frames[-1] - frames[0]).max() <= 2
-    assert RolloutSet.open(tmp_path).episode_ids == ["a-1", "b-1"]
 
 
-@pytest.mark.parametrize(
-    "kind", ["copy_first_frame", "text_to_video", pytest.param("stage1", marks=pytest.mark.slow), "film"]
-)
-def test_what_no_camera_is_needed_for_is_predicted_without_tracks(inputs, tmp_path, kind):
+def test_vectors_drive_a_rollout_of_recordings_without_tracks(inputs, tmp_path):
     """Recordings without cameras have no action tracks."""
     made = write_recordings(tmp_path, [("a", "test", 9, VIEWS, ()), ("b", "test", 9, VIEWS, ())])
     given = {"episodes": made["episodes"], "tokenizer": inputs["tokenizer"]}
-    sampler = {"kind": "full_clip" if kind == "film" else "text_to_video", "steps": 1}
-    if kind == "copy_first_frame":
-        sampler, given = {"kind": kind}, {"episodes": made["episodes"]}
-    elif kind == "stage1":
-        base, info = load_checkpoint(model(inputs, "base")["checkpoint"])
-        given["checkpoint"] = tmp_path / "stage1"
-        save_checkpoint(given["checkpoint"], base, kind="stage1", action_contract=None, metadata=info.metadata)
-    else:
-        given |= {"checkpoint": model(inputs, {"text_to_video": "base"}.get(kind, kind))["checkpoint"]}
-    config = RolloutConfig.model_validate({"sampler": sampler, "num_frames": 9, "bfloat16": False})
-    assert rollout(config, given, tmp_path / "out")["predictions"] == 2
-    if kind == "film":
-        for actions in ("shuffled", "delayed"):
-            changed = rolled(config, given, tmp_path / actions, actions=actions)
-            assert not np.array_equal(
-                changed.frames("b", "head"), RolloutSet.open(tmp_path / "out").frames("b", "head")
-            )
-        with pytest.raises(ConfigError, match=r"(?s)drawn from action tracks.*run render_actions"):
-            rollout(config, given | {"checkpoint": model(inputs, "stage2")["checkpoint"]}, tmp_path / "maps")
+    film, stage2 = (given | {"checkpoint": inputs["checkpoint"].parent / name} for name in ("film", "stage2"))
+    config = RolloutConfig(sampler=FullClipConfig(steps=1), num_frames=9, bfloat16=False)
+    seen = {rolled(config, film, tmp_path / actions, actions=actions)[0].frames("b", "head").tobytes()
+            for actions in ("true", "shuffled", "delayed")}  # fmt: skip
+    assert len(seen) == 3
+    with pytest.raises(ConfigError, match=r"(?s)drawn from action tracks.*run render_actions"):
+        rollout(config, stage2, tmp_path / "maps")
 
 
 def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text(inputs, tmp_path):
-    """The paper's first rows: the pretrained backbone, and Stage I."""
+    """The paper's first rows, the pretrained backbone and Stage I; neither needs tracks."""
     sampler = TextToVideoConfig(steps=2)
-    config = RolloutConfig(method="base", sampler=sampler, num_frames=7, embodiments=("aloha_viperx",), bfloat16=False)
-    base = model(inputs, "base")
-    summary = rollout(config, base, tmp_path / "base")
-    assert (summary["checkpoint_kind"], summary["steps"], summary["frames"]) == ("base", 2, 3 * 5)
-    found = RolloutSet.open(tmp_path / "base")
+    few = {"num_frames": 7, "embodiments": ("aloha_viperx",), "max_episodes_per_embodiment": 2, "bfloat16": False}
+    config = RolloutConfig(method="base", sampler=sampler, **few)
+    base = {name: folder for name, folder in model(inputs, "base").items() if name != "tracks"}
+    found, summary = rolled(config, base, tmp_path / "base")
+    assert (summary["checkpoint_kind"], summary["steps"], summary["frames"]) == ("base", 2, 2 * 5)
     reference = found.frames("b-1", "head").astype(int)
     assert (set(found.views("b-1")), reference.shape) == (set(VIEWS), (5, *SIZE, 3))
     # A prediction does not depend on those beside it, but on its text and seed; controls reach nothing.
@@ -202,8 +179,12 @@ def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text
         ("alone", True, {"batch_size": 1}), ("seed", False, {"seeds": (7,)}),
         ("cut", False, {"sampler": TextToVideoConfig(steps=2, text=TextConfig(max_length=2))}),
     ):  # fmt: skip
-        frames = rolled(config, base, tmp_path / name, **change).frames("b-1", "head")
+        frames = rolled(config, base, tmp_path / name, **change)[0].frames("b-1", "head")
         assert (np.abs(frames - reference).max() <= 2) == same, name
+    backbone, info = load_checkpoint(base["checkpoint"])
+    stage1 = base | {"checkpoint": tmp_path / "stage1"}
+    save_checkpoint(stage1["checkpoint"], backbone, kind="stage1", action_contract=None, metadata=info.metadata)
+    assert np.array_equal(rolled(config, stage1, tmp_path / "one")[0].frames("b-1", "head"), reference)
     for folder, message in (
         ("stage2", "wrong kind"), ("silent", "how this model reads text"), ("foreign", "another tokenizer"),
     ):  # fmt: skip
@@ -227,12 +208,8 @@ def test_a_gpu_that_is_not_there_is_named_before_work_begins(inputs, project_roo
 
 def test_models_and_choices_that_do_not_fit_are_refused(inputs, tmp_path):
     own, info = load_checkpoint(inputs["checkpoint"])
-    for name, value in (
-        ("fps", 10.0),
-        ("tokenizer", "0123456789abcdef"),
-        ("sigma_px_ref", 10.0),
-        ("controls", "state"),
-    ):
+    changes = {"fps": 10.0, "tokenizer": "0123456789abcdef", "sigma_px_ref": 10.0, "controls": "state"}
+    for name, value in changes.items():
         contract = info.contract.model_copy(update={name: value})
         save_checkpoint(tmp_path / name, own, kind="causal", action_contract=contract, causal=SPEC)
         with pytest.raises(CheckpointError, match=rf"(?s)action contract differs.*: {name}.*expected:.*{value}"):
@@ -240,10 +217,10 @@ def test_models_and_choices_that_do_not_fit_are_refused(inputs, tmp_path):
     with pytest.raises(DataError, match="No episode to predict"):
         rolled(CONFIG, inputs, tmp_path / "out", splits=("bank",))
     # The whole-clip sampler takes Stage II checkpoints only.
-    config = RolloutConfig(method="stage2", sampler=FullClipConfig(steps=2), embodiments=("ur5e_pair",))
+    config = CONFIG.model_copy(update={"sampler": FullClipConfig(steps=2), "embodiments": ("ur5e_pair",)})
     with pytest.raises(CheckpointError, match="wrong kind"):
         rollout(config, inputs, tmp_path)
-    assert rollout(config, model(inputs, "stage2"), tmp_path)["frames"] == N
+    assert rollout(config, model(inputs, "stage2"), tmp_path)["frames"] == 2 * N
     with pytest.raises(ConfigError, match="lacks inputs"):
         rollout(config, {"episodes": inputs["episodes"]}, tmp_path)
 
@@ -308,21 +285,17 @@ def test_a_small_decoder_shows_the_same_latents_otherwise(inputs, tmp_path):
         SmallDecoder(SmallDecoderConfig.of(tokenizer, name, width=4, depth=1), tokenizer).save(tmp_path / folder)
 
     def config(sampler):
-        return RolloutConfig(num_frames=17, embodiments=("ur5e_pair",), sampler=sampler)
+        return RolloutConfig(num_frames=5 if sampler.steps == 1 else 17, embodiments=("ur5e_pair",), sampler=sampler)
 
-    def rolled(name, checkpoint, sampler):
-        given = inputs | {"checkpoint": inputs["checkpoint"].parent / checkpoint}
-        rollout(config(sampler), given, tmp_path / name)
-        return RolloutSet.open(tmp_path / name).frames("a-1", "head").tobytes()
+    def video(name, checkpoint, sampler):
+        return rolled(config(sampler), model(inputs, checkpoint), tmp_path / name)[0].frames("a-1", "head").tobytes()
 
-    assert rolled("without", "causal", BlockCausalConfig()) != rolled(
-        "causal", "causal", BlockCausalConfig(decoder=own)
-    )
+    assert video("without", "causal", BlockCausalConfig()) != video("causal", "causal", BlockCausalConfig(decoder=own))
     for checkpoint, sampler in (("stage2", FullClipConfig), ("base", TextToVideoConfig)):
-        rolled(checkpoint, checkpoint, sampler(steps=1, decoder=own))
+        video(checkpoint, checkpoint, sampler(steps=1, decoder=own))
     for checkpoint, sampler in (("causal", BlockCausalConfig), ("base", TextToVideoConfig)):
         with pytest.raises(CheckpointError, match="trained for another tokenizer"):
-            rolled("refused", checkpoint, sampler(decoder=tmp_path / "foreign"))
+            video("refused", checkpoint, sampler(decoder=tmp_path / "foreign"))
         assert not (tmp_path / "refused").exists()
     # Its content is part of the key of a rollout.
     samplers, store = (BlockCausalConfig(), BlockCausalConfig(decoder=own)), ArtifactStore(tmp_path / "store")

@@ -60,7 +60,7 @@ def test_whole_clip_sampler_finds_what_the_velocity_points_to():
     first, maps = observation()
     clean = torch.randn(2, 3, 4, 9, 4, 4)
     clean[:, :, :, 0] = first
-    predicted = rollout_full_clip(Oracle(clean), first, maps, noise=Noise([42, 43]), steps=5)  # type: ignore[arg-type]
+    predicted = rollout_full_clip(Oracle(clean), first, maps, noise=Noise([42, 43]), steps=5)
     torch.testing.assert_close(predicted, clean, rtol=1e-4, atol=1e-4)
 
 

@@ -19,12 +19,11 @@ from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.rollout.recorded_starts import RecordedStarts
-from worldline_core.rollout.robot import CommandedRobot
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
-from worldline_core.rollout.simulation import Session
+from worldline_core.rollout.simulation import CommandedRobot, Session
 
 FRAMES = 17
 
@@ -37,9 +36,19 @@ def observed(held_out):
     return replace(held_out[0], cameras=cameras, controls=held_out[0].controls[:FRAMES])
 
 
+@pytest.fixture
+def start(held_out):
+    return held_out[0]
+
+
 @pytest.fixture(scope="module")
-def models(project_root):
-    return project_root / "artifacts" / "shipped" / "models"
+def models(shipped):
+    return shipped / "models"
+
+
+@pytest.fixture(scope="module")
+def causal(models):
+    return WorldLine.from_pretrained(models / "causal")
 
 
 @pytest.mark.parametrize(("kind", "sampler", "steps"), [("causal", "block_causal", None), ("stage2", "full_clip", 1)])
@@ -72,13 +81,20 @@ def test_controls_of_whole_intervals_drive_a_model_that_has_not_learnt_from_them
     assert all(np.abs(before[view].astype(int) - after[view]).max() <= 2 for view in before)
 
 
+def pictures_and_maps(world, observed, steps):
+    """First pictures of every view, and random action maps of some steps."""
+    images = [frames_to_video(observed.images[view][None], world.image_size)[:, 0] for view in world.views]
+    size = (1, len(world.views), world.info.config.control_channels, 1 + world.causal.block_size)
+    generator = torch.Generator().manual_seed(0)
+    maps = [torch.randn(*size, *world.contract.grid_size, generator=generator) for _ in range(steps)]
+    return torch.stack(images)[None], maps
+
+
 def test_weights_in_bfloat16_predict_nearly_the_same(observed, causal, models):
     half = WorldLine.from_pretrained(models / "causal", weights="bfloat16")
     assert half.model.proj_in.weight.dtype == torch.bfloat16
-    images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
-    size = (1, len(causal.views), causal.info.config.control_channels, 1 + causal.causal.block_size)
-    maps = torch.randn(*size, *causal.contract.grid_size, generator=torch.Generator().manual_seed(0))
-    (expected,), (found,) = (line.session(torch.stack(images)[None], [42]).step(maps) for line in (causal, half))
+    images, (maps,) = pictures_and_maps(causal, observed, 1)
+    (expected,), (found,) = (line.session(images, [42]).step(maps) for line in (causal, half))
     for view, frames in expected.items():
         assert np.abs(found[view].astype(int) - frames).mean() < 1
 
@@ -86,15 +102,12 @@ def test_weights_in_bfloat16_predict_nearly_the_same(observed, causal, models):
 @pytest.mark.slow
 @pytest.mark.parametrize("anchor_blocks", [1, None, 2])
 def test_decoding_one_block_while_the_next_is_sampled_changes_nothing(observed, causal, anchor_blocks):
-    images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
-    size = (1, len(causal.views), causal.info.config.control_channels, 1 + causal.causal.block_size)
-    generator = torch.Generator().manual_seed(0)
-    maps = [torch.randn(*size, *causal.contract.grid_size, generator=generator) for _ in range(4)]
+    images, maps = pictures_and_maps(causal, observed, 4)
     spec = causal.causal.model_copy(update={"anchor_blocks": anchor_blocks})
 
     def blocks(*, overlapped):
         sampler = BlockCausalSimulator(causal.model, spec, noise=Noise([42]), views=causal.views)
-        session = Session(sampler, causal.tokenizer, torch.stack(images)[None], device="cpu", bfloat16=False)
+        session = Session(sampler, causal.tokenizer, images, device="cpu", bfloat16=False)
         return [clips[0] for clips in session.steps(maps, overlapped=overlapped)]
 
     for one, other in zip(blocks(overlapped=True), blocks(overlapped=False), strict=True):
@@ -169,26 +182,6 @@ ARMS = load_embodiment(ROBOT)
 GRIPPERS = [ARMS.gripper_column(arm) for arm in ARMS.arms]
 
 
-@pytest.fixture(scope="module")
-def shipped(project_root):
-    return project_root / "artifacts" / "shipped"
-
-
-@pytest.fixture(scope="module")
-def recordings(shipped):
-    return EpisodeSet.open(shipped / "recordings")
-
-
-@pytest.fixture
-def start(held_out):
-    return held_out[0]
-
-
-@pytest.fixture(scope="module")
-def causal(shipped):
-    return WorldLine.from_pretrained(shipped / "models" / "causal")
-
-
 def videos(simulation, controls):
     """All pictures of a simulation that is at its start, driven by ``(b, 1 + steps, j)``; row 0 belongs to the start."""
     pieces = [[{view: picture[None] for view, picture in clip.items()} for clip in simulation.pictures]]
@@ -223,8 +216,9 @@ def test_steps_give_the_bytes_of_a_prediction(causal, start):
     assert equal(videos(start.begin(causal, limits=True), start.controls[None])[0], predicted)
 
 
-def test_a_simulation_begins_in_the_middle_of_a_recording(causal, recordings):
+def test_a_simulation_begins_in_the_middle_of_a_recording(small_world, shipped):
     """The robot is where the earlier commands led it; wrist cameras, known at the first frame, have moved with their arms."""
+    recordings = EpisodeSet.open(shipped / "recordings")
     recorded = RecordedStarts(recordings.root, view_sets=[VIEWS], fps=8.0, embodiment=ROBOT, splits=("test",))
     name = recorded.rows[1].episode_id
     position = recordings.position(name)
@@ -233,36 +227,35 @@ def test_a_simulation_begins_in_the_middle_of_a_recording(causal, recordings):
     start = recorded.at(name, frame)
     assert np.array_equal(start.images["head"], recordings.frames(position, "head", [frame])[0])
     begun = {"embodiment": ROBOT, "state": start.state, "earlier": [start.earlier]}
-    simulation = causal.start(start.images, start.cameras, **begun)
+    simulation = small_world.start(start.images, start.cameras, **begun)
     followed = CommandedRobot(simulation._starts.kinematics, 8.0, commands[:1], limits=False)
     robot, _, states = followed.follow(commands[None, 1 : frame + 1])
     assert np.array_equal(simulation.state, states[:, -1])
     assert np.array_equal(simulation.commands[:, -1], robot.command)
     assert np.abs(simulation.state - robot.command)[:, GRIPPERS].max() > 0.05
     wrists = {view: Camera(camera.K) for view, camera in start.cameras.items() if view != "head"}
-    mounted = causal.start(start.images, start.cameras | wrists, **begun)
+    mounted = small_world.start(start.images, start.cameras | wrists, **begun)
     bare = [arm.model_copy(update={"wrist_camera": None}) for arm in ARMS.arms]
     unknown = ArmKinematics(ARMS.model_copy(update={"arms": tuple(bare)}))
-    solved = causal.start(start.images, start.cameras, **begun | {"embodiment": unknown})
+    solved = small_world.start(start.images, start.cameras, **begun | {"embodiment": unknown})
     for one in (simulation, solved):
         np.testing.assert_allclose(one.tracks[0].uv, mounted.tracks[0].uv, atol=0.2)
-    driven = commands[frame + 1 : frame + 17]
-    driven = np.concatenate((driven, np.repeat(driven[-1:], 16 - len(driven), axis=0)))
+    driven = commands[np.minimum(np.arange(frame + 1, frame + 5), len(commands) - 1)]
     assert equal(simulation.step(driven)[0], mounted.step(driven)[0])
     earlier = {"earlier": [start.earlier[:0], start.earlier]}
-    branch = causal.start([start.images] * 2, [start.cameras] * 2, **begun | earlier)
+    branch = small_world.start([start.images] * 2, [start.cameras] * 2, **begun | earlier)
     assert np.array_equal(branch.state, np.stack((start.state, states[0, -1])))
     for wrong, said in (
         ([start.earlier] * 2, "do not fit together"), ([start.earlier[:, 1:]], "wrong length"),
         ([np.full_like(start.earlier, 90.0)], "limit"),
     ):  # fmt: skip
         with pytest.raises(DataError, match=said):
-            causal.start(start.images, start.cameras, **begun | {"earlier": wrong})
+            small_world.start(start.images, start.cameras, **begun | {"earlier": wrong})
 
 
 @pytest.mark.slow
-def test_stage2_is_stepped_clip_by_clip(shipped, start):
-    folder = shipped / "models" / "stage2"
+def test_stage2_is_stepped_clip_by_clip(models, start):
+    folder = models / "stage2"
     world = WorldLine.from_pretrained(folder, steps=1, clip_frames=17)
     predicted = world.predict(start.images, start.controls, start.cameras, embodiment=ROBOT)
     simulation = start.begin(world)
@@ -288,8 +281,8 @@ def test_clips_of_a_batch_are_those_of_single_simulations(causal, held_out):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("bfloat16", "grey_levels"), [(True, 0), (False, 1)])
-def test_branches_share_their_history_and_equal_separate_rollouts(shipped, start, bfloat16, grey_levels):
-    causal = WorldLine.from_pretrained(shipped / "models" / "causal", bfloat16=bfloat16)
+def test_branches_share_their_history_and_equal_separate_rollouts(models, start, bfloat16, grey_levels):
+    causal = WorldLine.from_pretrained(models / "causal", bfloat16=bfloat16)
     equally = partial(equal, grey_levels=grey_levels)
     shared, own = start.controls[None, 1:17], start.controls[17:33]
     ways = np.stack([own, own[:1] + 0 * own, own + 0.1 * np.linspace(0, 1, 16)[:, None]])
@@ -365,7 +358,7 @@ def test_misuse_is_refused_and_changes_nothing(causal, start):
     for controls, message in (
         (rows[:, :15], r"another shape.*frames 1 to 16.*\(1, 16, 14\).*got: \(1, 15, 14\)"),
         (rows[:, :, :13], r"another shape.*\(1, 16, 13\)"), (np.repeat(rows, 2, axis=0), r"another shape.*\(2, 16, 14\)"),
-        (broken, "not finite.*clip 0, row 3, left/elbow_joint"), (np.degrees(rows + 0.2), beyond), (rows * 100, beyond),
+        (broken, "not finite.*clip 0, frame 3, left/elbow_joint"), (np.degrees(rows + 0.2), beyond), (rows * 100, beyond),
         (rows.astype(complex), beyond), (np.ma.masked_greater(rows, 0.0), beyond),
     ):  # fmt: skip
         with pytest.raises(DataError, match=f"(?s){message}"):

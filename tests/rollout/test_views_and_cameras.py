@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from pydantic import ValidationError
 
-from tests.rollout.conftest import SIZE, N, recorded, write_recordings
+from tests.rollout.conftest import SIZE, N, recorded, rolled, write_recordings
 from worldline_core.actions.episode_tracks import ActionTracks, open_controls, write_index
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import QuarantineRow, read_quarantine, write_quarantine
@@ -30,7 +30,6 @@ from worldline_core.rollout.predictions import plan_predictions
 from worldline_core.rollout.recorded_starts import RecordedStarts, read_start
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import FullClipConfig, RolloutConfig
-from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.serving.play_session import PlaySession
 from worldline_core.serving.serve_config import ServeConfig
@@ -64,25 +63,22 @@ def trained_on(inputs, folder, view_sets, strides=(1,)):
 
 @pytest.fixture(scope="module")
 def predicted(mixed, tmp_path_factory):
-    output = tmp_path_factory.mktemp("predicted")
-    return output, rollout(CONFIG, mixed, output)
+    return rolled(CONFIG, mixed, tmp_path_factory.mktemp("predicted"))
 
 
 def test_every_recording_is_predicted_in_its_views_or_left_out_with_a_reason(predicted):
-    output, summary = predicted
-    rollouts = RolloutSet.open(output)
+    rollouts, summary = predicted
     views = {name: tuple(view for view in VIEWS if view in rollouts.views(name)) for name in rollouts.episode_ids}
     assert views == {"long": VIEWS, "one": HEAD, "three": VIEWS, "two": RIGHT, "uncalibrated-wrist": HEAD}
     assert summary["left_out"] == {"missing_view": 1, "missing_calibration": 1, "too_short": 1}
     assert summary["without_view"] == {"left_wrist": 3, "right_wrist": 2}
-    reasons = {row.episode_id: row.reason for row in read_quarantine(output)}
+    reasons = {row.episode_id: row.reason for row in read_quarantine(rollouts.root)}
     assert reasons == {"no-head": "missing_view", "no-camera": "missing_calibration", "short": "too_short"}
     assert len(views) + len(reasons) == len(EPISODES)
 
 
 def test_a_prediction_does_not_depend_on_whose_views_share_the_run(mixed, predicted, tmp_path):
-    rollout(CONFIG.model_copy(update={"batch_size": 1}), mixed, tmp_path)
-    together, alone = RolloutSet.open(predicted[0]), RolloutSet.open(tmp_path)
+    together, alone = predicted[0], rolled(CONFIG, mixed, tmp_path, batch_size=1)[0]
     for row in together.rows:
         pair = [part.frames(row.episode_id, row.view).astype(int) for part in (together, alone)]
         # Single precision rounds sums of another batch size otherwise, at most by one grey level here.
@@ -91,39 +87,34 @@ def test_a_prediction_does_not_depend_on_whose_views_share_the_run(mixed, predic
 
 
 def test_the_views_that_are_asked_for_are_predicted_alone(mixed, tmp_path):
-    summary = rollout(CONFIG.model_copy(update={"views": ("right_wrist", "head")}), mixed, tmp_path)
-    found = {(row.episode_id, row.view) for row in RolloutSet.open(tmp_path).rows}
-    assert found == {(name, view) for name in ("long", "three", "two") for view in RIGHT}
+    found, summary = rolled(CONFIG, mixed, tmp_path, views=("right_wrist", "head"))
+    assert {(row.episode_id, row.view) for row in found.rows} == {
+        (name, view) for name in ("long", "three", "two") for view in RIGHT
+    }
     assert summary["left_out"] == {"missing_view": 3, "missing_calibration": 1, "too_short": 1}
     for wrong in (("right_wrist",), ("head", "left_wrist"), ("head", "exterior_2"), ()):
         with pytest.raises(DataError, match=r"(?s)on these views together.*rollout\.views.*or head \+ right_wrist or"):
-            rollout(CONFIG.model_copy(update={"views": wrong}), mixed, tmp_path / "wrong")
+            rolled(CONFIG, mixed, tmp_path / "wrong", views=wrong)
     with pytest.raises(DataError, match=r"(?s)No episode can be predicted.*1 left out.*no video of head"):
         rollout(CONFIG, mixed | write_recordings(tmp_path / "none", EPISODES[5:6]), tmp_path / "none" / "out")
 
 
-def test_a_model_trained_on_the_head_alone_predicts_the_head_alone(inputs, mixed, tmp_path):
-    summary = rollout(CONFIG, mixed | {"checkpoint": trained_on(inputs, tmp_path / "head", [HEAD])}, tmp_path / "out")
-    assert {row.view for row in RolloutSet.open(tmp_path / "out").rows} == {"head"}
-    assert "without_view" not in summary
-    world = WorldLine.from_pretrained(tmp_path / "head", tokenizer=inputs["tokenizer"])
-    assert (world.views, world.info.strides) == (HEAD, (1,))
+def test_views_that_were_not_trained_together_are_refused_everywhere(inputs, mixed, tmp_path):
+    """Models of all views, of these and the head alone, and of the head alone: at every door but the rollout step's."""
+    found, summary = rolled(CONFIG, mixed | {"checkpoint": inputs["checkpoint"]}, tmp_path / "out")
+    assert {row.episode_id for row in found.rows} == {"three", "long"}
+    assert summary["left_out"] == {"missing_view": 5, "too_short": 1}
+    head = mixed | {"checkpoint": trained_on(inputs, tmp_path / "one", [HEAD])}
+    found, summary = rolled(CONFIG, head, tmp_path / "out head")
+    assert {row.view for row in found.rows} == {"head"} and "without_view" not in summary
     with pytest.raises(CheckpointError, match=r"trained.view_sets: \['exterior_2'\] are none of the model's views"):
         trained_on(inputs, tmp_path / "other", [("exterior_2",)])
-
-
-def test_views_that_were_not_trained_together_are_refused_everywhere(inputs, mixed, tmp_path):
-    """A model of all views, and one that saw the head alone besides: at every door but the rollout step's."""
-    summary = rollout(CONFIG, mixed | {"checkpoint": inputs["checkpoint"]}, tmp_path / "out")
-    assert {row.episode_id for row in RolloutSet.open(tmp_path / "out").rows} == {"three", "long"}
-    assert summary["left_out"] == {"missing_view": 5, "too_short": 1}
     images = {view: np.zeros((*SIZE, 3), np.uint8) for view in VIEWS}
     camera = Camera(np.array([[40.0, 0, SIZE[1] / 2], [0, 40, SIZE[0] / 2], [0, 0, 1]]), np.eye(4))
-    for name, sets, wrong in (
-        ("all", [VIEWS], HEAD), ("all", [VIEWS], RIGHT), ("both", [VIEWS, HEAD], RIGHT), ("one", [HEAD], VIEWS),
-    ):  # fmt: skip
+    for name, sets, wrong in (("all", [VIEWS], HEAD), ("both", [VIEWS, HEAD], RIGHT), ("one", [HEAD], VIEWS)):
         folder = trained_on(inputs, tmp_path / name, sets)
         world = WorldLine.from_pretrained(folder, tokenizer=inputs["tokenizer"], bfloat16=False)
+        assert (world.views, world.info.strides) == (sets[0], (1,))
         shown, cameras = {view: images[view] for view in wrong}, dict.fromkeys(wrong, camera)
         doors = {
             partial(world.predict, embodiment="ur5e_silver"): (shown, np.zeros((17, 14)), cameras),
@@ -150,16 +141,14 @@ def test_a_view_keeps_its_slot_whichever_others_are_there(inputs):
 
 @pytest.mark.slow
 def test_whole_recordings_are_predicted_to_their_end(mixed, tmp_path):
-    summary = rollout(CONFIG.model_copy(update={"num_frames": "whole", "crf": 0}), mixed, tmp_path)
-    rollouts = RolloutSet.open(tmp_path)
+    rollouts, summary = rolled(CONFIG, mixed, tmp_path, num_frames="whole", crf=0)
     counts = {row.episode_id: row.num_frames for row in rollouts.rows}
     assert counts == {name: n for name, _, n, *_ in EPISODES if name not in ("no-head", "no-camera")}
     assert rollouts.frames("long", "head").shape == (70, *SIZE, 3)
     # 70 = 1 + 5 blocks of 16 less 11; 9 = 1 + 1 block less 8: what lies after the end is cut off, and said.
     assert summary["cut_frames"] == 11 + 8
     assert summary["left_out"] == {"missing_view": 1, "missing_calibration": 1}
-    rollout(CONFIG.model_copy(update={"num_frames": 65, "crf": 0}), mixed, tmp_path / "numbered")
-    shorter = RolloutSet.open(tmp_path / "numbered")
+    shorter, _ = rolled(CONFIG, mixed, tmp_path / "numbered", num_frames=65, crf=0)
     difference = shorter.frames("long", "head").astype(int) - rollouts.frames("long", "head")[:65]
     assert np.abs(difference).max() <= 1  # the same blocks, sampled beside others
 
@@ -193,7 +182,7 @@ def test_stage2_goes_on_where_its_last_clip_ended(mixed, inputs):
     session = world.session(images, [42])
     last = session.step(world.action_maps([tracks], range(0, 17, 4), views=VIEWS))[0]
     again = world.session(pictures(last), [42])
-    again._sampler._noise = session._sampler._noise  # type: ignore[attr-defined]
+    again._sampler._noise = session._sampler._noise
     maps = world.action_maps([tracks], range(16, 33, 4), views=VIEWS)
     assert np.array_equal(again.step(maps)[0]["head"], chained[2])
     with pytest.raises(ValidationError, match=r"clip_frames\n.*1 \+ a multiple of 4"):
@@ -213,7 +202,7 @@ def test_a_causal_rollout_begins_anew_at_its_own_picture_every_few_blocks(mixed,
         assert not np.array_equal(pieces[3][view], free[3][view])
     session = world.session(pictures(pieces[2]), [42])
     for _ in range(2):  # the noise goes on
-        session._sampler.noise.draw((3, world.model.config.latent_channels, 4, *world.contract.grid_size))  # type: ignore[union-attr]
+        session._sampler.noise.draw((3, world.model.config.latent_channels, 4, *world.contract.grid_size))
     for block in (3, 4):
         maps = world.action_maps([tracks], range(16 * (block - 1), 16 * block + 1, 4), views=VIEWS)
         assert np.array_equal(session.step(maps)[0]["head"], pieces[block]["head"])
@@ -224,8 +213,7 @@ def test_strides_are_those_of_the_training(inputs, mixed, tmp_path):
     with pytest.raises(CheckpointError, match=r"(?s)not trained at this stride.*\(1,\).*got: 2"):
         rollout(strided, mixed, tmp_path / "refused")
     model = trained_on(inputs, tmp_path / "model", [VIEWS], (1, 2))
-    rollout(strided.model_copy(update={"crf": 0}), mixed | {"checkpoint": model}, tmp_path / "out")
-    rollouts = RolloutSet.open(tmp_path / "out")
+    rollouts, _ = rolled(strided, mixed | {"checkpoint": model}, tmp_path / "out", crf=0)
     found = rollouts.frames("long", "head").astype(int)
     assert (rollouts.fps, len(found)) == (4.0, 35)
     # Every second control of the recording is what a recording at half the rate would hold.
@@ -321,8 +309,7 @@ def test_a_rollout_takes_maps_where_there_are_cameras_and_vectors_elsewhere(inpu
     config = RolloutConfig.model_validate({"num_frames": 17, "bfloat16": False})
 
     def videos(name, given, **changes):
-        rollout(config.model_copy(update=changes), given, tmp_path / name)
-        found = RolloutSet.open(tmp_path / name)
+        found, _ = rolled(config, given, tmp_path / name, **changes)
         names = [one for one in found.episode_ids if "left_wrist" in found.views(one)]
         return {one: found.frames(one, "left_wrist").tobytes() for one in names}
 
@@ -392,7 +379,8 @@ def test_an_observation_as_files_may_lack_cameras(tmp_path):
     robot = load_embodiment(ROBOT)
     for view, picture in IMAGES.items():
         Image.fromarray(picture).save(tmp_path / f"{view}.png")
-    (tmp_path / "state.yaml").write_text("".join(f"{name}: 0.0\n" for name in robot.state_names))
+    state = dict.fromkeys(robot.state_names, 0.0)
+    (tmp_path / "state.yaml").write_text(json.dumps(state))
     found = read_start(tmp_path, robot, VIEWS, needs_cameras=False)
     assert (set(found.images), found.cameras) == (set(VIEWS), {})
     with pytest.raises(Exception, match=r"calibration\.yaml"):
@@ -408,26 +396,30 @@ def test_an_observation_as_files_may_lack_cameras(tmp_path):
     found = read_start(tmp_path, robot, VIEWS)
     tools = ArmKinematics(robot).tool_poses(found.state[None]).numpy()[0]
     by_view = {arm.camera_view: tool for arm, tool in zip(robot.arms, tools, strict=True)}
-    assert any("wrist" in view for view in VIEWS)
     for view in VIEWS:
         expected = by_view[view] @ mount if "wrist" in view else np.eye(4)
         assert np.allclose(found.cameras[view].T_base_camera, expected, atol=1e-6)
+    for name, content, said in (
+        ("calibration.yaml", {"views": {"head": still}}, r"(?s)each view.*view left_wrist.*got: nothing"),
+        ("left_wrist.png", None, r"(?s)Not a picture to start from.*left_wrist.png"),
+        ("state.yaml", state | {robot.state_names[0]: "zero"}, r"(?s)Not the robot's state.*left/shoulder_pan_joint"),
+    ):
+        (tmp_path / name).write_text(json.dumps(content))
+        with pytest.raises(DataError, match=said):
+            read_start(tmp_path, robot, VIEWS)
 
 
-@pytest.mark.parametrize(
-    ("reason", "known"),
-    [("no_calibration", {"a", "b"}), ("invalid_controls", {"a"}), ("missing_actions", {"a"}), (None, {"a", "b"})],
-)
-def test_what_was_refused_for_its_controls_is_no_vector_either(tmp_path, reason, known):
+def test_what_was_refused_for_its_controls_is_no_vector_either(tmp_path):
     made = write_recordings(tmp_path, [("a", "test", 5, VIEWS, VIEWS), ("b", "test", 5, VIEWS, ())])
     rows = [row for row in ActionTracks.open(made["tracks"]).rows if row["episode_id"] == "a"]
     write_index(made["tracks"], rows, sigma_px_ref=40.0)
-    write_quarantine(made["tracks"], [QuarantineRow("b", "synthetic", reason, "", "{}")] if reason else [])
     episodes = EpisodeSet.open(made["episodes"])
-    tracks = open_controls(made, episodes, vectors=True)
-    assert set(tracks.episode_ids) == known
-    assert tracks.calibrated_views("a") == VIEWS
-    for name in known:
-        native = tracks.tracks(name).native
-        assert native is not None and np.array_equal(native, episodes.episode(episodes.position(name)).action)
+    for reason, known in (("no_calibration", "ab"), ("invalid_controls", "a"), ("missing_actions", "a"), (None, "ab")):
+        write_quarantine(made["tracks"], [QuarantineRow("b", "synthetic", reason, "", "{}")] if reason else [])
+        tracks = open_controls(made, episodes, vectors=True)
+        assert set(tracks.episode_ids) == {*known}, reason
+        assert tracks.calibrated_views("a") == VIEWS
+        for name in known:
+            native = tracks.tracks(name).native
+            assert native is not None and np.array_equal(native, episodes.episode(episodes.position(name)).action)
     assert set(open_controls(made, episodes, vectors=False).episode_ids) == {"a"}

@@ -1,21 +1,17 @@
 """`worldline play`: the page in a headless browser, and its protocol without one."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
 from tests.policies.test_openpi import policy_server
 from worldline_core import WorldLine
@@ -35,13 +31,13 @@ EPISODE = "ur5e_silver-test-s1-00000"
 class Page:
     """A page of a browser, over the DevTools protocol."""
 
-    def __init__(self, connection: ClientConnection) -> None:
+    def __init__(self, connection):
         self._connection, self._count = connection, 0
-        self.messages: list[str] = []
+        self.messages = []
         self.call("Runtime.enable")
         self.call("Log.enable")
 
-    def call(self, method: str, **parameters: object) -> dict[str, Any]:
+    def call(self, method, **parameters):
         self._count += 1
         self._connection.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
         while True:
@@ -52,20 +48,20 @@ class Page:
                 assert "error" not in reply, reply
                 return reply["result"]
 
-    def value(self, expression: str) -> Any:
+    def value(self, expression):
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
-    def until(self, expression: str, seconds: float = 60) -> Any:
+    def until(self, expression, seconds=60):
         deadline = time.monotonic() + seconds
         while not (found := self.value(expression)):
             assert time.monotonic() < deadline, (expression, self.value("document.getElementById('said').textContent"))
             time.sleep(0.05)
         return found
 
-    def key(self, kind: str, key: str) -> None:
+    def key(self, kind, key):
         self.call("Input.dispatchKeyEvent", type=kind, key=key)
 
-    def mouse(self, kind: str, view: str, at: Sequence[float]) -> None:
+    def mouse(self, kind, view, at):
         """An event of the left button at a place in the picture of a view, in shares of its width and height."""
         canvas = f"document.querySelector('canvas[data-view={view}]').getBoundingClientRect()"
         left, top, width, height = self.value(f"(({{x, y, width, height}}) => [x, y, width, height])({canvas})")
@@ -74,7 +70,7 @@ class Page:
 
 
 @contextmanager
-def browser(folder: Path, url: str) -> Iterator[Page]:
+def browser(folder, url):
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no Chromium is here (apt-get install chromium)")
@@ -100,7 +96,7 @@ def browser(folder: Path, url: str) -> Iterator[Page]:
         process.wait(20)
 
 
-def drag_and_steer(page: Page, begin: np.ndarray) -> None:
+def drag_and_steer(page, begin):
     """From the start on: one tool by the mouse, the other by a gamepad, each taking over from a policy that was chosen."""
     page.value("go(0)")
     page.value("document.getElementById('driver').add(new Option('by a policy', 'policy'))")
@@ -140,7 +136,7 @@ def drag_and_steer(page: Page, begin: np.ndarray) -> None:
     assert page.value("wish().grip") == 0
 
 
-def hold_buttons_of_a_phone(page: Page, begin: np.ndarray) -> None:
+def hold_buttons_of_a_phone(page, begin):
     """A finger on a button moves the arm, all buttons are there without scrolling sideways and large enough for a finger."""
     page.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)
     buttons = "[...document.querySelectorAll('#pad button')]"
@@ -162,7 +158,7 @@ def hold_buttons_of_a_phone(page: Page, begin: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, shipped: Path, tmp_path: Path) -> None:
+def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving, shipped, tmp_path):
     world = WorldLine.from_pretrained(shipped / "models" / "causal")
     with (
         serving(world=world, output=tmp_path / "saved") as url,
@@ -204,14 +200,14 @@ def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, s
 class Driver:
     """The page's side of the protocol."""
 
-    def __init__(self, connection: ClientConnection) -> None:
+    def __init__(self, connection):
         self.connection = connection
-        self.marks: dict[str, Any] = {}
+        self.marks = {}
 
-    def tell(self, **message: object) -> None:
+    def tell(self, **message):
         self.connection.send(json.dumps(message))
 
-    def until(self, kind: str) -> dict[str, Any]:
+    def until(self, kind):
         while True:
             found = self.connection.recv(timeout=30)
             if isinstance(found, bytes):
@@ -227,26 +223,26 @@ class Driver:
                 return message
             assert message["type"] != "error", message
 
-    def refused(self, **message: object) -> str:
+    def refused(self, **message):
         self.tell(**message)
         return self.until("error")["what"]
 
-    def block(self, **wish: object) -> dict[str, Any]:
+    def block(self, **wish):
         for _ in range(4):
             self.tell(type="tick", arms=[{}, wish])
         return self.until("block")
 
 
 @contextmanager
-def driving(url: str) -> Iterator[Driver]:
+def driving(url):
     with connect(url + "/play/session", proxy=None, max_size=None) as connection:
         yield Driver(connection)
 
 
-def test_driving_branches_a_policy_and_saving(serving: Callable, tmp_path: Path) -> None:
-    asked: list[dict[str, Any]] = []
+def test_driving_branches_a_policy_and_saving(serving, tmp_path):
+    asked = []
 
-    def act(observation: dict[str, Any]) -> dict[str, Any]:
+    def act(observation):
         asked.append(observation)
         return {"actions": np.repeat(observation["state"][None], 5, axis=0)[:, : 14 if len(asked) < 2 else 3]}
 
@@ -300,17 +296,14 @@ def test_driving_branches_a_policy_and_saving(serving: Callable, tmp_path: Path)
     assert episode.conventions["started_at"] == EPISODE
 
 
-Driven = tuple[PlaySession, Callable[..., Any], list[dict[str, Any]], list[bytes]]
-
-
 @contextmanager
-def in_this_process(world: WorldLine, shipped: Path, output: Path) -> Iterator[Driven]:
+def in_this_process(world, shipped, output):
     """A session without a server: itself, a function that tells it a message, and what it sent."""
     host = SessionHost(world, ServeConfig.model_validate({"episodes": shipped / "recordings", "output": output}))
-    sent: list[dict[str, Any]] = []
-    pictures: list[bytes] = []
+    sent = []
+    pictures = []
 
-    async def send(content: str | bytes) -> None:
+    async def send(content):
         if isinstance(content, bytes):
             head = content[4 : 4 + int.from_bytes(content[:4], "little")]
             pictures.append(content[4 + len(head) :])
@@ -319,7 +312,7 @@ def in_this_process(world: WorldLine, shipped: Path, output: Path) -> Iterator[D
 
     session = PlaySession(host, send)
 
-    async def tell(**message: object) -> None:
+    async def tell(**message):
         await session.receive(json.dumps(message))
 
     yield session, tell, sent, pictures
@@ -328,19 +321,17 @@ def in_this_process(world: WorldLine, shipped: Path, output: Path) -> Iterator[D
 
 
 @pytest.mark.slow
-def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(
-    small_world: WorldLine, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(small_world, shipped, tmp_path, monkeypatch):
     monkeypatch.setattr(play_session, "KEPT_EVERY", 2)
     monkeypatch.setattr(play_session, "KEPT_LAST", 2)
     with in_this_process(small_world, shipped, tmp_path) as (session, tell, sent, pictures):
 
-        async def block() -> None:
+        async def block():
             for _ in range(4):
                 await tell(type="tick", arms=[{}, {"move": [0, 0, 1]}])
             await session._settled()
 
-        async def drive() -> None:
+        async def drive():
             await tell(type="start", episode=EPISODE)
             for _ in range(5):
                 await block()
@@ -359,20 +350,18 @@ def test_a_long_session_keeps_few_simulations_and_goes_back_all_the_same(
 
 
 @pytest.mark.slow
-def test_the_next_block_is_computed_ahead_in_a_session_alone(
-    small_world: WorldLine, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_next_block_is_computed_ahead_in_a_session_alone(small_world, shipped, tmp_path, monkeypatch):
     """Wishes that go on, that change at the last tick, and that change after a way back."""
     up, away = [{}, {"move": [0, 0, 1]}], [{}, {"move": [0, 1, 0]}]
-    steps: list[Simulation] = []
+    steps = []
     step = Simulation.step
     monkeypatch.setattr(Simulation, "step", lambda self, rows: steps.append(self) or step(self, rows))
 
-    def driven(*, alone: bool) -> tuple[list[int], list[bytes]]:
-        counts: list[int] = []
+    def driven(*, alone):
+        counts = []
         with in_this_process(small_world, shipped, tmp_path) as (session, tell, _, pictures):
 
-            async def drive() -> None:
+            async def drive():
                 if not alone:
                     session._host.admit("somebody else")
                 await tell(type="start", episode=EPISODE)
@@ -396,7 +385,7 @@ def test_the_next_block_is_computed_ahead_in_a_session_alone(
     assert ahead[1] == by_request[1]
 
 
-def test_somebody_at_the_page_takes_the_room_of_a_session(serving: Callable) -> None:
+def test_somebody_at_the_page_takes_the_room_of_a_session(serving):
     with serving(max_sessions=1) as url:
         with driving(url) as page:
             for _ in range(2):  # starting again takes no further room

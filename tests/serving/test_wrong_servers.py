@@ -1,24 +1,20 @@
 """The Python client ends with one clear error, whatever answers."""
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 import pytest
 
 msgpack = pytest.importorskip("msgpack")
 
-from websockets.sync.server import ServerConnection, serve
+from websockets.sync.server import serve
 
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.policies.messages import pack
+from worldline_core.policies.openpi import pack
 from worldline_core.serving.client import SimulatorClient
 
 UPGRADE = b"HTTP/1.1 101 S\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -39,10 +35,10 @@ STEPPED = STATE | {"frames": {"head": np.zeros((1, 4, 4, 6, 3), np.uint8)}, "sec
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("hears", [True, False])
-def test_servers_of_something_else(answer: bytes, hears: bool, caplog: pytest.LogCaptureFixture) -> None:
+def test_servers_of_something_else(answer, hears, caplog):
     with socket.create_server(("127.0.0.1", 0)) as listening:
 
-        def once() -> None:
+        def once():
             with listening.accept()[0] as connection:
                 if hears:
                     connection.recv(4096)
@@ -57,7 +53,7 @@ def test_servers_of_something_else(answer: bytes, hears: bool, caplog: pytest.Lo
     assert not [record for record in caplog.records if record.name.startswith(("worldline_core", "websockets"))]
 
 
-def changed(reply: dict[str, Any], **changes: object) -> bytes:
+def changed(reply, **changes):
     return pack({name: value for name, value in (reply | changes).items() if value is not None})
 
 
@@ -79,8 +75,8 @@ def changed(reply: dict[str, Any], **changes: object) -> bytes:
         [pack(METADATA), pack(OPENED)],
     ],
 )  # fmt: skip
-def test_servers_that_answer_otherwise(replies: list[bytes]) -> None:
-    def handle(connection: ServerConnection) -> None:
+def test_servers_that_answer_otherwise(replies):
+    def handle(connection):
         for number, reply in enumerate(replies):
             if number:
                 connection.recv()
@@ -94,17 +90,17 @@ def test_servers_that_answer_otherwise(replies: list[bytes]) -> None:
     "frame",  # a text, one that is no UTF-8, an unknown operation, reserved bits, a message of 2^62 bytes
     [b"\x81\x02hi", b"\x81\x02\xff\xfe", b"\x85\x00", b"\xc2\x01\x80", b"\x82\x7f" + struct.pack("!Q", 1 << 62)],
 )
-def test_frames_that_are_no_messages(frame: bytes) -> None:
+def test_frames_that_are_no_messages(frame):
     refused = pytest.raises((UnavailableError, DataError), match=r"reports an error|closed the connection|too large")
     with answering(lambda connection: connection.socket.sendall(frame)) as url, refused:
         drive(url)
 
 
-def test_a_server_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_takes_nothing_is_given_up(monkeypatch):
     stop = threading.Event()
-    monkeypatch.setattr("worldline_core.policies.messages.CLOSE_S", 0.2)
+    monkeypatch.setattr("worldline_core.policies.openpi.CLOSE_S", 0.2)
 
-    def handle(connection: ServerConnection) -> None:
+    def handle(connection):
         connection.send(pack(METADATA))
         with connection.protocol_mutex:  # without it nothing is read
             stop.wait(10)
@@ -118,13 +114,13 @@ def test_a_server_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch
 
 
 @contextmanager
-def answering(handle: Callable[[ServerConnection], None]) -> Iterator[str]:
+def answering(handle):
     with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
         server.shutdown()
 
 
-def drive(url: str) -> None:
+def drive(url):
     with SimulatorClient(url, deadline_s=5) as client:
         client.start("x").step(np.zeros((1, 4, 14)))

@@ -22,8 +22,14 @@ from worldline_core.config import validate
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.environment.environment import Reward, RunningEpisode, longer, shipped_segmenter
-from worldline_core.environment.spaces import RobotSpaces, each_start
+from worldline_core.environment.environment import (
+    Reward,
+    RobotSpaces,
+    RunningEpisode,
+    each_start,
+    longer,
+    shipped_segmenter,
+)
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.geometry.embodiment import load_embodiment
@@ -43,7 +49,7 @@ from worldline_core.recorder.simulate import (
     read_state,
 )
 from worldline_core.rollout.recorded_starts import RecordedStart, RecordedStarts
-from worldline_core.rollout.robot import CommandedRobot
+from worldline_core.rollout.simulation import CommandedRobot
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.artifact_files import MANIFEST_NAME, read_manifest
 

@@ -147,13 +147,6 @@ class RecordedStarts:
         """``(state size)``: where the robot was at a start, as it was measured."""
         return self._episode(start.episode_id).state[len(start.earlier)]
 
-    def named(self, episode_id: str) -> tuple[EpisodeRow, RecordedStart]:
-        """The recording of this name and its start.
-
-        Raises: DataError when there is none.
-        """
-        return self.row(episode_id), self.at(episode_id)
-
     def row(self, episode_id: str) -> EpisodeRow:
         """The recording of this name.
 

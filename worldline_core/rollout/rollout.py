@@ -7,7 +7,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -25,8 +24,7 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.tokenizers import frames_to_video, require_device
 from worldline_core.processor import processor_name
 from worldline_core.progress import Progress
-from worldline_core.rollout.baselines import FirstFrameCopy, TextToVideo
-from worldline_core.rollout.ge_sim import GeSim, RefusedPredictionError
+from worldline_core.rollout.baselines import FirstFrameCopy, GeSim, RefusedPredictionError, TextToVideo
 from worldline_core.rollout.predictions import Prediction, batches, choose_episodes, plan_predictions
 from worldline_core.rollout.rollout_config import (
     BlockCausalConfig,
@@ -66,7 +64,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     require_device(config.device)
     sampler = config.sampler
     without_model = isinstance(sampler, CopyFirstFrameConfig | GeSimConfig)
-    needed = {"episodes"} | (set() if without_model else {"tokenizer", "checkpoint"})
+    needed = {"episodes"} if without_model else {"episodes", "tokenizer", "checkpoint"}
     if not needed <= inputs.keys():
         raise ConfigError("The rollout lacks inputs", expected=sorted(needed), got=sorted(inputs))
     episodes = EpisodeSet.open(Path(inputs["episodes"]))
@@ -97,9 +95,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
                 "Controls are mirrored as poses, of which there are no control vectors", where="rollout.actions",
                 expected="a model of action maps, with cameras", got=world.info.config.action_conditioning,
             )  # fmt: skip
-        tracks = open_controls(
-            inputs, episodes, vectors=not world.needs_cameras, controls=world.contract.controls
-        )  # fmt: skip
+        tracks = open_controls(inputs, episodes, vectors=not world.needs_cameras, controls=world.contract.controls)
     fps = world.contract.fps if isinstance(world, WorldLine) else rates[0]
     planned, left_out = plan_predictions(config, episodes, tracks, chosen, world, fps)
     if isinstance(world, WorldLine) and tracks is not None:
@@ -144,12 +140,13 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     reasons |= Counter(row.reason for row in left_out)
     lacking = Counter(view for item in planned for view in world.views if view not in item.views)
     account = {"without_view": dict(lacking), "cut_frames": sum(item.sampled - item.frames for item in planned)}
+    kept = len({item.position for item in planned})
     return {
         "method": config.method,
         "found": len(episodes),
-        "kept": len({item.position for item in planned}),
+        "kept": kept,
         "left_out": {name: count for name, count in reasons.items() if count},
-        "episodes": len({item.position for item in planned}),
+        "episodes": kept,
         "predictions": len(planned),
         "frames": sum(item.frames for item in planned),
         "checkpoint_kind": world.info.kind if isinstance(world, WorldLine | TextToVideo) else None,
@@ -202,7 +199,7 @@ def _predicted(
         yield from world.stream(images, batch)
         return
     controls = [cast("ActionTracks", tracks).tracks(item.controls_of) for item in batch]
-    if config.actions == "mirrored" or config.actions == "delayed":
+    if config.actions in ("mirrored", "delayed"):
         controls = [changed_tracks(control, config.actions) for control in controls]
     yield from world.stream(
         images,
@@ -225,7 +222,7 @@ def _write(
         videos = [stack.enter_context(writer.video(item.episode_id, item.seed, item.views, size)) for item in batch]
         while True:
             piece, elapsed = timed(partial(next, pieces, None), device)
-            seconds += elapsed.wall
+            seconds += elapsed
             if piece is None:
                 return seconds
             for add, item, clip in zip(videos, batch, piece, strict=True):
@@ -237,15 +234,13 @@ def _timed_blocks(
     config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks | None, item: Prediction
 ) -> dict[str, list[float]] | None:
     """Seconds of the blocks of one long rollout, where the sampler asks for it."""
-    sampler = config.sampler
-    if not isinstance(world, WorldLine) or not isinstance(sampler, BlockCausalConfig) or tracks is None:
-        return None
-    if not sampler.timed_blocks:
+    blocks = config.sampler.timed_blocks if isinstance(config.sampler, BlockCausalConfig) else 0
+    if not isinstance(world, WorldLine) or tracks is None or not blocks:
         return None
     first = encode_images(world.tokenizer, _observed(world, episodes, [item]).to(config.device))
     index = range(0, world.frames_per_unit + 1, TEMPORAL_FACTOR)
     maps = world.action_maps([tracks.tracks(item.controls_of)], index, views=item.views, by_vector=not config.cameras)
-    return long_rollout(partial(world.simulator, [item.seed], item.views), first, maps, sampler.timed_blocks)
+    return long_rollout(partial(world.simulator, [item.seed], item.views), first, maps, blocks)
 
 
 def _write_speed(
@@ -271,24 +266,16 @@ def _write_speed(
     write_json_atomic(output / "run" / "speed.json", speed | ({} if blocks is None else {"long_rollout": blocks}))
 
 
-@dataclass(frozen=True)
-class Elapsed:
-    """Wall seconds, and processor seconds of all threads, which a busy machine does not stretch."""
+def timed[T](work: Callable[[], T], device: str) -> tuple[T, float]:
+    """Returns the result of ``work`` and its wall seconds; waits for the kernels of the current stream on a GPU."""
 
-    wall: float
-    processor: float
+    def now() -> float:
+        if torch.device(device).type == "cuda":
+            torch.cuda.current_stream(device).synchronize()
+        return time.perf_counter()
 
-
-def timed[T](work: Callable[[], T], device: str) -> tuple[T, Elapsed]:
-    """Returns the result of ``work`` and its time; waits for the kernels of the current stream on a GPU."""
-    on_gpu = torch.device(device).type == "cuda"
-    if on_gpu:
-        torch.cuda.current_stream(device).synchronize()
-    wall, processor = time.perf_counter(), time.process_time()
-    result = work()
-    if on_gpu:
-        torch.cuda.current_stream(device).synchronize()
-    return result, Elapsed(time.perf_counter() - wall, time.process_time() - processor)
+    begin = now()
+    return work(), now() - begin
 
 
 def long_rollout(
@@ -301,17 +288,13 @@ def long_rollout(
     Args:
         first, maps: observed latents ``(b v c h w)`` and the action maps of a clip ``(b v a t h w)``.
     """
-    device = str(maps.device)
-    times: list[Elapsed] = []
+    seconds: list[float] = []
     for count in (2, blocks):
         running = simulator()
         running.start(first, maps[:, :, :, :1])
         controls = maps[:, :, :, -running.spec.block_size :]
-        times = [timed(partial(running.step, controls), device)[1] for _ in range(count)]
-    seconds = {"block_seconds": [block.wall for block in times]}
-    if maps.device.type == "cpu":
-        seconds["block_processor_seconds"] = [block.processor for block in times]
-    return seconds
+        seconds = [timed(partial(running.step, controls), str(maps.device))[1] for _ in range(count)]
+    return {"block_seconds": seconds}
 
 
 def device_name(device: str) -> str:

@@ -96,14 +96,12 @@ class GeSimConfig(StrictModel):
         url: of the server, such as http://127.0.0.1:9000.
         image_size: (H, W) of the pictures that it takes and gives.
         timeout_s: for each whole answer.
-        tool_offset_m: from the end link of an arm to the tool, along its z.
     """
 
     kind: Literal["ge_sim"] = "ge_sim"
     url: str = Field(pattern=r"^https?://[^/\s@]+/?$")
     image_size: ImageSize = (384, 512)
     timeout_s: float = Field(default=300.0, gt=0)
-    tool_offset_m: float = 0.15
 
 
 def _usual_kind(value: object) -> object:

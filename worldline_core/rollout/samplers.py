@@ -71,13 +71,10 @@ class Noise:
 
     def fork(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> Noise:
         """A separate source for these clips: in the same state as this one, or seeded anew."""
-        other = Noise([] if seeds is None else seeds)
-        if seeds is not None:
-            return other
-        for clip in clips:
-            twin = torch.Generator()
-            twin.set_state(self._generators[clip].get_state())
-            other._generators.append(twin)
+        other = Noise([0] * len(clips) if seeds is None else seeds)
+        if seeds is None:
+            for twin, clip in zip(other._generators, clips, strict=True):
+                twin.set_state(self._generators[clip].get_state())
         return other
 
 

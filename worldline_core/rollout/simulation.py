@@ -14,6 +14,7 @@ embodiment's state, h w pixels or latent cells.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
@@ -41,7 +42,6 @@ from worldline_core.rollout.observation import (
     project_controls,
     real_numbers,
 )
-from worldline_core.rollout.robot import CommandedRobot
 from worldline_core.rollout.samplers import BlockCausalSimulator, FullClipSampler
 
 Frames = list[dict[str, np.ndarray]]
@@ -257,6 +257,79 @@ class Starts:
         return other
 
 
+SPEED_RAD_S, SPEED_M_S, GRIPPER_TRAVEL_S = math.pi, 1.0, 0.4
+
+
+class CommandedRobot:
+    """Where robots of one embodiment are that follow commands within their limits, one for each clip.
+
+    A joint's command is clipped to its position limits and to what pi rad/s or 1 m/s reaches in a frame from the command
+    before; a gripper's to its range. These are the *executed* commands. Joints are at every frame where that frame's command
+    wants them; a gripper follows within 0.4 s from open to closed.
+
+    Args:
+        start: (b, j) where they are and what was commanded last, in the embodiment's layout. A limit never moves a robot that
+            began beyond it.
+        limits: hold commands within the embodiment's limits.
+        earlier: commands (n, j) of each clip that were executed since then as they are, whatever the limits.
+
+    Attributes:
+        command, state: (b, j) of the last frame.
+    """
+
+    def __init__(
+        self,
+        kinematics: ArmKinematics,
+        fps: float,
+        start: np.ndarray,
+        *,
+        limits: bool,
+        earlier: Sequence[np.ndarray] = (),
+    ) -> None:
+        embodiment = kinematics.embodiment
+        self._fastest = np.full(start.shape[1], np.inf)
+        self._low, self._high = np.full_like(start, -np.inf), np.full_like(start, np.inf)
+        self._grippers = [embodiment.gripper_column(arm) for arm in embodiment.arms]
+        ranges = np.array([sorted((arm.gripper.closed, arm.gripper.open)) for arm in embodiment.arms])
+        self._gripper_steps = (ranges[:, 1] - ranges[:, 0]) / (GRIPPER_TRAVEL_S * fps)
+        self.command, self.state = start.copy(), start.copy()
+        for clip, commands in enumerate(earlier):
+            if len(commands):
+                moved = self.select([clip]).follow(commands[None])[0]
+                self.command[clip], self.state[clip] = moved.command[0], moved.state[0]
+        if not limits:
+            return
+        for arm, gripper_range in zip(embodiment.arms, ranges, strict=True):
+            columns, gripper = embodiment.joint_columns(arm), embodiment.gripper_column(arm)
+            self._low[:, columns], self._high[:, columns] = np.array(arm.limits).T
+            self._low[:, gripper], self._high[:, gripper] = gripper_range
+            speeds = [SPEED_RAD_S if name in kinematics.revolute else SPEED_M_S for name in arm.joints]
+            self._fastest[columns] = np.array(speeds) / fps
+        self._low, self._high = np.minimum(self._low, self.command), np.maximum(self._high, self.command)
+
+    def follow(self, commands: np.ndarray) -> tuple[CommandedRobot, np.ndarray, np.ndarray]:
+        """The robots after finite commands (b, n, j), executed commands (b, n, j) and states (b, n, j); this one stays."""
+        executed, before = np.empty_like(commands), self.command
+        for frame in range(commands.shape[1]):
+            reachable = np.clip(commands[:, frame], before - self._fastest, before + self._fastest)
+            executed[:, frame] = before = np.clip(reachable, self._low, self._high)
+        states, opening = executed.copy(), self.state[:, self._grippers]
+        for frame in range(commands.shape[1]):
+            wanted = executed[:, frame, self._grippers]
+            opening = np.clip(wanted, opening - self._gripper_steps, opening + self._gripper_steps)
+            states[:, frame, self._grippers] = opening
+        other = copy(self)
+        other.command, other.state = executed[:, -1], states[:, -1]
+        return other, executed, states
+
+    def select(self, clips: Sequence[int]) -> CommandedRobot:
+        """The robots of these clips, in their present state."""
+        other, index = copy(self), list(clips)
+        for name in ("command", "state", "_low", "_high"):
+            setattr(other, name, getattr(self, name)[index])
+        return other
+
+
 class Simulation:
     """A batch of running predictions of one robot, stepped by controls (made by ``WorldLine.start``).
 
@@ -269,7 +342,7 @@ class Simulation:
         num_frames: pictures so far, the observed one with them.
         pictures: last picture of every view, of each clip; at the start the observed one, as the tokenizer shows it.
         commands, states: ``(b, n, j)`` of the last step's frames: what was executed (commands within the limits), and where
-            the robot then is (:mod:`worldline_core.rollout.robot`). At the start those of the observed frame.
+            the robot then is (`CommandedRobot`). At the start those of the observed frame.
     """
 
     def __init__(
@@ -350,8 +423,9 @@ class Simulation:
         is. The history of a causal model is shared, not copied.
 
         Args:
-            seeds: of the noise of each branch from here on, which begins anew even with the clip's own. By default all branches of a clip go on with its noise, so they
-                differ by their controls alone, and each equals a simulation that was driven so from its start.
+            seeds: of the noise of each branch from here on, which begins anew even with the clip's own. By default all
+                branches of a clip go on with its noise, so they differ by their controls alone, and each equals a simulation
+                that was driven so from its start.
 
         Raises:
             DataError: no branch, or another number of seeds.
@@ -397,14 +471,6 @@ class Simulation:
                 where=f"frames {self.num_frames} to {self.num_frames + self.frames_per_step - 1}",
                 expected=f"{wanted}: clips, frames, {', '.join(self.embodiment.state_names)}",
                 got=np.shape(controls),
-            )
-        if not np.isfinite(commands).all():
-            clip, row, column = np.argwhere(~np.isfinite(commands))[0]
-            raise DataError(
-                "A command is not finite",
-                where=f"clip {clip}, row {row}, {self.embodiment.state_names[column]}",
-                expected="finite numbers",
-                got=float(commands[clip, row, column]),
             )
         for clip, rows in enumerate(commands):
             where = f"controls of a step, clip {clip}"

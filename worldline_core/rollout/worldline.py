@@ -15,24 +15,15 @@ from torch import Tensor
 from worldline_core.actions.action_maps import ControlDrawing
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, drawn_size
 from worldline_core.errors import CheckpointError, DataError
-from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
 from worldline_core.model.pretrained import load_model_tokenizer, pretrained_folder
 from worldline_core.model.small_decoder import SmallDecoder
-from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video, require_device
+from worldline_core.model.tokenizers import VideoTokenizer, require_device
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import match_views
 from worldline_core.processor import bfloat16_by_default
-from worldline_core.rollout.observation import (
-    Camera,
-    check_controls,
-    checked_seeds,
-    image_size,
-    project_controls,
-    real_numbers,
-    require_drivable,
-)
+from worldline_core.rollout.observation import Camera, check_controls, real_numbers, require_drivable
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts
 from worldline_core.store.artifact_files import verify_artifact
@@ -180,15 +171,11 @@ class WorldLine:
                 "The model predicts one observed frame and whole units", expected=f"1 + k * {unit} rows of controls",
                 got=len(rows), next_step=f"give {1 + max(1, (len(rows) - 1) // unit) * unit} rows",
             )  # fmt: skip
-        kinematics = ArmKinematics(load_embodiment(embodiment))
-        require_drivable(self.info, views, cameras, kinematics.embodiment.name)
-        check_controls(kinematics, rows, "controls")
-        seeds = checked_seeds(seed, 1)
-        tracks = project_controls(
-            cameras, image_size(images, cameras), kinematics, controls=rows, fps=self.contract.fps
-        )
-        first = torch.stack([frames_to_video(images[view][None], self.image_size)[:, 0] for view in views])
-        pieces = [clips[0] for clips in self.stream(first[None], [tracks], tracks.num_frames, seeds, views=views)]
+        starts = Starts(images, cameras, embodiment, rows[0], seed)
+        require_drivable(self.info, views, cameras, starts.kinematics.embodiment.name)
+        check_controls(starts.kinematics, rows, "controls")
+        tracks, first = starts.project(0, rows, self.contract.fps), starts.pictures(views, self.image_size)
+        pieces = [clips[0] for clips in self.stream(first, [tracks], len(rows), starts.seeds, views=views)]
         return {view: np.concatenate([piece[view] for piece in pieces]) for view in views}
 
     def start(

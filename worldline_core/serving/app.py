@@ -30,7 +30,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.pages.page import render
-from worldline_core.policies.messages import pack, unpack
+from worldline_core.policies.openpi import pack, unpack
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.serving.play_session import PlaySession
 from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig, is_loopback
@@ -258,7 +258,9 @@ def make_server(world: WorldLine, config: ServeConfig, token: str | None) -> uvi
     host = SessionHost(world, config)
     host.warm_up()
     settings = uvicorn.Config(
-        make_app(host, token), config.host, config.port, http=patient_http(2 * config.max_connections, TAKE_S), ws=QuietWebSocket, ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
-        timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning", server_header=False,
+        make_app(host, token), config.host, config.port, http=patient_http(2 * config.max_connections, TAKE_S),
+        ws=QuietWebSocket, ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0,
+        ws_ping_timeout=20.0, timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning",
+        server_header=False,
     )  # fmt: skip
     return uvicorn.Server(settings)

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.policies.messages import MAX_MESSAGE_BYTES, MessageSocket
+from worldline_core.policies.openpi import MAX_MESSAGE_BYTES, MessageSocket
 from worldline_core.serving.serve_config import PROTOCOL
 
 

@@ -211,7 +211,10 @@ class PlaySession:
         await self._settled()
         self._hand = None
         seed = message.seed
-        self._row, self._start = row, start = await self._host.compute(lambda: self._host.starts.named(message.episode))
+        recorded = self._host.starts
+        self._row, self._start = row, start = await self._host.compute(
+            lambda: (recorded.row(message.episode), recorded.at(message.episode))
+        )
         simulation = await self._host.compute(lambda: self._host.simulate(message.episode, [seed]))
         kinematics = self._host.kinematics.get(row.embodiment)
         hand = await asyncio.to_thread(Teleoperation, start, kinematics, simulation.fps)
@@ -245,7 +248,8 @@ class PlaySession:
         self._pending.append(hand.command)
         await self._send_marks(hand)
         if len(self._pending) >= size and self._working is None:
-            self._work(self._predict(self._taken(size), BY_HAND))
+            rows, self._pending = np.stack(self._pending[:size]), self._pending[size:]
+            self._work(self._predict(rows, BY_HAND))
         elif self._working is None:
             self._compute_ahead(hand, message.arms, size)
 
@@ -275,11 +279,6 @@ class PlaySession:
     def _forget_commands(self) -> None:
         self._pending.clear()
         self._ahead = None
-
-    def _taken(self, size: int) -> np.ndarray:
-        rows = np.stack(self._pending[:size])
-        del self._pending[:size]
-        return rows
 
     async def _send_marks(self, hand: Teleoperation) -> None:
         await self._send(json.dumps({"type": "marks", "pending": len(self._pending), **hand.marks()}))

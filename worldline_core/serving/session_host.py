@@ -22,15 +22,12 @@ from worldline_core.geometry.embodiment import check_embodiment_name
 from worldline_core.geometry.kinematics import KinematicsByName
 from worldline_core.rollout.observation import Camera
 from worldline_core.rollout.recorded_starts import RecordedStarts
-from worldline_core.rollout.simulation import Simulation
+from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Simulation
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.serving.serve_config import PROTOCOL, ServeConfig
 from worldline_core.untrusted_text import shown
 
-LARGEST_SEED = 2**63 - 1
-
-
-Seed = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 def _numbers(values: np.ndarray) -> np.ndarray:
@@ -134,8 +131,7 @@ class SessionHost:
 
         Raises: DataError when there is no such recording.
         """
-        row, start = self.starts.named(episode_id)
-        count = len(seeds)
+        row, start, count = self.starts.row(episode_id), self.starts.at(episode_id), len(seeds)
         return self.world.start(
             [start.images] * count, [start.cameras] * count, embodiment=self.kinematics.get(row.embodiment),
             state=np.repeat(start.state[None], count, axis=0), seed=list(seeds),
@@ -153,13 +149,8 @@ class SessionHost:
             "frames_per_step": world.frames_per_unit if world.causal is not None else None,
             "image_size": list(world.image_size),
             "episodes": [
-                {
-                    "id": row.episode_id,
-                    "embodiment": row.embodiment,
-                    "task": row.task_family,
-                    "instruction": row.instruction,
-                }
-                for row in rows
+                {"id": r.episode_id, "embodiment": r.embodiment, "task": r.task_family, "instruction": r.instruction}
+                for r in rows
             ],
             "policies": list(self.config.policies),
         }
@@ -201,18 +192,12 @@ class SessionHost:
         return {"closed": True}
 
     def _start(self, request: StartRequest) -> Simulation:
-        given = {
-            "images": request.images,
-            "cameras": request.cameras,
-            "embodiment": request.embodiment,
-            "state": request.state,
-        }
-        present = [name for name, value in given.items() if value is not None]
-        whole = {*present, "cameras"} == given.keys()  # what lacks a camera, the model says
-        if (request.episode is not None) == bool(present) or (present and not whole):
+        given = ("images", "cameras", "embodiment", "state")
+        present = {name for name in (*given, "episode") if getattr(request, name) is not None}
+        if present != {"episode"} and present | {"cameras"} != {*given}:  # what lacks a camera, the model says
             raise DataError(
                 "A session starts at a recording, or at an observation", expected=f"episode, or {', '.join(given)}",
-                got=", ".join([*present, *(["episode"] if request.episode is not None else [])]) or "neither",
+                got=", ".join(name for name in (*given, "episode") if name in present) or "neither",
             )  # fmt: skip
         if request.episode is not None:
             return self.simulate(request.episode, request.seeds)
@@ -229,7 +214,7 @@ class SessionHost:
     def _check_room(self, owner: object, clips: int) -> None:
         """Raises: UnavailableError when so many more clips exceed a limit; DataError when one session's own do."""
         config = self.config
-        frames = self.world.frames_per_unit if self.world.causal is not None else self.world.unit(33)
+        frames = self.world.unit(USUAL_CLIP_FRAMES)
         size = clips * frames * len(self.world.views) * 3 * int(np.prod(self.world.image_size))
         if size > 0.9 * config.max_message_bytes or clips > config.max_clips:
             raise DataError(
@@ -305,12 +290,7 @@ def _parsed(message: object) -> Request:
 
 
 def _state_of(simulation: Simulation) -> dict[str, Any]:
-    return {
-        "num_frames": simulation.num_frames,
-        "states": simulation.states,
-        "commands": simulation.commands,
-        "tool_poses": simulation.tool_poses,
-    }
+    return {name: getattr(simulation, name) for name in ("num_frames", "states", "commands", "tool_poses")}
 
 
 def _pictures_of(simulation: Simulation) -> dict[str, np.ndarray]:

@@ -1,7 +1,8 @@
 """From what a person does with keys, a gamepad or a mouse to commands of all joints, and to marks over the pictures.
 
-Wishes are in the head camera's terms (the base's, where no camera is known), level with the ground: to its right, away from it, up. They move a wanted pose of each tool,
-which inverse kinematics follows within the joint limits; a pose that cannot be reached is drawn back to what was reached.
+Wishes are in the head camera's terms (the base's, where no camera is known), level with the ground: to its right, away from it,
+up. They move a wanted pose of each tool, which inverse kinematics follows within the joint limits; a pose that cannot be reached
+is drawn back to what was reached.
 """
 
 from __future__ import annotations

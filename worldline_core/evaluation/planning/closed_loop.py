@@ -23,8 +23,7 @@ from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.tokenizers import frames_to_video, video_to_frames
 from worldline_core.rollout.observation import Camera, image_size, project_controls
-from worldline_core.rollout.robot import CommandedRobot
-from worldline_core.rollout.simulation import Simulation
+from worldline_core.rollout.simulation import CommandedRobot, Simulation
 from worldline_core.rollout.worldline import WorldLine
 
 Sequences = Float[np.ndarray, "k n j"]
