@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.embodiment_report import random_states
-from worldline_core.geometry.inverse_kinematics import InverseKinematics
-from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.kinematics import ArmKinematics, InverseKinematics
 from worldline_core.geometry.transforms import rotation_about_axis, rotation_angle
 
 ROBOTS = ("ur5e_pair", "xarm7_pair", "aloha_viperx", "panda_pair", "yam_station", "agibot_g1", "kinova_gen3")
