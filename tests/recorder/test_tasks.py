@@ -19,10 +19,9 @@ from worldline_core.recorder.attempts import SEALED_FILE, BankSpec, RecordBanksC
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.looks import SCENES, look_of
-from worldline_core.recorder.outcomes import LIFTED, outcome
 from worldline_core.recorder.record import RecordGroup
-from worldline_core.recorder.scene import CONTACT, TASKS, Layout, apply_layout, sample_layout
-from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, draw_layout
+from worldline_core.recorder.scene import CONTACT, LIFTED, TASKS, Layout, apply_layout, sample_layout
+from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, draw_layout, outcome
 
 
 @pytest.fixture(scope="module")

@@ -211,8 +211,8 @@ PLATE_TOP = 0.024
 # A tray with a handle near each end, as wide as a block: one for each arm. Its ends lie along its own y.
 TRAY_HALF, HANDLE_HALF, HANDLE_APART = (0.048, 0.150, 0.010), (0.028, 0.028, 0.050), 0.115
 HANDLES = {"left": HANDLE_APART, "right": -HANDLE_APART}
-# A button that is down by more than this share of its travel is pressed.
-BUTTON_DOWN = 0.5
+# A button that is down by more than this share of its travel is pressed; a thing that is so much higher [m] is lifted.
+BUTTON_DOWN, LIFTED = 0.5, 0.07
 HouseholdFamily = Literal["lift", "place", "close", "press", "carry"]
 ContactFamily = Literal["grip", "balance", "topple", "detour", "peg", "stack", "roll", "both", "level"]
 Family = HouseholdFamily | ContactFamily
