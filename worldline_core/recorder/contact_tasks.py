@@ -147,17 +147,6 @@ def apply_contact_layout(scene: SceneModel, data: Any, layout: Layout) -> None:
                 model.body_pos[body], model.body_quat[body] = place, turn
 
 
-def solid_labels(scene: SceneModel, layout: Layout) -> np.ndarray:
-    """uint8 (number of geoms,) as of `scene.thing_labels`."""
-    labels = np.zeros(scene.model.ngeom, np.uint8)
-    others = 3
-    for name, thing in layout.named():
-        label = 1 if thing is layout.target else 2 if thing is layout.goal else others
-        others += label > 2
-        labels[scene.model.geom_bodyid == scene.model.body(name).id] = label
-    return labels
-
-
 Judged = tuple[str, dict[str, float]]
 # A thing that leans by more has fallen [rad].
 FALLEN = 0.35

@@ -471,7 +471,7 @@ def apply_layout(scene: SceneModel, data: Any, layout: Layout) -> None:
 def thing_labels(scene: SceneModel, layout: Layout) -> np.ndarray:
     """uint8 (number of geoms,): 1 for those of the target, 2 of the goal, 3.. of the others, 0 for the rest.
 
-    Of a drawer only what slides belongs to it; a button's plate belongs to it, because it lights up.
+    Of a drawer only what slides belongs to it; all of any other thing does, also a button's plate, because it lights up.
     """
     labels = np.zeros(scene.model.ngeom, np.uint8)
     others = 3
@@ -479,8 +479,8 @@ def thing_labels(scene: SceneModel, layout: Layout) -> np.ndarray:
         label = 1 if thing is layout.target else 2 if thing is layout.goal else others
         others += label > 2
         labels[scene.model.geom(name).id] = label
-        for part in {"button": ("plate",), "tray": tuple(HANDLES)}.get(thing.kind, ()):
-            labels[scene.model.geom(f"{name}_{part}").id] = label
+        if thing.kind != "drawer":
+            labels[scene.model.geom_bodyid == scene.model.body(name).id] = label
     return labels
 
 

@@ -19,13 +19,7 @@ import numpy as np
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.recorder.bodies import BODIES, CENTRE, HELD_OUT_BODY, Robot
-from worldline_core.recorder.contact_tasks import (
-    CONTACT_TASKS,
-    Ended,
-    apply_contact_layout,
-    build_contact_scene,
-    solid_labels,
-)
+from worldline_core.recorder.contact_tasks import CONTACT_TASKS, Ended, apply_contact_layout, build_contact_scene
 from worldline_core.recorder.controllers import (
     ArmSolver,
     ScriptedPolicy,
@@ -396,7 +390,7 @@ class EpisodeRecorder:
         # Another layout may have been executed since: this one decides where objects stand and what they look like.
         self.set_up(self._data, layout)
         self._set_scene(self._renderer, scene_id, jitter)
-        labels = (solid_labels if self.contact else thing_labels)(self.scene, layout)
+        labels = thing_labels(self.scene, layout)
         frames, masks, things, cameras = self._renderer.render(
             motion.qpos, lambda qpos: light_buttons(self.scene, layout, qpos), labels if masked else None
         )
