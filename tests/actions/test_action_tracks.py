@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from worldline_core.actions.action_maps import render_action_maps
-from worldline_core.actions.action_tracks import CAUSES, compute_tracks, project_tools
+from worldline_core.actions.action_tracks import CAUSES, compute_tracks, count_samples, project_tools
 from worldline_core.actions.episode_tracks import TrackBatch, collate_tracks
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.cameras import MIN_DEPTH_M
@@ -151,6 +151,10 @@ def test_one_bad_frame_of_a_moving_camera_masks_that_frame_of_its_view():
     seen = project_tools(tool, torch.full((4, 1), 0.5), torch.stack([K, K]), cameras, SIZE)
     assert (seen.cause == VALID).flatten(1).tolist() == [[True, n != 2] for n in range(4)]
     assert (rendered(seen)[1, :, 2] == 0).all()
+    counts = count_samples(seen.cause, torch.full((4, 1), 1.5), 3)
+    assert counts == dict.fromkeys(CAUSES, 0) | {
+        "episodes": 1, "samples": 8, "valid": 7, "invalid_calibration": 1, "outside_joint_limits": 3, "gripper_clipped": 4,
+    }  # fmt: skip
 
 
 def test_gradient_of_a_masked_sample_is_finite():

@@ -131,7 +131,7 @@ def linked(episode_set, tmp_path) -> tuple[Path, Path]:
     return filtered, curated
 
 
-@pytest.mark.parametrize("mode", ["full", "fast", "off"])
+@pytest.mark.parametrize("mode", ["full", "off"])
 def test_data_that_is_gone_is_no_verdict_on_an_episode(linked, tmp_path, mode):
     filtered, curated = linked
     store = ArtifactStore(tmp_path / "store", mode)

@@ -12,9 +12,9 @@ from worldline_core.filters.signals import measure
 from worldline_core.filters.verdict import REASONS, Finding
 
 
-def findings_of(clip: Clip) -> list[Finding]:
+def findings_of(clip: Clip, **doctor: float) -> list[Finding]:
     thumbnails = {view: view_thumbnails(images, clip.episode.fps) for view, images in clip.frames.items()}
-    return inspect(FilterConfig(), measure(clip.episode, thumbnails))
+    return inspect(FilterConfig.model_validate({"doctor": doctor}), measure(clip.episode, thumbnails))
 
 
 LATE = ("late_states", "late_pictures")
@@ -27,7 +27,8 @@ LATE = ("late_states", "late_pictures")
 def test_every_fault_gets_its_reason(recording: Clip, name: str) -> None:
     clip = FAULTS[name](recording, np.random.default_rng(3))
     assert clip.bad.any()
-    found = [f for f in findings_of(clip) if f.verdict.reason == clip.fault and not f.verdict.clean]
+    doctor = {} if name in LATE else {"rate_hz": 0.5}  # too little to search for mistakes of the calibration
+    found = [f for f in findings_of(clip, **doctor) if f.verdict.reason == clip.fault and not f.verdict.clean]
     assert found
     assert clip.fault in REASONS
     if found[0].verdict.bad_frames is not None:
