@@ -143,7 +143,7 @@ def recordings(project_root):
 
 @pytest.mark.parametrize("embodiment", ["panda_ivory", "ur5e_slate", "viperx_pearl", "xarm7_single"])
 def test_kinematics_give_the_recorded_wrist_cameras_and_masks_that_cover_the_robot(recordings, embodiment):
-    """One body of each model; that descriptions fit every body: test_recorder_simulation."""
+    """One body of each model; that descriptions fit every body: test_tasks of the recorder."""
     position = recordings[1][embodiment]
     episode = recordings[0].episode(position)
     kinematics = ArmKinematics(load_embodiment(embodiment))
