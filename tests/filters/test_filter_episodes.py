@@ -32,9 +32,8 @@ def spoiled(recording: Clip, number: int) -> tuple[Episode, dict[str, np.ndarray
     if number == 7:  # nothing happens
         recording = at_frames(recording, np.zeros(recording.episode.num_frames, int))
     robot = ArmKinematics(load_embodiment(recording.episode.embodiment))
-    episode = replace(
-        as_tool_poses(recording.episode, robot), episode_id=f"e{number:02d}", source="judged" if number == 3 else "tests", embodiment="points", scene=f"s{number}"
-    )  # fmt: skip
+    names = {"episode_id": f"e{number:02d}", "source": "judged" if number == 3 else "tests", "scene": f"s{number}"}
+    episode = replace(as_tool_poses(recording.episode, robot), embodiment="points", **names)
     frames = {view: images[:, ::2, ::2].copy() for view, images in recording.frames.items()}
     cameras = {view: camera.resized(96, 64) for view, camera in episode.cameras.items()}
     if number == 1:  # frozen
