@@ -1,4 +1,4 @@
-"""Tracks: projection, masking and its counts, where camera poses come from, clips; and what holds for any robot and camera."""
+"""Tracks: projection, masking and its counts, sources of camera poses, clips; and what holds for any robot and camera."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Resize, crop and letterbox: pixels, images and K move together; camera poses say their convention, and rotations are repaired or
-refused."""
+"""Cameras: pixels, images and K move together; poses say their convention, and rotations are repaired or refused."""
 
 from __future__ import annotations
 

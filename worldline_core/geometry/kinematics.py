@@ -261,9 +261,10 @@ class Reached:
 class InverseKinematics:
     """Solver for all arms of an embodiment at once.
 
-    Damped least squares with a damping that falls with the error (Sugihara, "Solvability-unconcerned inverse kinematics by
-    the Levenberg-Marquardt method", 2011): quadratic convergence near a reachable pose, and a steady nearest pose where it is
-    out of reach. A joint that is at its limit and would pass it takes no part in a step, so that the others do its work.
+    Damped least squares with a damping that falls with the error (Sugihara, "Solvability-unconcerned inverse kinematics
+    by the Levenberg-Marquardt method", 2011): quadratic convergence near a reachable pose, and a steady nearest pose
+    where it is out of reach. A joint that is at its limit and would pass it takes no part in a step, so that the others
+    do its work.
     """
 
     def __init__(self, kinematics: ArmKinematics) -> None:

@@ -3,8 +3,8 @@
 Each has something visible that the instruction does not place: which way a bar lies, where its weight is, where poles stand, which of two
 frames is wide enough. A careless controller does not look at it: it draws its choice evenly. A good one knows.
 
-Their solid things, whose sizes, masses and places a layout gives, have a model of their own: more bodies in a model would change
-the recordings of the other tasks. Metres, base frame.
+Their solid things, whose sizes, masses and places a layout gives, have a model of their own: more bodies in a model
+would change the recordings of the other tasks. Metres, base frame.
 """
 
 from __future__ import annotations
