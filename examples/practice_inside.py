@@ -24,8 +24,7 @@ from worldline_core.environment.environment import WorldLineVectorEnv
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
-from worldline_core.geometry.inverse_kinematics import InverseKinematics
-from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.kinematics import ArmKinematics, InverseKinematics
 
 FRAMES = 32
 REACH_FRAMES = 6

@@ -8,11 +8,6 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.actions_config import RenderActionsConfig
-from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.actions.render_actions import render_actions
-from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.sources.agibot import AgibotGesimSource, AgibotGesimSourceConfig
@@ -100,23 +95,3 @@ def test_commands_land_where_their_published_poses_put_them(shared_data):
         seen = by_action.valid[:, 2, 1] & by_state.valid[:, 2, 1]
         assert np.linalg.norm(by_action.uv - by_state.uv, axis=-1)[seen, 2, 1].max() > 20
         assert np.abs(by_action.gripper - by_state.gripper).max() > 0.15
-
-
-@pytest.mark.slow
-def test_curated_and_resized_samples_keep_their_projections(shared_data, tmp_path):
-    """The whole way: reader, resize, EpisodeSet on disk, `render_actions`."""
-    folder = shared_data / "agibot_gesim"
-    source = {"kind": "agibot_gesim", "path": str(folder), "fps": 30.0}
-    config = CurateConfig.model_validate({"sources": [source], "image_size": [96, 160]})
-    curate(config, {}, tmp_path / "episodes")
-    inputs = {"episodes": tmp_path / "episodes"}
-    summary = render_actions(RenderActionsConfig(source="state", previews=0), inputs, tmp_path / "tracks")
-    assert (summary["found"], summary["kept"]) == (2, 2)
-    tracks = ActionTracks.open(tmp_path / "tracks")
-    for name in ("sample_0", "sample_1"):
-        small = tracks.tracks(next(i for i in tracks.episode_ids if i.endswith(name)))
-        assert small.image_size == (96, 160)
-        for view, arm, _, _ in READ_OFF[name]:
-            pixel = independent_pixel(folder, name, view, arm)
-            expected = (pixel + 0.5) * np.array([160 / 640, 96 / 480]) - 0.5
-            np.testing.assert_allclose(small.uv[0, VIEWS.index(view), arm], expected, atol=0.01)

@@ -229,30 +229,21 @@ def test_dark_and_overexposed_pictures_are_not_counted_twice() -> None:
     pictures = picture_statistics(TABLE)
     assert detectors.detect_dark(pictures, NOTHING, config).clean
     assert detectors.detect_overexposed(pictures, config).clean
-    gray = TABLE.copy()
+    gray, lost = TABLE.copy(), np.isin(np.arange(33), [4, 5, 6, 7, 20, 21, 22])
     gray[4:8] = gray[4:8] // 12
+    gray[10:14] = np.random.default_rng(0).integers(0, 30, gray[10:14].shape)  # noise is noise, however dark
     gray[20:23] = np.clip(gray[20:23].astype(int) * 3, 0, 255)
     pictures = picture_statistics(gray)
-    assert cut(detectors.detect_dark(pictures, NOTHING, config)) == [4, 5, 6, 7]
+    noise = detectors.without_signal(pictures, configs.CorruptedConfig())[1]
+    assert cut(detectors.detect_dark(pictures, noise, config)) == [4, 5, 6, 7]
     assert cut(detectors.detect_overexposed(pictures, config)) == [20, 21, 22]
-    assert cut(corrupted(gray, lost=np.isin(np.arange(33), [4, 5, 6, 7, 20, 21, 22]))) == []
+    verdict = corrupted(gray, lost=lost)
+    assert (cut(verdict), verdict.numbers["noise_frames"]) == ([10, 11, 12, 13], 4)
     gray[:30] = 0
     assert not detectors.detect_dark(picture_statistics(gray), NOTHING, config).passed
     # A thing in the gripper may cover a wrist camera.
     covered = picture_statistics(np.full((9, 64, 96), 20, np.uint8))
     assert detectors.detect_dark(covered, np.zeros(9, bool), config, wrist=True).clean
-
-
-def test_noise_is_noise_however_dark() -> None:
-    gray = TABLE.copy()
-    gray[10:14] = np.random.default_rng(0).integers(0, 30, gray[10:14].shape)
-    gray[20:24] = gray[20:24] // 12
-    pictures = picture_statistics(gray)
-    noise = detectors.without_signal(pictures, configs.CorruptedConfig())[1]
-    dark = detectors.detect_dark(pictures, noise, configs.ExposureConfig())
-    assert cut(dark) == [20, 21, 22, 23]
-    verdict = corrupted(gray, lost=dark.bad_frames)
-    assert (cut(verdict), verdict.numbers["noise_frames"]) == ([10, 11, 12, 13], 4)
 
 
 def test_blurred_stretches_are_found_whatever_is_seen() -> None:

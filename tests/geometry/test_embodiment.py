@@ -24,13 +24,19 @@ def write(tmp_path, **changes):
 
 
 @pytest.mark.parametrize("name", embodiment_names())
-def test_every_shipped_file_is_valid_and_orders_its_state(name):
+def test_every_shipped_file_is_valid_orders_its_state_and_has_a_description_or_says_where_to_get_it(name, monkeypatch):
+    monkeypatch.delenv(f"WORLDLINE_DESCRIPTION_{name.upper()}", raising=False)
     embodiment = load_embodiment(name)
     assert embodiment.name == name
     assert len(embodiment.state_names) == embodiment.state_size
     columns = list(range(embodiment.state_size))
     joints = [c for arm in embodiment.arms for c in columns[embodiment.joint_columns(arm)]]
     assert sorted(joints + [embodiment.gripper_column(arm) for arm in embodiment.arms]) == columns
+    if embodiment.description_path.is_file():
+        assert read_description(embodiment)
+    else:
+        with pytest.raises(UnavailableError, match=r"take .* from github.com"):
+            read_description(embodiment)
 
 
 def test_unknown_name_lists_the_known_ones():
@@ -73,17 +79,6 @@ def test_own_file_and_variable_go_before_the_file_beside_the_yaml(tmp_path, monk
     monkeypatch.setenv("WORLDLINE_DESCRIPTION_TOY", str(mine))
     assert read_description(load_embodiment(path)) == "mine"
     assert load_embodiment(path, tmp_path / "other.xml").description_path.name == "other.xml"
-
-
-@pytest.mark.parametrize("name", embodiment_names())
-def test_description_is_here_or_the_file_says_how_to_get_it(name, monkeypatch):
-    monkeypatch.delenv(f"WORLDLINE_DESCRIPTION_{name.upper()}", raising=False)
-    embodiment = load_embodiment(name)
-    if embodiment.description_path.is_file():
-        assert read_description(embodiment)
-    else:
-        with pytest.raises(UnavailableError, match=r"take .* from github.com"):
-            read_description(embodiment)
 
 
 def test_states_of_another_length_or_no_numbers_are_named(tmp_path):

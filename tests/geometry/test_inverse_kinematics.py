@@ -11,26 +11,20 @@ from scipy.spatial.transform import Rotation
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.embodiment_report import random_states
-from worldline_core.geometry.inverse_kinematics import InverseKinematics
-from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.kinematics import ArmKinematics, InverseKinematics
 from worldline_core.geometry.transforms import rotation_about_axis, rotation_angle
-
-ROBOTS = ("ur5e_pair", "xarm7_pair", "aloha_viperx", "panda_pair", "yam_station", "agibot_g1", "kinova_gen3")
 
 
 @cache
 def solver(name: str) -> InverseKinematics:
-    embodiment = load_embodiment(name)
-    if not embodiment.description_path.is_file():
-        pytest.skip(f"the description of {name} is not here")
-    return InverseKinematics(ArmKinematics(embodiment))
+    return InverseKinematics(ArmKinematics(load_embodiment(name)))
 
 
 def tools(inverse: InverseKinematics, state: np.ndarray) -> np.ndarray:
     return inverse.kinematics.tool_poses(state[None])[0].numpy()
 
 
-@pytest.mark.parametrize("name", ["aloha_viperx", "agibot_g1", "kinova_gen3", "so101"])
+@pytest.mark.parametrize("name", ["aloha_viperx", "kinova_gen3", "so101"])
 def test_jacobians_agree_with_finite_differences(name: str) -> None:
     inverse = solver(name)
     embodiment = inverse.kinematics.embodiment
@@ -44,13 +38,13 @@ def test_jacobians_agree_with_finite_differences(name: str) -> None:
             assert np.allclose(jacobian[:, d], expected, atol=1e-5), arm.joints[d]
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", ["ur5e_pair", "xarm7_pair", "aloha_viperx", "kinova_gen3"])
 def test_reachable_poses_are_reached_within_the_limits(name: str) -> None:
     inverse = solver(name)
     embodiment = inverse.kinematics.embodiment
     generator = np.random.default_rng(0)
     reached = []
-    for state in random_states(embodiment, 12, 5):
+    for state in random_states(embodiment, 10, 5):
         wanted = tools(inverse, state)
         start = state + generator.normal(0, 0.25, state.shape)
         found = inverse.solve(start, wanted, iterations=60)
@@ -76,10 +70,10 @@ def test_poses_out_of_reach_end_at_a_steady_near_one(name: str) -> None:
     wanted = tools(inverse, state)
     wanted[:, :3, 3] += (1.5, 0.0, 0.0)
     wanted[:, :3, :3] = wanted[:, :3, :3] @ rotation_about_axis(np.array([1.0, 0.0, 0.0]), 0.7)
-    found = inverse.solve(state, wanted, iterations=200)
+    found = inverse.solve(state, wanted, iterations=80)
     assert not embodiment.outside_limits(found.state[None], 0.0).any()
     assert (found.position_error_m < np.linalg.norm(wanted[:, :3, 3] - tools(inverse, state)[:, :3, 3], axis=1)).all()
-    again = inverse.solve(found.state, wanted, iterations=100)
+    again = inverse.solve(found.state, wanted, iterations=40)
     assert np.abs(again.state - found.state).max() < 0.1
     assert (again.position_error_m <= found.position_error_m + 1e-2).all()
 

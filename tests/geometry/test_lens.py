@@ -31,7 +31,7 @@ LENSES = {
     "equidistant": Distortion("fisheye", (0.0, 0.0, 0.0, 0.0)),
 }
 each_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
-steady = settings(derandomize=True, deadline=None, max_examples=60)
+steady = settings(derandomize=True, deadline=None, max_examples=40)
 
 
 def undistort_points(points: np.ndarray, lens: Distortion) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Tasks and contact tasks: their outcomes, who succeeds at them, and physics that repeats itself."""
+"""Tasks and contact tasks: their outcomes, who succeeds at them, physics that repeats itself, and kinematics."""
 
 from __future__ import annotations
 
@@ -14,15 +14,26 @@ from pydantic import ValidationError
 mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
 
 from worldline_core.errors import DataError
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.embodiment_report import random_states
+from worldline_core.geometry.kinematic_tree import read_tree, tool_poses
 from worldline_core.recorder import scene
 from worldline_core.recorder.attempts import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
 from worldline_core.recorder.bodies import BODIES
-from worldline_core.recorder.controllers import ScriptedPolicy
+from worldline_core.recorder.controllers import ScriptedPolicy, Waypoint, sample_waypoints
 from worldline_core.recorder.looks import SCENES, look_of
-from worldline_core.recorder.outcomes import LIFTED, outcome
 from worldline_core.recorder.record import RecordGroup
-from worldline_core.recorder.scene import CONTACT, TASKS, Layout, apply_layout, sample_layout
-from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, draw_layout
+from worldline_core.recorder.rendering import OPENCV_AXES, wrist_camera_pose
+from worldline_core.recorder.scene import (
+    CONTACT,
+    LIFTED,
+    TASKS,
+    Layout,
+    apply_layout,
+    build_scene,
+    sample_layout,
+)
+from worldline_core.recorder.simulate import EpisodeRecorder, ExecutedMotion, draw_layout, outcome
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +81,9 @@ def test_every_task_succeeds_in_about_half_of_the_draws_and_fails_in_several_way
 def test_bodies_reach_their_workspace(name: str) -> None:
     recorder = EpisodeRecorder(name)
     tasks = [task for task in TASKS if task != "carry" or len(BODIES[name].arms) == 2]
-    for number in range(10):
+    for number, task in enumerate(tasks):
         random = np.random.default_rng([3, number])
-        assert recorder.move(layout_of(recorder, tasks[number % len(tasks)], random), random, 33) is not None
+        assert recorder.move(layout_of(recorder, task, random), random, 33) is not None
 
 
 def test_outcomes_are_read_from_the_things(recorder: EpisodeRecorder) -> None:
@@ -122,9 +133,9 @@ def test_layouts_name_what_is_there_and_keep_things_apart(recorder: EpisodeRecor
 
 def test_a_bank_mixes_successes_and_failures_of_one_initial_state(recorder: EpisodeRecorder) -> None:
     spec = BankSpec(name="b", embodiment="ur5e_slate", family="carry", scene="scene_12", layout=3)
-    layout, motions = RecordBanksConfig(banks=(spec,), candidates=8).draw(recorder, spec)
+    layout, motions = RecordBanksConfig(banks=(spec,), candidates=4).draw(recorder, spec)
     assert layout.family == "carry"
-    assert list(motions) == [f"{candidate:03d}" for candidate in range(8)]
+    assert list(motions) == [f"{candidate:03d}" for candidate in range(4)]
     assert 0.25 <= np.mean([motion.outcome == "success" for motion in motions.values()]) <= 0.75
     for motion in motions.values():
         np.testing.assert_array_equal(motion.qpos[0], motions["000"].qpos[0])
@@ -167,9 +178,10 @@ def test_who_looks_succeeds_and_who_does_not_fails_at_times(contact: EpisodeReco
         assert len(careless) < 12
         careless.append(moved(contact, family, len(careless), None))
     assert all((motion.outcome == "failure") == bool(motion.failure) for motion in careless)
-    again = moved(contact, family, 0, None)
-    assert (again.outcome, again.facts) == (careless[0].outcome, careless[0].facts)
-    assert again.facts and np.isfinite(list(again.facts.values())).all()
+    facts = careless[0].facts
+    assert facts and np.isfinite(list(facts.values())).all()
+    if family == "roll":
+        assert moved(contact, family, 0, None).facts == facts
 
 
 def test_tasks_and_scenes_fit() -> None:
@@ -189,3 +201,52 @@ def test_facts_are_sealed_with_the_outcomes(rendering: None, tmp_path: Path) -> 
     for row in rows:
         facts = json.loads(row["facts"])
         assert (row["outcome"] == "success") == (facts["lean"] < 0.35 and facts["height"] > 0.07)
+
+
+@pytest.mark.parametrize("name", sorted(BODIES))
+def test_committed_descriptions_have_the_poses_of_the_recorder(name: str) -> None:
+    robot, built = load_embodiment(name), build_scene(BODIES[name])
+    data = mujoco.MjData(built.model)
+    states = random_states(robot, 5)
+    for state, tools in zip(states, tool_poses(robot, read_tree(robot), states), strict=True):
+        for arm in robot.arms:
+            for joint, value in zip(arm.joints, state[robot.joint_columns(arm)], strict=True):
+                data.joint(joint).qpos[0] = value
+        mujoco.mj_kinematics(built.model, data)
+        for number, (arm, indices) in enumerate(zip(robot.arms, built.arms, strict=True)):
+            np.testing.assert_allclose(tools[number, :3, 3], data.site_xpos[indices.tool_site], atol=1e-7)
+            rotation = data.site_xmat[indices.tool_site].reshape(3, 3)
+            np.testing.assert_allclose(tools[number, :3, :3], rotation, atol=1e-7)
+            mount, (translation, axes) = np.array(arm.wrist_camera.T_link_camera), wrist_camera_pose(built, number)
+            np.testing.assert_allclose(mount[:3, 3], translation, atol=1e-7)
+            np.testing.assert_allclose(mount[:3, :3], axes @ OPENCV_AXES, atol=1e-7)
+
+
+def test_recorded_actions_alone_reproduce_the_motion() -> None:
+    recorder = EpisodeRecorder("viperx_graphite")
+    layout, another = (
+        sample_layout(recorder.scene.robot, task, np.random.default_rng(seed), SCENES["scene_12"])
+        for task, seed in (("lift", 5), ("place", 7))
+    )
+    motion = recorder.move(layout, np.random.default_rng(6), 33)
+    other = recorder.move(another, np.random.default_rng(8), 33)
+    again = recorder.replay(layout, motion.action)
+    np.testing.assert_array_equal(again.qpos, motion.qpos)
+    assert again.outcome == motion.outcome
+    assert not np.array_equal(other.qpos, motion.qpos)
+
+
+def test_a_single_arm_uses_the_whole_table_and_pads_never_touch_what_is_placed() -> None:
+    random = np.random.default_rng(2)
+    layouts = [sample_layout(BODIES["xarm7_single"], "place", random, SCENES["scene_12"]) for _ in range(60)]
+    assert {np.sign(layout.target.y) for layout in layouts} == {-1.0, 1.0}
+    for layout in layouts:
+        assert np.linalg.norm(layout.target.xy - layout.goal.xy) > 0.1
+
+
+def test_waypoints_are_met_in_time_and_at_rest() -> None:
+    points = [Waypoint(0.0, (0, 0, 0), 0.0, 1.0), *(Waypoint(t, (1, 2, 3), 0.5, t - 1.0) for t in (1.0, 2.0))]
+    positions, yaw, opening = sample_waypoints(points, np.array([0.0, 0.5, 1.0, 1.01, 5.0]))
+    np.testing.assert_allclose(positions, [[0, 0, 0], [0.5, 1, 1.5], [1, 2, 3], [1, 2, 3], [1, 2, 3]])
+    np.testing.assert_allclose(yaw, [0, 0.25, 0.5, 0.5, 0.5])
+    np.testing.assert_allclose(opening[[0, 1, 2, 4]], [1.0, 0.5, 0.0, 1.0])

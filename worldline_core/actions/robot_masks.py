@@ -26,8 +26,7 @@ NEAR_PLANE_M = 0.02
 TOUCH_MARGIN_CELLS = 0.6
 """Between a cell's half width and its half diagonal: a centre this near to a capsule means that the cell is touched."""
 DILATION_ROWS = 30
-DEFAULT_TOOL_LENGTH_M = 0.15
-DEFAULT_TOOL_RADIUS_M = 0.05
+TOOL_LENGTH_M, TOOL_RADIUS_M = 0.15, 0.05
 
 
 def robot_capsules(
@@ -83,13 +82,11 @@ def _below(link: str, parents: dict[str, str]) -> list[str]:
     return below
 
 
-def tool_capsules(
-    T_base_tool: Float[Tensor, "n a 4 4"], length: float = DEFAULT_TOOL_LENGTH_M, radius: float = DEFAULT_TOOL_RADIUS_M
-) -> tuple[Float[Tensor, "n s 2 3"], Float[Tensor, " s"]]:
+def tool_capsules(T_base_tool: Float[Tensor, "n a 4 4"]) -> tuple[Float[Tensor, "n s 2 3"], Float[Tensor, " s"]]:
     """One capsule per arm, from the tool back along its z axis: all that a source without joints tells."""
     tip = T_base_tool[..., :3, 3]
-    back = tip - length * T_base_tool[..., :3, 2]
-    return torch.stack([back, tip], dim=-2), torch.full((T_base_tool.shape[1],), radius, dtype=torch.float64)
+    back = tip - TOOL_LENGTH_M * T_base_tool[..., :3, 2]
+    return torch.stack([back, tip], dim=-2), torch.full((T_base_tool.shape[1],), TOOL_RADIUS_M, dtype=torch.float64)
 
 
 def project_capsules(
@@ -157,11 +154,10 @@ def kinematic_robot_masks(
     image_size: tuple[int, int],
     grid_size: tuple[int, int],
     *,
-    temporal_factor: int = TEMPORAL_FACTOR,
     neighbour_frames: int = 1,
     dilation: int | None = None,
 ) -> Float[Tensor, "b v t h w"]:
-    """Masks (0 or 1) at latent resolution, n = 1 + (t - 1) * temporal_factor RGB frames.
+    """Masks (0 or 1) at latent resolution, n = 1 + 4 (t - 1) RGB frames.
 
     A latent cell belongs to the robot when a capsule touches it in one of the latent frame's RGB frames (frame 0;
     4j-3 .. 4j), widened by `neighbour_frames` on both sides; the result is dilated by `dilation` cells. By
@@ -170,10 +166,9 @@ def kinematic_robot_masks(
     Raises: ConfigError when the number of frames does not fit.
     """
     num_frames = capsules.shape[1]
-    if (num_frames - 1) % temporal_factor:
-        raise ConfigError(
-            "Frames do not fit the tokenizer", expected=f"1 + a multiple of {temporal_factor}", got=num_frames
-        )
+    if (num_frames - 1) % TEMPORAL_FACTOR:
+        expected = f"1 + a multiple of {TEMPORAL_FACTOR}"
+        raise ConfigError("Frames do not fit the tokenizer", expected=expected, got=num_frames)
     covered = project_capsules(
         capsules, radii, K, T_base_camera, image_size, grid_size, margin_cells=TOUCH_MARGIN_CELLS
     )
@@ -183,7 +178,7 @@ def kinematic_robot_masks(
     if dilation:
         cells = functional.max_pool2d(cells, 2 * dilation + 1, stride=1, padding=dilation)
     frames = []
-    for last in range(0, num_frames, temporal_factor):
-        first = max(0, last - temporal_factor + 1 - neighbour_frames)
+    for last in range(0, num_frames, TEMPORAL_FACTOR):
+        first = max(0, last - TEMPORAL_FACTOR + 1 - neighbour_frames)
         frames.append(cells[:, first : last + 1 + neighbour_frames].amax(dim=1))
     return rearrange(torch.stack(frames, dim=1), "(b v) t h w -> b v t h w", b=clips)

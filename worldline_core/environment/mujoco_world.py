@@ -36,7 +36,6 @@ from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.tokenizers import resized_frames
 from worldline_core.recorder.attempts import RecordPoliciesConfig
-from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.record import RecordConfig, plan_jobs
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene import FRAME_RATE, Layout, apply_layout
@@ -45,6 +44,7 @@ from worldline_core.recorder.simulate import (
     ExecutedMotion,
     drive,
     motor_targets,
+    outcome,
     place_arms,
     read_state,
 )

@@ -24,7 +24,7 @@ from worldline_core.filters.filter_config import (
     StaticConfig,
 )
 from worldline_core.filters.signals import SPEED_WINDOW_S, PictureStatistics, Signals
-from worldline_core.filters.verdict import Curve, Finding, Verdict, bad_frames, frame_verdict, long_runs, runs
+from worldline_core.filters.verdict import Finding, Verdict, bad_frames, frame_verdict, long_runs, runs
 
 
 def detect_dark(
@@ -33,16 +33,14 @@ def detect_dark(
     """Images that are black or too dark to see anything in; noise (bool (n,)) is another fault, however dark."""
     least = config.min_bright_level_wrist if wrist else config.min_bright_level
     bad = (pictures.bright_level < least) & ~noise
-    passed = bad.mean() <= config.max_bad_share
-    return frame_verdict("too_dark", passed, bad, {"bright_level": Curve(pictures.bright_level, least)})
+    return frame_verdict("too_dark", bad.mean() <= config.max_bad_share, bad, {"bright_level": least})
 
 
 def detect_overexposed(pictures: PictureStatistics, config: ExposureConfig, *, wrist: bool = False) -> Verdict:
     """Images in which much of the sensor is saturated."""
     most = config.max_white_share_wrist if wrist else config.max_white_share
     bad = pictures.white_share > most
-    passed = bad.mean() <= config.max_bad_share
-    return frame_verdict("overexposed", passed, bad, {"white_share": Curve(pictures.white_share, most)})
+    return frame_verdict("overexposed", bad.mean() <= config.max_bad_share, bad, {"white_share": most})
 
 
 def relative_sharpness(sharpness: np.ndarray, detail: np.ndarray) -> np.ndarray:
@@ -81,9 +79,8 @@ def detect_blur(
         relative[seen] = relative_sharpness(sharpness[seen], pictures.detail[seen])
     blurred = ((relative < least) | (sharpness < config.min_sharpness)) & seen
     bad = long_runs(blurred, max(1.0, config.min_run_s * fps))
-    curves = {"relative_sharpness": Curve(relative, least), "sharpness": Curve(sharpness, config.min_sharpness)}
-    deciding = sorted(curves.items(), key=lambda item: -int((item[1].values < item[1].threshold)[bad].sum()))
-    return frame_verdict("blur", bad.mean() <= config.max_bad_share, bad, dict(deciding))
+    thresholds = {"relative_sharpness": least, "sharpness": config.min_sharpness}
+    return frame_verdict("blur", bad.mean() <= config.max_bad_share, bad, thresholds)
 
 
 def frozen_frames(
@@ -186,17 +183,16 @@ def detect_corrupted(
     garbled = np.zeros_like(blank) if wrist else garbled_frames(pictures, blank | noise | lost, fps, config)
     frozen = frozen_frames(pictures.change, tracks, unreliable, config, wrist=wrist)
     bad = blank | noise | garbled | frozen
-    detail = _relative_detail(pictures)
     kinds = {"blank": blank, "noise": noise, "garbled": garbled, "frozen": frozen}
     return frame_verdict(
         "corrupted",
         bad.mean() <= config.max_bad_share,
         bad,
         {
-            "image_change": Curve(pictures.change, config.max_frozen_change),
-            "roughness": Curve(pictures.roughness, config.max_roughness),
-            "relative_detail": Curve(detail, float(np.median(detail)) * config.max_detail_rise),
-            "flat_share": Curve(pictures.flat_share, float(np.median(pictures.flat_share)) + config.max_flat_rise),
+            "image_change": config.max_frozen_change,
+            "roughness": config.max_roughness,
+            "relative_detail": float(np.median(_relative_detail(pictures))) * config.max_detail_rise,
+            "flat_share": float(np.median(pictures.flat_share)) + config.max_flat_rise,
         },
         **{f"{kind}_frames": int(flags.sum()) for kind, flags in kinds.items()},
     )
@@ -244,11 +240,8 @@ def detect_static(
         still[max(0, start - half) : stop + half] = True
     still &= image_change < config.max_image_change
     bad = long_runs(still, config.min_run_s * fps)
-    curves = {
-        "joint_range_rad_s": Curve(joint_speed, config.max_joint_speed_rad_s),
-        "coarse_image_change": Curve(image_change, config.max_image_change),
-    }
-    return frame_verdict("static", not bad.all(), bad, curves)
+    thresholds = {"joint_range_rad_s": config.max_joint_speed_rad_s, "coarse_image_change": config.max_image_change}
+    return frame_verdict("static", not bad.all(), bad, thresholds)
 
 
 def find_static(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
@@ -354,8 +347,7 @@ def detect_reset(joints: np.ndarray, fps: float, config: ResetConfig, commands: 
     bad = np.zeros(len(joints), dtype=bool)
     if found is not None:
         bad[found[0] + 1 :] = True
-    from_home = Curve(np.abs(joints - joints[0]).max(axis=1), config.min_jump_rad)
-    return frame_verdict("reset", True, bad, {"distance_from_home_rad": from_home})
+    return frame_verdict("reset", True, bad, {"distance_from_home_rad": config.min_jump_rad})
 
 
 _LARGE_STEPS = 2
@@ -395,8 +387,7 @@ def detect_joint_jump(joints: np.ndarray, config: JointMotionConfig) -> Verdict:
             returned = abs(joints[second + 1, joint] - joints[first, joint]) < half
             if returned and (second - first <= _WINDOW or np.ptp(joints[first + 1 : second + 1, joint]) < half):
                 bad[first + 1 : second + 1] = True
-    largest = Curve(np.concatenate([[0.0], steps.max(axis=1)]), config.min_jump_rad)
-    return frame_verdict("joint_jump", True, bad, {"largest_step_rad": largest})
+    return frame_verdict("joint_jump", True, bad, {"largest_step_rad": config.min_jump_rad})
 
 
 def detect_joint_speed(joints: np.ndarray, fps: float, config: JointMotionConfig) -> Verdict:
@@ -411,8 +402,7 @@ def detect_joint_speed(joints: np.ndarray, fps: float, config: JointMotionConfig
     for start, stop in runs((speed > config.max_speed_rad_s) & ~jumps):
         if stop - start >= 2:
             bad[start + 1 : stop + 1] = True
-    curve = Curve(np.concatenate([[0.0], speed]), config.max_speed_rad_s)
-    return frame_verdict("joint_speed", True, bad, {"joint_speed_rad_s": curve})
+    return frame_verdict("joint_speed", True, bad, {"joint_speed_rad_s": config.max_speed_rad_s})
 
 
 _STUCK_S = 1.0
@@ -425,15 +415,13 @@ def detect_joint_stuck(joints: np.ndarray, commands: np.ndarray, fps: float, con
         joints, commands: (n, j) [rad], without grippers.
     """
     bad = np.zeros(len(joints), dtype=bool)
-    commanded = np.zeros(len(joints))
     same = np.concatenate([np.zeros((1, joints.shape[1]), dtype=bool), np.diff(joints, axis=0) == 0])
     for joint in range(joints.shape[1]):
         for start, stop in runs(same[:, joint]):
             moved = float(np.ptp(commands[start - 1 : stop, joint]))
             if stop - start >= _STUCK_S * fps:
-                commanded[start:stop] = np.maximum(commanded[start:stop], moved)
                 bad[start:stop] |= moved > config.min_jump_rad
-    return frame_verdict("joint_stuck", True, bad, {"commanded_rad": Curve(commanded, config.min_jump_rad)})
+    return frame_verdict("joint_stuck", True, bad, {"commanded_rad": config.min_jump_rad})
 
 
 def find_joint_faults(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
@@ -498,7 +486,7 @@ def detect_base_motion(area: np.ndarray, fps: float, config: BaseMotionConfig) -
     """
     bad = long_runs(area > config.min_changed_area, config.min_run_s * fps, gap=0.25 * fps)
     passed = bad.mean() <= config.max_moving_share
-    return frame_verdict("base_motion", passed, bad, {"changed_area": Curve(area, config.min_changed_area)})
+    return frame_verdict("base_motion", passed, bad, {"changed_area": config.min_changed_area})
 
 
 def find_base_motion(signals: Signals, config: FilterConfig, found: Sequence[Finding]) -> list[Finding]:

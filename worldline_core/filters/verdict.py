@@ -11,14 +11,6 @@ Numbers = dict[str, float | int | str | None]
 
 
 @dataclass(frozen=True)
-class Curve:
-    """Measured values of a detector by frame, (n,), and their threshold."""
-
-    values: np.ndarray
-    threshold: float
-
-
-@dataclass(frozen=True)
 class Verdict:
     """Outcome of one detector.
 
@@ -27,14 +19,12 @@ class Verdict:
         passed: whether the episode as a whole may stay.
         numbers: measured values, next to the thresholds they were held against.
         bad_frames: bool (n,) frames that must not be trained on, where the detector can tell.
-        curves: by name.
     """
 
     reason: str
     passed: bool
     numbers: Mapping[str, float | int | str | None] = field(default_factory=dict)
     bad_frames: np.ndarray | None = None
-    curves: Mapping[str, Curve] = field(default_factory=dict)
 
     @property
     def clean(self) -> bool:
@@ -43,11 +33,11 @@ class Verdict:
 
 
 def frame_verdict(
-    reason: str, passed: bool, bad: np.ndarray, curves: Mapping[str, Curve], **numbers: float | str | None
+    reason: str, passed: bool, bad: np.ndarray, thresholds: Mapping[str, float], **numbers: float | str | None
 ) -> Verdict:
-    """Verdict of a detector of bad frames (n,); the numbers are their share, the given ones and the curves' thresholds."""
-    thresholds = {f"threshold_{name}": float(curve.threshold) for name, curve in curves.items()}
-    return Verdict(reason, bool(passed), {"bad_share": float(bad.mean()), **numbers, **thresholds}, bad, curves)
+    """Verdict of a detector of bad frames (n,); the numbers are their share, the given ones and the thresholds."""
+    named = {f"threshold_{name}": float(threshold) for name, threshold in thresholds.items()}
+    return Verdict(reason, bool(passed), {"bad_share": float(bad.mean()), **numbers, **named}, bad)
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ Distorted lenses are undistorted when recordings are read (`lens`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from worldline_core.errors import CalibrationError, ConfigError, DataError
 from worldline_core.geometry.transforms import RotationRepair, repair_rotations, rigid_inverse
@@ -195,25 +195,13 @@ class ImageTransform:
             )
         return self if size == self.image_size else self._then(Window(top, left, size))
 
-    def pad(self, top: int, bottom: int, left: int, right: int) -> ImageTransform:
-        """Then add empty rows and columns.
-
-        Raises: ConfigError for a negative number of them.
-        """
-        if min(top, bottom, left, right) < 0:
-            raise ConfigError("Padding is negative", expected="at least 0 each", got=(top, bottom, left, right))
-        height, width = self.image_size
-        size = (height + top + bottom, width + left + right)
-        return self if size == self.image_size else self._then(Window(-top, -left, size))
-
     def letterbox(self, image_size: tuple[int, int]) -> ImageTransform:
         """Then fit whole into the size, the rest evenly padded; the aspect ratio changes by rounding to pixels only."""
         wanted = _whole(image_size)
         scale = min(wanted[0] / self.image_size[0], wanted[1] / self.image_size[1])
         height, width = (min(max(round(n * scale), 1), limit) for n, limit in zip(self.image_size, wanted, strict=True))
-        below, beside = wanted[0] - height, wanted[1] - width
-        inner = self.resize((height, width))
-        return inner.pad(below // 2, below - below // 2, beside // 2, beside - beside // 2)
+        inner, above, beside = self.resize((height, width)), (wanted[0] - height) // 2, (wanted[1] - width) // 2
+        return inner if inner.image_size == wanted else inner._then(Window(-above, -beside, wanted))
 
     def centre_crop(self, image_size: tuple[int, int]) -> ImageTransform:
         """Then fill the size: resized until both sides reach, the rest cut away evenly."""
@@ -236,16 +224,14 @@ class ImageTransform:
 
         Raises: DataError for images of another size than the transform is for.
         """
-        return self._apply(frames, lambda frame: frame)
+        return self._apply(frames, frames.dtype)
 
     def masks(self, masks: np.ndarray) -> np.ndarray:
         """bool (N, H, W) transformed: True where at least half of a pixel's area was; padding is False.
 
         Raises: DataError for masks of another size than the transform is for.
         """
-        if all(isinstance(step, Window) for step in self.steps):
-            return self._apply(masks, lambda mask: mask)
-        return self._apply(masks, lambda mask: mask.astype(np.float32)) >= 0.5
+        return self._apply(masks, np.float32) >= 0.5
 
     def labels(self, labels: np.ndarray) -> np.ndarray:
         """uint8 (N, H, W) transformed: the label that at least half of a pixel's area had, else 0.
@@ -257,7 +243,7 @@ class ImageTransform:
             transformed[self.masks(labels == label)] = label
         return transformed
 
-    def _apply(self, images: np.ndarray, prepare: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    def _apply(self, images: np.ndarray, dtype: npt.DTypeLike) -> np.ndarray:
         if tuple(images.shape[1:3]) != self.source_size:
             raise DataError(
                 "Images have another size than the transform is for",
@@ -268,7 +254,7 @@ class ImageTransform:
             return images
         transformed = []
         for image in images:
-            result = prepare(image)
+            result = image.astype(dtype, copy=False)
             for step in self.steps:
                 result = step.apply(result)
             transformed.append(result)

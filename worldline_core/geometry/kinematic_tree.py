@@ -199,10 +199,33 @@ def read_mjcf(text: str, where: object) -> TreeBody:
     return tree
 
 
-def _overlaid(inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
+def overlaid(inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
     """Attributes of both, the own ones first; an own orientation, in any form, replaces the inherited one."""
     replaced = _ORIENTATIONS if any(name in own for name in _ORIENTATIONS) else ()
     return {**{name: value for name, value in inherited.items() if name not in replaced}, **own}
+
+
+def mjcf_defaults(root: ET.Element, tags: Iterable[str], where: object) -> dict[str, dict[str, dict[str, str]]]:
+    """Default attributes of elements with these tags, by class; a class inherits those of the one around it.
+
+    Raises: DataError for a class without a name, or one that is there twice.
+    """
+    defaults: dict[str, dict[str, dict[str, str]]] = {"main": {tag: {} for tag in tags}}
+
+    def read(element: ET.Element, name: str, parent: str) -> None:
+        defaults[name] = dict(defaults[parent])
+        for tag in defaults[name]:
+            for part in element.findall(tag):
+                defaults[name][tag] = overlaid(defaults[name][tag], part.attrib)
+        for child in element.findall("default"):
+            child_name = child.get("class", "")
+            if not child_name or child_name in defaults:
+                raise DataError("A class of defaults has no name, or is there twice", where=where, got=child_name)
+            read(child, child_name, name)
+
+    for default in root.findall("default"):
+        read(default, "main", "main")
+    return defaults
 
 
 class _MjcfReader:
@@ -215,22 +238,9 @@ class _MjcfReader:
         self.eulerseq = settings.get("eulerseq", "xyz")
         if not re.fullmatch("[xyzXYZ]{3}", self.eulerseq):
             raise DataError("Not a sequence of axes", where=f"{where}: eulerseq", expected="xyz", got=self.eulerseq)
-        self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {"joint": {}, "site": {}}}
-        for default in root.findall("default"):
-            self._read_defaults(default, "main", "main")
+        self.defaults = mjcf_defaults(root, ("joint", "site"), where)
         self.unnamed = 0
         self.body_names = {element.get("name") for element in root.iter("body")}
-
-    def _read_defaults(self, element: ET.Element, name: str, parent: str) -> None:
-        self.defaults[name] = dict(self.defaults[parent])
-        for tag in self.defaults[name]:
-            for part in element.findall(tag):
-                self.defaults[name][tag] = _overlaid(self.defaults[name][tag], part.attrib)
-        for child in element.findall("default"):
-            child_name = child.get("class", "")
-            if not child_name or child_name in self.defaults:
-                raise DataError("A class of defaults has no name, or is there twice", where=self.where, got=child_name)
-            self._read_defaults(child, child_name, name)
 
     def _with_defaults(self, element: ET.Element, childclass: str | None) -> dict[str, str]:
         """Attributes of a joint or site, with those of its class."""
@@ -238,7 +248,7 @@ class _MjcfReader:
         if name not in self.defaults:
             place = f"{self.where}: {element.tag} {element.get('name', '')}"
             raise DataError("No such class of defaults", where=place, expected=", ".join(self.defaults), got=name)
-        return _overlaid(self.defaults[name][element.tag], element.attrib)
+        return overlaid(self.defaults[name][element.tag], element.attrib)
 
     def body(self, element: ET.Element, name: str, childclass: str | None) -> TreeBody:
         childclass = element.get("childclass", childclass)

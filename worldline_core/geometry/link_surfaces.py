@@ -15,7 +15,7 @@ import numpy as np
 
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import Embodiment, read_description
-from worldline_core.geometry.kinematic_tree import parse_xml
+from worldline_core.geometry.kinematic_tree import mjcf_defaults, overlaid, parse_xml
 from worldline_core.geometry.transforms import (
     rotation_from_euler_fixed_xyz,
     rotation_from_euler_moving_xyz,
@@ -81,12 +81,10 @@ def _mjcf_shapes(root: ET.Element, folder: Path) -> Iterator[tuple[str, np.ndarr
     """
     compiler = {key: value for each in root.findall("compiler") for key, value in each.attrib.items()}
     folder = folder / compiler.get("meshdir", compiler.get("assetdir", ""))
-    geoms, meshes = dict[str, dict[str, str]](), dict[str, dict[str, str]]()
-    for default in root.findall("default"):
-        _defaults(default, "main", geoms, meshes, {}, {})
+    defaults = mjcf_defaults(root, ("geom", "mesh"), folder)
     files = {}
     for mesh in root.iterfind("asset/mesh"):
-        values = {**meshes.get(mesh.get("class", "main"), {}), **mesh.attrib}
+        values = {**defaults.get(mesh.get("class", "main"), {}).get("mesh", {}), **mesh.attrib}
         if "file" in values:
             files[values.get("name", Path(values["file"]).stem)] = values
     worldbody = root.find("worldbody")
@@ -96,7 +94,8 @@ def _mjcf_shapes(root: ET.Element, folder: Path) -> Iterator[tuple[str, np.ndarr
         childclass = body.get("childclass", inherited)
         front += [(child, childclass) for child in body.findall("body")]
         described = [
-            {**geoms.get(geom.get("class", childclass) or "main", {}), **geom.attrib} for geom in body.findall("geom")
+            overlaid(defaults.get(geom.get("class", childclass) or "main", {}).get("geom", {}), geom.attrib)
+            for geom in body.findall("geom")
         ]
         seen = [values for values in described if values.get("contype") == values.get("conaffinity") == "0"]
         for values in seen or described:
@@ -104,19 +103,6 @@ def _mjcf_shapes(root: ET.Element, folder: Path) -> Iterator[tuple[str, np.ndarr
             if len(points) and body.get("name"):
                 place = np.array(_floats(values.get("pos", "0 0 0")))
                 yield str(body.get("name")), points @ _turn(values, compiler).T + place, radius
-
-
-def _defaults(
-    element: ET.Element, name: str, geoms: dict[str, dict[str, str]], meshes: dict[str, dict[str, str]],
-    geom: dict[str, str], mesh: dict[str, str],
-) -> None:  # fmt: skip
-    """Collects the defaults of geoms and meshes by class; a class inherits those around it."""
-    of_geoms, of_meshes = element.find("geom"), element.find("mesh")
-    name = element.get("class", name)
-    geoms[name] = {**geom, **geoms.get(name, {}), **({} if of_geoms is None else of_geoms.attrib)}
-    meshes[name] = {**mesh, **meshes.get(name, {}), **({} if of_meshes is None else of_meshes.attrib)}
-    for child in element.findall("default"):
-        _defaults(child, name, geoms, meshes, geoms[name], meshes[name])
 
 
 def _turn(values: dict[str, str], compiler: dict[str, str]) -> np.ndarray:

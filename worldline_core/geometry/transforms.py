@@ -51,10 +51,7 @@ def rotation_from_quaternion_wxyz(quaternion: np.ndarray) -> np.ndarray:
 
 
 def rotation_from_quaternion_xyzw(quaternion: np.ndarray) -> np.ndarray:
-    """(..., 4) xyzw, any positive length -> (..., 3, 3).
-
-    Raises: CalibrationError for a quaternion of no length, or one that is not finite.
-    """
+    """(..., 4) xyzw, any positive length -> (..., 3, 3); raises as `rotation_from_quaternion_wxyz`."""
     return rotation_from_quaternion_wxyz(np.roll(quaternion, 1, axis=-1))
 
 
@@ -204,18 +201,12 @@ def pose_from_rotation(position: np.ndarray, rotation: np.ndarray) -> np.ndarray
 
 
 def pose_from_quaternion_xyzw(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Position (..., 3) [m] and quaternion xyzw -> (..., 4, 4).
-
-    Raises: CalibrationError for a quaternion of no length.
-    """
+    """Position (..., 3) [m] and quaternion xyzw -> (..., 4, 4); raises as `rotation_from_quaternion_wxyz`."""
     return pose_from_rotation(position, rotation_from_quaternion_xyzw(quaternion))
 
 
 def pose_from_quaternion_wxyz(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Position (..., 3) [m] and quaternion wxyz -> (..., 4, 4).
-
-    Raises: CalibrationError for a quaternion of no length.
-    """
+    """Position (..., 3) [m] and quaternion wxyz -> (..., 4, 4); raises as `rotation_from_quaternion_wxyz`."""
     return pose_from_rotation(position, rotation_from_quaternion_wxyz(quaternion))
 
 

@@ -2,6 +2,9 @@
 
 Each has something visible that the instruction does not place: which way a bar lies, where its weight is, where poles stand, which of two
 frames is wide enough. A careless controller does not look at it: it draws its choice evenly. A good one knows.
+
+Their solid things, whose sizes, masses and places a layout gives, have a model of their own: more bodies in a model
+would change the recordings of the other tasks. Metres, base frame.
 """
 
 from __future__ import annotations
@@ -13,11 +16,136 @@ from typing import Any
 import numpy as np
 
 from worldline_core.recorder.bodies import REACH_X, Robot
-from worldline_core.recorder.contact_scene import BAR_HALF, RAIL_AWAY, TRAY_HALF, Solid
-from worldline_core.recorder.controllers import WIDE, Waypoint
+from worldline_core.recorder.controllers import WIDE, Waypoint, first_waypoint, waypoint
 from worldline_core.recorder.looks import Look
-from worldline_core.recorder.outcomes import LIFTED
-from worldline_core.recorder.scene import OBJECT_COLOURS, Layout, SceneModel, free_tool
+from worldline_core.recorder.scene import (
+    LIFTED,
+    OBJECT_COLOURS,
+    PARKED,
+    Layout,
+    SceneModel,
+    Thing,
+    add_room,
+    compile_scene,
+    free_tool,
+    scene_spec,
+)
+
+# How many of each kind a scene can hold, and the largest half size.
+LOOSE = {"box": 3, "cylinder": 3, "ball": 1, "bar": 1, "tray": 1}
+FIXED = {"wall": 8, "pad": 2}
+_LARGEST = 0.12
+BAR_HALF, TRAY_HALF, RAIL_AWAY = (0.10, 0.020, 0.025), (0.075, 0.140, 0.008), 0.120
+# What has parts is as it is: half sizes, place and mass of each part. The last two are dark: a weight on the +x side, and as much flat paint
+# on the other, without which the middle of the colour would point away from the weight.
+_Part = tuple[tuple[float, float, float], tuple[float, float, float], float]
+_RAIL = (0.075, 0.019, 0.034)
+PARTS: dict[str, tuple[_Part, ...]] = {
+    "bar": (
+        (BAR_HALF, (0.0, 0.0, 0.0), 0.1),
+        ((0.020, 0.0202, 0.0252), (-0.078, 0.0, 0.0), 0.001),
+        ((0.020, 0.020, 0.042), (0.078, 0.0, 0.017), 0.3),
+    ),
+    "tray": (
+        (TRAY_HALF, (0.0, 0.0, 0.0), 0.2),
+        (_RAIL, (0.0, RAIL_AWAY, 0.042), 0.05),
+        (_RAIL, (0.0, -RAIL_AWAY, 0.042), 0.05),
+        ((0.022, 0.050, 0.0085), (-0.052, 0.0, 0.0), 0.001),
+        ((0.022, 0.050, 0.030), (0.052, 0.0, 0.038), 1.7),
+    ),
+}
+_DARK = [0.10, 0.10, 0.11, 1.0]
+
+
+@dataclass(frozen=True)
+class Solid(Thing):
+    """A thing of a contact task.
+
+    Attributes:
+        half: half sizes along its own axes; of a cylinder or ball (radius, half height, unused).
+        z: height of its origin. lying: a cylinder on its side, along its own y.
+    """
+
+    half: tuple[float, float, float] = BAR_HALF
+    z: float = BAR_HALF[2]
+    mass: float = 0.08
+    lying: bool = False
+
+    @property
+    def standing(self) -> float:
+        return self.z
+
+
+def build_contact_scene(robot: Robot) -> SceneModel:
+    """Compile a body's model with all solids, parked until a layout uses them."""
+    import mujoco
+
+    spec = scene_spec()
+    add_room(spec)
+    shape = mujoco.mjtGeom
+    shapes = {"box": shape.mjGEOM_BOX, "cylinder": shape.mjGEOM_CYLINDER, "ball": shape.mjGEOM_SPHERE}
+    contact = {"condim": 4, "friction": [1.0, 0.02, 0.001], "solref": [0.01, 1.0]}
+    for kind, count in (LOOSE | FIXED).items():
+        for number in range(count):
+            name = f"{kind}_{number}"
+            body = spec.worldbody.add_body(name=name, pos=PARKED)
+            if kind in LOOSE:
+                body.add_freejoint(name=name)
+            if kind in PARTS:
+                # A hand holds it up, but not against its turning weight.
+                slim = contact | {"condim": 3, "friction": [0.8, 0.02, 0.001], "priority": 1}
+                for part, (half, pos, mass) in enumerate(PARTS[kind]):
+                    made = name if part == 0 else f"{name}_{part}"
+                    body.add_geom(name=made, type=shape.mjGEOM_BOX, size=half, pos=pos, mass=mass, **slim)
+            elif kind == "pad":
+                body.add_geom(name=name, type=shape.mjGEOM_CYLINDER, size=[_LARGEST] * 3, contype=0, conaffinity=0)
+            else:
+                # A ball rolls on, unless something stops it.
+                rolling = {"condim": 6, "friction": [1.0, 0.005, 0.00004], "priority": 1} if kind == "ball" else {}
+                form = shapes.get(kind, shape.mjGEOM_BOX)
+                body.add_geom(name=name, type=form, size=[_LARGEST] * 3, mass=0.08, **(contact | rolling))
+    return compile_scene(spec, robot)
+
+
+def apply_contact_layout(scene: SceneModel, data: Any, layout: Layout) -> None:
+    """Reset ``data``, give every solid its size, mass, colour and place; the others float far away."""
+    import mujoco
+
+    model, used = scene.model, {name: thing for name, thing in layout.named() if isinstance(thing, Solid)}
+    for name, thing in used.items():
+        body, geom = model.body(name).id, model.geom(name).id
+        model.geom_rgba[geom] = layout.rgba(thing)
+        for part in range(1, len(PARTS.get(thing.kind, ()))):
+            dark = part + 2 >= len(PARTS[thing.kind])
+            model.geom_rgba[model.geom(f"{name}_{part}").id] = _DARK if dark else layout.rgba(thing)
+        if thing.kind not in PARTS:
+            model.geom_size[geom] = thing.half
+            if thing.kind in LOOSE:
+                x, y, z = np.square(
+                    thing.half if thing.kind == "box" else (thing.half[0], thing.half[0], thing.half[1])
+                )
+                model.body_mass[body] = thing.mass
+                model.body_inertia[body] = thing.mass / 3 * np.array([y + z, x + z, x + y])
+    # What follows from masses and sizes.
+    mujoco.mj_setConst(model, data)
+    mujoco.mj_resetData(model, data)
+    for row, (kind, count) in enumerate((LOOSE | FIXED).items()):
+        for number in range(count):
+            name = f"{kind}_{number}"
+            thing, body = used.get(name), model.body(name).id
+            place, turn = PARKED + np.array([0.3 * number, 0.3 * row, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])
+            if thing is not None:
+                place = np.array([thing.x, thing.y, thing.z + 0.0005 * (kind in LOOSE)])
+                turn = np.array([np.cos(thing.yaw / 2), 0.0, 0.0, np.sin(thing.yaw / 2)])
+                if thing.lying:
+                    mujoco.mju_mulQuat(turn, turn.copy(), np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]))
+            if kind in LOOSE:
+                model.body_gravcomp[body] = 1.0 if thing is None else 0.0
+                address = int(model.joint(name).qposadr[0])
+                data.qpos[address : address + 7] = [*place, *turn]
+            else:
+                model.body_pos[body], model.body_quat[body] = place, turn
+
 
 Judged = tuple[str, dict[str, float]]
 # A thing that leans by more has fallen [rad].
@@ -38,15 +166,11 @@ class Ended:
         address = int(self.scene.model.joint(name).qposadr[0])
         return self.qpos[:, address : address + 3]
 
-    def upright(self, name: str) -> np.ndarray:
-        """(N, 3) direction of a loose thing's own z axis."""
-        address = int(self.scene.model.joint(name).qposadr[0]) + 3
-        w, x, y, z = self.qpos[:, address : address + 4].T
-        return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
-
     def lean(self, name: str) -> float:
-        """Angle between a thing's own z axis and the vertical in the last frame [rad]."""
-        return float(np.arccos(np.clip(self.upright(name)[-1, 2], -1, 1)))
+        """Angle between a loose thing's own z axis and the vertical in the last frame [rad]."""
+        address = int(self.scene.model.joint(name).qposadr[0]) + 3
+        _, x, y, _ = self.qpos[-1, address : address + 4]
+        return float(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
 
     def touched(self, name: str) -> bool:
         """True if the robot touches the thing in the last frame."""
@@ -87,13 +211,8 @@ def _middle(robot: Robot, arm: int, random: np.random.Generator, beside: float) 
     return float(x), float(robot.side(arm) * y)
 
 
-def _at(time: float, xy: np.ndarray, z: float, yaw: float, opening: float) -> Waypoint:
-    return Waypoint(time, (float(xy[0]), float(xy[1]), float(z)), float(yaw), float(opening))
-
-
-def _first(layout: Layout, arm: int) -> Waypoint:
-    x, y, z, yaw, opening = layout.start[arm]
-    return _at(0.0, np.array([x, y]), z, yaw, opening)
+def _solid(kind: str, colour: str, xy: np.ndarray | tuple[float, float], yaw: float = 0.0, **shape: Any) -> Solid:
+    return Solid(kind, colour, float(xy[0]), float(xy[1]), float(yaw), **shape)
 
 
 def _goal(layout: Layout) -> np.ndarray:
@@ -113,11 +232,11 @@ def _raise(
     opened, pace = random.uniform(*WIDE), 1.0 if len(layout.acting()) > 1 else random.uniform(0.96, 1.03)
     times = pace * np.array([0.85, 1.3, 1.9, 2.8])
     return [
-        _first(layout, arm),
-        _at(times[0], xy, 0.21, yaw, opened),
-        _at(times[1], xy, z, yaw, opened),
-        _at(times[2], xy, z, yaw, 0.0),
-        _at(times[3], xy, z + rise, yaw, 0.0),
+        first_waypoint(layout, arm),
+        waypoint(times[0], xy, 0.21, yaw, opened),
+        waypoint(times[1], xy, z, yaw, opened),
+        waypoint(times[2], xy, z, yaw, 0.0),
+        waypoint(times[3], xy, z + rise, yaw, 0.0),
     ]
 
 
@@ -130,16 +249,16 @@ def _move(
     times = random.uniform(0.97, 1.01) * np.array([0.6, 0.9, 1.4, 1.75, 2.2, 2.7, 2.95, 3.3, 3.65])
     middle = (xy + goal) / 2 if via is None else via
     return [
-        _first(layout, layout.arm),
-        _at(times[0], xy, 0.21, yaw, opened),
-        _at(times[1], xy, z, yaw, opened),
-        _at(times[2], xy, z, yaw, 0.0),
-        _at(times[3], xy, z + over, yaw, 0.0),
-        _at(times[4], middle, z + over, yaw, 0.0),
-        _at(times[5], goal, z + over, yaw, 0.0),
-        _at(times[6], goal, z + drop, yaw, 0.0),
-        _at(times[7], goal, z + drop, yaw, opened),
-        _at(times[8], goal, z + drop + 0.11, yaw, opened),
+        first_waypoint(layout, layout.arm),
+        waypoint(times[0], xy, 0.21, yaw, opened),
+        waypoint(times[1], xy, z, yaw, opened),
+        waypoint(times[2], xy, z, yaw, 0.0),
+        waypoint(times[3], xy, z + over, yaw, 0.0),
+        waypoint(times[4], middle, z + over, yaw, 0.0),
+        waypoint(times[5], goal, z + over, yaw, 0.0),
+        waypoint(times[6], goal, z + drop, yaw, 0.0),
+        waypoint(times[7], goal, z + drop, yaw, opened),
+        waypoint(times[8], goal, z + drop + 0.11, yaw, opened),
     ]
 
 
@@ -170,7 +289,7 @@ def _balance_layout(robot: Robot, random: np.random.Generator, look: Look) -> La
     arm, start, colours = _start(robot, random)
     x, y = random.uniform(0.37, 0.40), _middle(robot, arm, random, 0.03)[1]
     yaw = random.uniform(-0.5, 0.5) + np.pi * random.integers(2)
-    bar = Solid("bar", colours[0], float(x), y, float(yaw))
+    bar = _solid("bar", colours[0], (x, y), yaw)
     return Layout("balance", f"lift the {colours[0]} bar and keep it level", arm, start, bar, None, (), look)
 
 
@@ -201,7 +320,7 @@ def _topple_layout(robot: Robot, random: np.random.Generator, look: Look) -> Lay
     poles = []
     for angle in (first, first + random.choice([-1, 1]) * random.uniform(0.6, 1.4)):
         xy = can.xy + random.uniform(0.056, 0.062) * np.array([np.cos(angle), np.sin(angle)])
-        poles.append(Solid("cylinder", "white", float(xy[0]), float(xy[1]), half=POLE_HALF, z=POLE_HALF[1], mass=0.03))
+        poles.append(_solid("cylinder", "white", xy, half=POLE_HALF, z=POLE_HALF[1], mass=0.03))
     instruction = f"lift the {colours[0]} can and knock nothing over"
     return Layout("topple", instruction, arm, start, can, None, tuple(poles), look)
 
@@ -256,7 +375,7 @@ def _level_layout(robot: Robot, random: np.random.Generator, look: Look) -> Layo
     _, start, colours = _start(robot, random)
     x, y = random.uniform(0.378, 0.392), random.uniform(-0.02, 0.02)
     yaw = random.uniform(-0.12, 0.12) + np.pi * random.integers(2)
-    tray = Solid("tray", colours[0], float(x), float(y), float(yaw), z=TRAY_HALF[2])
+    tray = _solid("tray", colours[0], (x, y), yaw, z=TRAY_HALF[2])
     return Layout(
         "level", f"lift the {colours[0]} tray with both arms and keep it level", 0, start, tray, None, (), look
     )
@@ -285,20 +404,10 @@ def _across(robot: Robot, arm: int, random: np.random.Generator) -> tuple[np.nda
 def _detour_layout(robot: Robot, random: np.random.Generator, look: Look) -> Layout:
     arm, start, colours = _start(robot, random)
     source, goal = _across(robot, arm, random)
-    block = Solid(
-        "box",
-        colours[0],
-        float(source[0]),
-        float(source[1]),
-        random.uniform(-0.2, 0.2),
-        half=(0.024, 0.024, 0.055),
-        z=0.055,
-    )
-    pad = Solid("pad", colours[1], float(goal[0]), float(goal[1]), half=(0.052, 0.0015, 0.0), z=0.0015)
-    x, y = (source + goal) / 2 + np.array(
-        [random.choice([-1, 1]) * random.uniform(0.022, 0.034), random.normal(0, 0.008)]
-    )
-    pole = Solid("cylinder", "white", float(x), float(y), half=(0.013, 0.075, 0.0), z=0.075, mass=0.03)
+    block = _solid("box", colours[0], source, random.uniform(-0.2, 0.2), half=(0.024, 0.024, 0.055), z=0.055)
+    pad = _solid("pad", colours[1], goal, half=(0.052, 0.0015, 0.0), z=0.0015)
+    aside = [random.choice([-1, 1]) * random.uniform(0.022, 0.034), random.normal(0, 0.008)]
+    pole = _solid("cylinder", "white", (source + goal) / 2 + aside, half=(0.013, 0.075, 0.0), z=0.075, mass=0.03)
     instruction = f"place the {colours[0]} block on the {colours[1]} pad and knock nothing over"
     return Layout("detour", instruction, arm, start, block, pad, (pole,), look)
 
@@ -340,25 +449,16 @@ def _frame(colour: str, xy: np.ndarray, inner: float, thick: float) -> list[Soli
     high = 0.018
     offsets = [(inner + thick, 0.0), (-inner - thick, 0.0), (0.0, inner + thick), (0.0, -inner - thick)]
     long = inner + 2 * thick
+    halves = [(thick, long, high) if dx else (long, thick, high) for dx, _ in offsets]
     return [
-        Solid(
-            "wall",
-            colour,
-            float(xy[0] + dx),
-            float(xy[1] + dy),
-            half=(thick, long, high) if dx else (long, thick, high),
-            z=high,
-        )
-        for dx, dy in offsets
+        _solid("wall", colour, xy + offset, half=half, z=high) for offset, half in zip(offsets, halves, strict=True)
     ]
 
 
 def _peg_layout(robot: Robot, random: np.random.Generator, look: Look) -> Layout:
     arm, start, colours = _start(robot, random)
     at, goals = _two_goals(robot, arm, random)
-    block = Solid(
-        "box", colours[0], float(at[0]), float(at[1]), random.uniform(-0.1, 0.1), half=(0.022, 0.022, 0.060), z=0.060
-    )
+    block = _solid("box", colours[0], at, random.uniform(-0.1, 0.1), half=(0.022, 0.022, 0.060), z=0.060)
     wide, narrow = (
         _frame(colours[1], xy, *form) for xy, form in zip(goals, ((0.036, 0.005), (0.015, 0.010)), strict=True)
     )
@@ -388,22 +488,10 @@ def _peg_judge(ended: Ended, layout: Layout) -> Judged:
 def _stack_layout(robot: Robot, random: np.random.Generator, look: Look) -> Layout:
     arm, start, colours = _start(robot, random)
     at, (flat, round_) = _two_goals(robot, arm, random)
-    block = Solid(
-        "box", colours[0], float(at[0]), float(at[1]), random.uniform(-0.2, 0.2), half=(0.022, 0.022, 0.045), z=0.045
-    )
+    block = _solid("box", colours[0], at, random.uniform(-0.2, 0.2), half=(0.022, 0.022, 0.045), z=0.045)
     high, yaw = random.uniform(0.024, 0.028), random.uniform(-0.4, 0.4)
-    base = Solid("box", colours[1], float(flat[0]), float(flat[1]), yaw, half=(0.034, 0.034, high), z=high, mass=0.5)
-    roller = Solid(
-        "cylinder",
-        colours[1],
-        float(round_[0]),
-        float(round_[1]),
-        yaw,
-        half=(high, 0.043, 0.0),
-        z=high,
-        mass=0.5,
-        lying=True,
-    )
+    base = _solid("box", colours[1], flat, yaw, half=(0.034, 0.034, high), z=high, mass=0.5)
+    roller = _solid("cylinder", colours[1], round_, yaw, half=(high, 0.043, 0.0), z=high, mass=0.5, lying=True)
     instruction = f"put the {colours[0]} block on something {colours[1]}"
     return Layout("stack", instruction, arm, start, block, base, (roller,), look)
 
@@ -431,9 +519,9 @@ def _roll_layout(robot: Robot, random: np.random.Generator, look: Look) -> Layou
     arm, start, colours = _start(robot, random)
     middle = robot.side(arm) * sum(robot.reach_y) / 2
     x, y = random.uniform(0.35, 0.42), middle + random.uniform(-0.005, 0.005)
-    ball = Solid("ball", colours[0], float(x), float(y), half=(BALL, BALL, BALL), z=BALL, mass=0.06)
-    side = float(random.choice([-1, 1]))
-    rail = Solid("wall", "white", float(x), float(y + side * STOP_AWAY), half=(0.075, 0.006, 0.022), z=0.022)
+    ball = _solid("ball", colours[0], (x, y), half=(BALL, BALL, BALL), z=BALL, mass=0.06)
+    rail_y = y + random.choice([-1, 1]) * STOP_AWAY
+    rail = _solid("wall", "white", (x, rail_y), half=(0.075, 0.006, 0.022), z=0.022)
     return Layout("roll", f"push the {colours[0]} ball against the rail", arm, start, ball, None, (rail,), look)
 
 
@@ -446,11 +534,11 @@ def _roll_plan(robot: Robot, layout: Layout, random: np.random.Generator, knows:
     times = random.uniform(0.96, 1.03) * np.array([0.8, 1.2, 1.9, 2.5])
     return {
         layout.arm: [
-            _first(layout, layout.arm),
-            _at(times[0], before, 0.15, yaw, 0.0),
-            _at(times[1], before, 0.035, yaw, 0.0),
-            _at(times[2], end, 0.035, yaw, 0.0),
-            _at(times[3], end - [0.0, side * 0.05], 0.15, yaw, 0.0),
+            first_waypoint(layout, layout.arm),
+            waypoint(times[0], before, 0.15, yaw, 0.0),
+            waypoint(times[1], before, 0.035, yaw, 0.0),
+            waypoint(times[2], end, 0.035, yaw, 0.0),
+            waypoint(times[3], end - [0.0, side * 0.05], 0.15, yaw, 0.0),
         ]
     }
 

@@ -118,7 +118,8 @@ def _draw(plans: dict[str, float], random: np.random.Generator, mistakes: float 
     return str(random.choice(list(plans), p=shares / shares.sum()))
 
 
-def _at(time: float, xy: np.ndarray, z: float, yaw: float, opening: float) -> Waypoint:
+def waypoint(time: float, xy: np.ndarray, z: float, yaw: float, opening: float) -> Waypoint:
+    """A waypoint from numpy numbers."""
     return Waypoint(time, (float(xy[0]), float(xy[1]), float(z)), float(yaw), float(opening))
 
 
@@ -134,9 +135,10 @@ def _beside(robot: Robot, layout: Layout, random: np.random.Generator) -> np.nda
     return offset
 
 
-def _first(layout: Layout, arm: int | None = None) -> Waypoint:
-    x, y, z, yaw, opening = layout.start[layout.arm if arm is None else arm]
-    return _at(0.0, np.array([x, y]), z, yaw, opening)
+def first_waypoint(layout: Layout, arm: int) -> Waypoint:
+    """The place of an arm at the layout's start."""
+    x, y, z, yaw, opening = layout.start[arm]
+    return waypoint(0.0, np.array([x, y]), z, yaw, opening)
 
 
 def _grasp(
@@ -149,10 +151,10 @@ def _grasp(
     yaw, opened = target.yaw + random.normal(0, 0.06), random.uniform(*WIDE)
     closed = random.uniform(0.9, 1.0) if plan == "open" else 0.0
     points = [
-        _first(layout),
-        _at(times[0], xy, 0.20, yaw, opened),
-        _at(times[1], xy, height, yaw, opened),
-        _at(times[2], xy, height, yaw, closed),
+        first_waypoint(layout, layout.arm),
+        waypoint(times[0], xy, 0.20, yaw, opened),
+        waypoint(times[1], xy, height, yaw, opened),
+        waypoint(times[2], xy, height, yaw, closed),
     ]
     return points, xy, height, yaw, closed
 
@@ -165,9 +167,9 @@ def _lift(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: f
     away = xy + random.normal(0, 0.015, 2)
     if plan == "relax":
         closed = random.uniform(*RELAXED)
-    points.append(_at(times[3], away, height + rise, yaw, closed))
+    points.append(waypoint(times[3], away, height + rise, yaw, closed))
     if plan == "release":
-        points.append(_at(times[4], away, height + rise, yaw, random.uniform(*WIDE)))
+        points.append(waypoint(times[4], away, height + rise, yaw, random.uniform(*WIDE)))
     return points
 
 
@@ -184,18 +186,18 @@ def _place(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: 
     carried = height + 0.09
     if plan == "relax":
         closed = random.uniform(*RELAXED)
-    points.append(_at(times[3], xy + 0.25 * (goal - xy), carried, yaw, closed))
+    points.append(waypoint(times[3], xy + 0.25 * (goal - xy), carried, yaw, closed))
     if plan == "release":
         middle = xy + random.uniform(0.4, 0.6) * (goal - xy)
-        points += [_at(times[4], middle, carried, yaw, closed), _at(times[6], middle, carried, yaw, opened)]
+        points += [waypoint(times[4], middle, carried, yaw, closed), waypoint(times[6], middle, carried, yaw, opened)]
         return points
-    points.append(_at(times[4], goal, carried, turn, closed))
+    points.append(waypoint(times[4], goal, carried, turn, closed))
     if plan == "keep":
         return points
     points += [
-        _at(times[5], goal, height + 0.003, turn, closed),
-        _at(times[6], goal, height + 0.004, turn, opened),
-        _at(times[7], goal, height + 0.11, turn, opened),
+        waypoint(times[5], goal, height + 0.003, turn, closed),
+        waypoint(times[6], goal, height + 0.004, turn, opened),
+        waypoint(times[7], goal, height + 0.11, turn, opened),
     ]
     return points
 
@@ -222,11 +224,11 @@ def _close(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: 
     left_open = random.uniform(0.45, 0.85) * DRAWER_TRAVEL if plan == "short" else -0.006
     before, end = np.array([front - DRAWER_TRAVEL - 0.035, y]), np.array([front - left_open, y])
     return [
-        _first(layout),
-        _at(times[0], before, z + 0.08, yaw, opening),
-        _at(times[1], before, z, yaw, opening),
-        _at(times[2], end, z, yaw, opening),
-        _at(times[3], end - [0.06, 0.0], z + 0.06, yaw, opening),
+        first_waypoint(layout, layout.arm),
+        waypoint(times[0], before, z + 0.08, yaw, opening),
+        waypoint(times[1], before, z, yaw, opening),
+        waypoint(times[2], end, z, yaw, opening),
+        waypoint(times[3], end - [0.06, 0.0], z + 0.06, yaw, opening),
     ]
 
 
@@ -242,11 +244,11 @@ def _press(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: 
     z = PRESSED_HEIGHT if plan != "short" else CAP_TOP + random.uniform(0.06, 0.08)
     yaw, opening = random.normal(0, 0.2), random.uniform(0.0, 0.1)
     return [
-        _first(layout),
-        _at(times[0], goal, 0.19, yaw, opening),
-        _at(times[1], goal, z, yaw, opening),
-        _at(times[2], goal, z, yaw, opening),
-        _at(times[3], goal - [0.04, 0.0], 0.18, yaw, opening),
+        first_waypoint(layout, layout.arm),
+        waypoint(times[0], goal, 0.19, yaw, opening),
+        waypoint(times[1], goal, z, yaw, opening),
+        waypoint(times[2], goal, z, yaw, opening),
+        waypoint(times[3], goal - [0.04, 0.0], 0.18, yaw, opening),
     ]
 
 
@@ -270,14 +272,14 @@ def _carry(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: 
         closed = random.uniform(0.9, 1.0) if spoiled == "open" else 0.0
         carried = random.uniform(*RELAXED) if spoiled == "relax" else closed
         points = [
-            _first(layout, arm),
-            _at(times[0], xy, 0.21, yaw, opened),
-            _at(times[1], xy, z, yaw, opened),
-            _at(times[2], xy, z, yaw, closed),
-            _at(times[3], xy + away, z + rise, yaw, carried),
+            first_waypoint(layout, arm),
+            waypoint(times[0], xy, 0.21, yaw, opened),
+            waypoint(times[1], xy, z, yaw, opened),
+            waypoint(times[2], xy, z, yaw, closed),
+            waypoint(times[3], xy + away, z + rise, yaw, carried),
         ]
         if spoiled == "release":
-            points.append(_at(times[4], xy + away, z + rise, yaw, random.uniform(*WIDE)))
+            points.append(waypoint(times[4], xy + away, z + rise, yaw, random.uniform(*WIDE)))
         plans.append(points)
     return plans
 
@@ -287,17 +289,15 @@ _TASKS = {"lift": _lift, "place": _place, "close": _close, "press": _press}
 
 def _idle(robot: Robot, layout: Layout, arm: int, random: np.random.Generator, duration: float) -> list[Waypoint]:
     """The arm without a task rests, or moves slowly above the things."""
-    x, y, z, yaw, opening = layout.start[arm]
-    points = [_at(0.0, np.array([x, y]), z, yaw, opening)]
+    points, time, opening = [first_waypoint(layout, arm)], 0.0, layout.start[arm][4]
     if random.uniform() < 0.4:
         return points
-    time = 0.0
     while time < duration:
         time += float(random.uniform(1.3, 2.2))
         goal = layout.start[arm][:4] + 0.6 * (free_tool(robot, arm, random) - layout.start[arm][:4])
         if random.uniform() < 0.4:
             opening = random.uniform(0.7, 1.0) if opening < 0.5 else random.uniform(0.0, 0.3)
-        points.append(_at(time, goal[:2], goal[2], goal[3], opening))
+        points.append(waypoint(time, goal[:2], goal[2], goal[3], opening))
     return points
 
 
@@ -316,20 +316,15 @@ def plan_waypoints(
         mistakes: the share of plans that go wrong; by default each task's own.
         acting: waypoints of the arms that act, where they are already planned.
     """
-    if acting is not None:
-        plans = [
-            acting[arm] if arm in acting else _idle(robot, layout, arm, random, duration)
-            for arm in range(len(robot.arms))
-        ]
-    elif layout.family == "carry":
-        plans = _carry(robot, layout, random, mistakes)
-    else:
-        plans = [
-            _TASKS[layout.family](robot, layout, random, mistakes)
-            if arm == layout.arm
-            else _idle(robot, layout, arm, random, duration)
-            for arm in range(len(robot.arms))
-        ]
+    planned = dict(enumerate(_carry(robot, layout, random, mistakes))) if layout.family == "carry" else acting or {}
+    plans = []
+    for arm in range(len(robot.arms)):
+        if arm in planned:
+            plans.append(planned[arm])
+        elif arm == layout.arm:
+            plans.append(_TASKS[layout.family](robot, layout, random, mistakes))
+        else:
+            plans.append(_idle(robot, layout, arm, random, duration))
     if duration > TASK_SECONDS:
         _go_on(robot, layout, plans, random, duration)
     return plans
@@ -350,7 +345,7 @@ def _go_on(
             else:
                 x, y, z, yaw = free_tool(robot, arm, random) + np.array([0.0, 0.0, 0.03, 0.0])
                 xy = np.array([x, y])
-            plans[arm].append(_at(time, xy, z, yaw, plans[arm][-1].opening))
+            plans[arm].append(waypoint(time, xy, z, yaw, plans[arm][-1].opening))
 
 
 def shifted(points: list[Waypoint], offset: np.ndarray) -> list[Waypoint]:

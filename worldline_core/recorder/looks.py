@@ -69,16 +69,10 @@ class Look:
 
     def paint(self, colour: Colour) -> Colour:
         """A thing's colour in this look."""
+        if (self.hue_deg, self.saturation, self.value) == (0.0, 1.0, 1.0):  # back and forth rounds
+            return colour
         hue, saturation, value = colorsys.rgb_to_hsv(*colour)
-        return (
-            _hsv(hue + self.hue_deg / 360, saturation * self.saturation, value * self.value)
-            if self.recoloured
-            else colour
-        )
-
-    @property
-    def recoloured(self) -> bool:
-        return (self.hue_deg, self.saturation, self.value) != (0.0, 1.0, 1.0)
+        return _hsv(hue + self.hue_deg / 360, saturation * self.saturation, value * self.value)
 
 
 def _hsv(hue: float, saturation: float, value: float) -> Colour:

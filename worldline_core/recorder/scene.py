@@ -211,8 +211,8 @@ PLATE_TOP = 0.024
 # A tray with a handle near each end, as wide as a block: one for each arm. Its ends lie along its own y.
 TRAY_HALF, HANDLE_HALF, HANDLE_APART = (0.048, 0.150, 0.010), (0.028, 0.028, 0.050), 0.115
 HANDLES = {"left": HANDLE_APART, "right": -HANDLE_APART}
-# A button that is down by more than this share of its travel is pressed.
-BUTTON_DOWN = 0.5
+# A button that is down by more than this share of its travel is pressed; a thing that is so much higher [m] is lifted.
+BUTTON_DOWN, LIFTED = 0.5, 0.07
 HouseholdFamily = Literal["lift", "place", "close", "press", "carry"]
 ContactFamily = Literal["grip", "balance", "topple", "detour", "peg", "stack", "roll", "both", "level"]
 Family = HouseholdFamily | ContactFamily
@@ -471,7 +471,7 @@ def apply_layout(scene: SceneModel, data: Any, layout: Layout) -> None:
 def thing_labels(scene: SceneModel, layout: Layout) -> np.ndarray:
     """uint8 (number of geoms,): 1 for those of the target, 2 of the goal, 3.. of the others, 0 for the rest.
 
-    Of a drawer only what slides belongs to it; a button's plate belongs to it, because it lights up.
+    Of a drawer only what slides belongs to it; all of any other thing does, also a button's plate, because it lights up.
     """
     labels = np.zeros(scene.model.ngeom, np.uint8)
     others = 3
@@ -479,8 +479,8 @@ def thing_labels(scene: SceneModel, layout: Layout) -> np.ndarray:
         label = 1 if thing is layout.target else 2 if thing is layout.goal else others
         others += label > 2
         labels[scene.model.geom(name).id] = label
-        for part in {"button": ("plate",), "tray": tuple(HANDLES)}.get(thing.kind, ()):
-            labels[scene.model.geom(f"{name}_{part}").id] = label
+        if thing.kind != "drawer":
+            labels[scene.model.geom_bodyid == scene.model.body(name).id] = label
     return labels
 
 

@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.overlays import axis_tips
 from worldline_core.errors import DataError
-from worldline_core.geometry.inverse_kinematics import InverseKinematics
-from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.kinematics import ArmKinematics, InverseKinematics
 from worldline_core.rollout.observation import image_size, project_controls
 from worldline_core.rollout.recorded_starts import RecordedStart
 
