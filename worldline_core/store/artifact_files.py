@@ -16,8 +16,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError
 from worldline_core.store.atomic import write_json_atomic
 
@@ -176,6 +177,18 @@ def digest_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+class ListedFile(StrictModel):
+    """Size [bytes] and digest of a file, as manifests and publications list it."""
+
+    size: int = Field(ge=0)
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+def describe_file(path: Path) -> ListedFile:
+    """Size and digest of the file at a path."""
+    return ListedFile(size=path.stat().st_size, sha256=digest_file(path))
+
+
 def leads_out(path: Path, root: Path) -> bool:
     """True if a path ends outside of a folder. Snapshots of the Hub's cache may use the blobs of their own repository."""
     target, root = path.resolve(), root.resolve()
@@ -213,10 +226,8 @@ def _files_by_name(folder: Path, *, everything: bool = False) -> dict[str, Path]
 
 def content_files(folder: Path, *, everything: bool = False) -> dict[str, JsonObject]:
     """`size` [bytes] and `sha256` of every file of a folder's content by relative name, as a manifest lists them."""
-    return {
-        name: {"size": path.stat().st_size, "sha256": digest_file(path)}
-        for name, path in _files_by_name(folder, everything=everything).items()
-    }
+    files = _files_by_name(folder, everything=everything)
+    return {name: describe_file(path).model_dump() for name, path in files.items()}
 
 
 def digest_listed(files: Mapping[str, JsonObject]) -> str:
@@ -257,17 +268,12 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> str:
     return content["digest"]
 
 
-class _ListedFile(BaseModel):
-    size: int
-    sha256: str
-
-
 class _Manifest(BaseModel):
     """Fields of a manifest that readers rely on."""
 
     model_config = ConfigDict(strict=True)
     digest: str
-    files: dict[str, _ListedFile]
+    files: dict[str, ListedFile]
     step: str = ""
     metrics: dict[str, Any] = {}
     config: dict[str, Any] = {}
