@@ -33,6 +33,7 @@ from worldline_core.store.artifact_files import (
     ListedFile,
     describe_file,
     folder_files,
+    shortened,
     verify_artifact,
 )
 from worldline_core.store.remote import AnyPath, file_system, first_line, list_files, parse_location
@@ -85,7 +86,7 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
         foreign = sorted(present.keys() - sending.keys() - {".gitattributes"})
         if FILE_LIST not in present and foreign:
             raise ArtifactError(
-                "The location holds files that are not of this set", where=where, got="; ".join(foreign),
+                "The location holds files that are not of this set", where=where, got=shortened(foreign),
                 expected="an empty location, or an earlier push", next_step="push to a location of its own",
             )  # fmt: skip
         earlier = _read_list(location, present).files if FILE_LIST in present else {}
@@ -113,15 +114,14 @@ def pull(where: str, folder: Path) -> FileList:
             _check_names(contents.files, where)
             wrong = [name for name, file in contents.files.items() if present.get(name) != file.size]
             if not wrong:
-                for path in folder_files(unfinished, everything=True):  # of an earlier, interrupted pull
-                    name = path.relative_to(unfinished)
-                    if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
+                for name, path in folder_files(unfinished, everything=True).items():  # of an earlier, interrupted pull
+                    if name not in contents.files and not name.startswith(f"{VOLATILE_FOLDER}/"):
                         path.unlink()
                 with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
                     wrong = list(filter(None, pool.map(partial(_fetch, location, unfinished), contents.files.items())))
         if wrong:
             raise ArtifactError(
-                "Published files are not those of the set", where=where, got="; ".join(wrong),
+                "Published files are not those of the set", where=where, got=shortened(wrong),
                 expected=f"the files with the sizes and digests of {FILE_LIST}",
                 next_step="pull again; if it stays, delete the published copy and push the set again",
             )  # fmt: skip
@@ -140,11 +140,10 @@ def set_files(folder: Path) -> dict[str, Path]:
     linked = sorted({r.dataset for r in EpisodeSet.open(folder).rows if ".." in PurePosixPath(r.dataset).parts})
     if linked:
         raise ArtifactError(
-            "The set refers to datasets of another artifact", where=folder, got="; ".join(linked),
+            "The set refers to datasets of another artifact", where=folder, got=shortened(linked),
             next_step=f"make it whole first: worldline export {folder} --format lerobot --output FOLDER",
         )  # fmt: skip
-    paths = [*folder_files(folder), *(folder.glob(MANIFEST_NAME))]
-    return {path.relative_to(folder).as_posix(): path for path in paths}
+    return folder_files(folder) | {path.name: path for path in folder.glob(MANIFEST_NAME)}
 
 
 def _check_new(folder: Path) -> None:

@@ -71,7 +71,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> dict[st
 @pytest.mark.parametrize("kind", ["curate", "filter"])
 def test_a_flipped_byte_is_named_before_it_is_used(run: Run, kind: str, tmp_path: Path) -> None:
     folder = run[kind]
-    for path in [*folder_files(folder), folder / "manifest.json"]:
+    for path in [*folder_files(folder).values(), folder / "manifest.json"]:
         size = path.stat().st_size
         for place, position in enumerate(sorted({0, 4 * size // 5} & set(range(size)))):
             with flipped(path, position, 0 if path.suffix == ".json" else place):
