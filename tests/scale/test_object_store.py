@@ -17,7 +17,7 @@ from object_store import BUCKET, ObjectStore
 from upath import UPath
 
 from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImports]
-from tests.data.curating import record
+from tests.data.curating import record, run
 from tools.corrupted import lerobot_v21, mcap
 from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.curation.curate import curate
@@ -145,9 +145,7 @@ def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, store: Ob
         url.fs.invalidate_cache()
         digests.append(artifacts.input_digest(url))
     assert digests[0] == digests[1] != digests[2]
-    assert not [
-        path for method, path in store.requests if method == "GET" and "/key/" in path
-    ]  # the listing says enough
+    assert not [path for method, path in store.requests if method == "GET" and "/key/" in path]  # listings say enough
 
 
 def test_a_set_is_pushed_and_pulled(tmp_path: Path, recordings: Path, store: ObjectStore) -> None:
@@ -220,17 +218,11 @@ def test_the_same_bytes_from_a_folder_and_from_elsewhere(
     if broken := {"mcap": "broken.mcap", "video_folder": "broken.mp4"}.get(layout):
         (local / broken).write_bytes(b"no recording")
     remote = UPath(f"memory://{tmp_path.name}/{local.name}")
-    for file in (path for path in local.rglob("*") if path.is_file()):
-        place = remote / file.relative_to(local).as_posix()
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes(file.read_bytes())
+    remote.fs.put(f"{local}/", remote.path, recursive=True)
     made = []
     for number, path in enumerate((local, remote)):
-        changed = source | {"path": str(path), "name": "rec"}
-        counts = curate(
-            CurateConfig.model_validate({"sources": [changed], "min_frames": 1}), {}, tmp_path / f"{number}"
-        )
-        made.append((counts, digest_folder(tmp_path / f"{number}")))
+        counts, curated = run(tmp_path / str(number), source | {"path": str(path), "name": "rec"}, min_frames=1)
+        made.append((counts, digest_folder(curated.root)))
     assert made[0][0]["kept"] == 1
     assert made[0][0]["quarantined"] == (layout in ("lerobot_v21", "mcap", "video_folder"))
     assert made[0] == made[1]
