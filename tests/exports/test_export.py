@@ -8,7 +8,6 @@ import os
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.mcap.exported import read_exported_episode
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.exports.export import export, export_rollout, shown_tracks, write_prediction_mcap
+from worldline_core.exports.export import export, shown_tracks, write_prediction_mcap
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -162,9 +161,6 @@ def test_what_is_not_exported_is_named(linked: Path, tmp_path: Path) -> None:
         export(linked, tmp_path, ["mp4"])
     with pytest.raises(DataError, match=r"(?s)No such episode.*nothing"):
         export(linked, tmp_path, ["mcap"], episode_ids=["nothing"])
-    rollouts: Any = {"stage2": SimpleNamespace(method="stage2", episode_ids=("robot/1",))}
-    with pytest.raises(DataError, match=r"(?s)robot/2.*stage2"):
-        export_rollout(rollouts, None, None, "robot/2", tmp_path, ("mp4",))  # type: ignore[arg-type]
 
 
 def test_demonstrations_alone_are_exported(linked: Path, tmp_path: Path) -> None:
@@ -236,7 +232,7 @@ def test_rerun_signals_are_named_and_timed_and_the_robot_lies_along_its_capsules
 def test_mcap_holds_images_calibration_and_transforms(content: RecordingContent, tmp_path: Path) -> None:
     path, again, ros2 = (tmp_path / f"{name}.mcap" for name in ("episode", "again", "ros2"))
     for file in (path, again):
-        write_prediction_mcap(file, content, "stage2", "protobuf")
+        write_prediction_mcap(file, content, "protobuf")
     with path.open("rb") as stream:
         reader = make_reader(stream)
         found = [(channel.topic, message.log_time) for _, channel, message in reader.iter_messages()]
@@ -246,6 +242,6 @@ def test_mcap_holds_images_calibration_and_transforms(content: RecordingContent,
     assert found[-1][1] == round((COUNT - 1) / 8.0 * 1e9)
     assert json.loads(facts["method"]) == "stage2"
     assert again.read_bytes() == path.read_bytes()
-    write_prediction_mcap(ros2, content, "stage2", "ros2")
+    write_prediction_mcap(ros2, content, "ros2")
     counts = Counter(message.channel.topic for message in read_ros2_messages(str(ros2)))
     assert counts == topics | {"/tf": 4 * COUNT, "/tf_static": 1}

@@ -128,17 +128,18 @@ def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
     """
     fs = file_system(root)
     base = fs._strip_protocol(str(root)).rstrip("/")
+    found: dict[str, Any]
     own: Any = type(fs)._find if isinstance(fs, AsyncFileSystem) else type(fs).find
     with _answering(root):
         if own in (AsyncFileSystem._find, AbstractFileSystem.find):
             # This walk silently omits folders that it could not list: `on_error` does not reach folders further down.
-            found, folders = dict[str, dict[str, Any]](), [base] if fs.exists(base) else []
+            found, folders = {}, [base] if fs.exists(base) else []
             for folder in folders:
                 listed = {about["name"].rstrip("/"): about for about in fs.ls(folder, detail=True)}
                 found |= {name: about for name, about in listed.items() if about["type"] != "directory"}
                 folders += [name for name in listed.keys() - found.keys() if name != folder]
         else:
-            found = fs.find(base, detail=True)
+            found = cast("dict[str, Any]", fs.find(base, detail=True))
     return {name: found[path] for path in sorted(found) if (name := path.removeprefix(base).lstrip("/"))}
 
 
