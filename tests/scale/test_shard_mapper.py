@@ -146,8 +146,11 @@ class ClientPayloadError(Exception):
     __module__ = "aiohttp.client_exceptions"
 
 
+# A reader's own words do not hide the network.
+UNREADABLE = RejectedInputError("unreadable", "Parquet file cannot be read")
+UNREADABLE.__cause__ = OSError(errno.ESTALE, "stale file handle")
 PASSING = [
-    ConnectionResetError(), TimeoutError(), OSError(errno.EIO, "I/O error"), OSError(errno.ESTALE, "stale"), ClientError(503),
+    UNREADABLE, ConnectionResetError(), TimeoutError(), OSError(errno.EIO, "I/O error"), OSError(errno.ESTALE, "stale"), ClientError(503),
     ClientError(429), ClientPayloadError("cut"), UnreachableInputError("away"),
 ]  # fmt: skip
 BAD_DATA = [
@@ -173,12 +176,6 @@ def test_what_passes_is_tried_again_and_what_every_episode_would_meet_ends_the_r
     error: Exception, passes: bool, ends: bool
 ) -> None:
     assert (is_transient(error), ends_the_run(error)) == (passes, ends)
-
-
-def test_a_readers_own_words_do_not_hide_the_network() -> None:
-    error = RejectedInputError("unreadable", "Parquet file cannot be read")
-    error.__cause__ = OSError(errno.ESTALE, "stale file handle")
-    assert is_transient(error)
 
 
 def rows(*statuses: Literal["kept", "quarantined"]) -> list[InputRow]:
