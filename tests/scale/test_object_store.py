@@ -13,11 +13,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
-from object_store import BUCKET, ObjectStore
 from upath import UPath
 
 from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImports]
 from tests.data.curating import record, run
+from tests.scale.conftest import BUCKET, ObjectStore
 from tools.corrupted import lerobot_v21, mcap
 from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.curation.curate import curate
@@ -148,13 +148,14 @@ def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, store: Ob
     assert not [path for method, path in store.requests if method == "GET" and "/key/" in path]  # listings say enough
 
 
-def test_a_set_is_pushed_and_pulled(tmp_path: Path, recordings: Path, store: ObjectStore) -> None:
-    store.upload(tmp_path / "nothing", "x")  # makes the bucket
-    pushed = push(recordings, f"s3://{BUCKET}/there")
-    assert pull(f"s3://{BUCKET}/there", tmp_path / "back") == pushed
+@pytest.mark.usefixtures("store")
+def test_a_set_is_pushed_and_pulled(tmp_path: Path, recordings: Path) -> None:
+    where = f"s3://{BUCKET}/there"
+    pushed = push(recordings, where)
+    assert pull(where, tmp_path / "back") == pushed
     assert digest_folder(tmp_path / "back") == digest_folder(recordings)
     with pytest.raises(ArtifactError, match="Folder exists already"):
-        pull(f"s3://{BUCKET}/there", tmp_path / "back")
+        pull(where, tmp_path / "back")
 
 
 def test_in_a_folder_the_card_takes_the_place_of_a_page_that_is_gone(tmp_path: Path, recordings: Path) -> None:
@@ -172,7 +173,6 @@ def test_in_a_folder_the_card_takes_the_place_of_a_page_that_is_gone(tmp_path: P
 @pytest.mark.parametrize("refused", [".json", ".txt"])
 def test_an_interrupted_second_push_goes_on(tmp_path: Path, recordings: Path, store: ObjectStore, refused: str) -> None:
     """Files that the second set lacks are removed and those of another content sent, also after an interruption."""
-    store.upload(tmp_path / "nothing", "x")
     where, folder = f"s3://{BUCKET}/again{refused}", shutil.copytree(recordings, tmp_path / "set")
     (folder / "first.txt").write_text("of the first push alone")
     (folder / "both.txt").write_text("one")
