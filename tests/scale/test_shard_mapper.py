@@ -38,7 +38,7 @@ from worldline_core.store.remote import UnreachableInputError, is_transient
 
 
 def run(folder: Path, values: Sequence[int], size: int, kind: str, **settings: Any) -> None:
-    config = RunnerConfig.model_validate({"kind": kind, "workers": 2, "retry_seconds": 0.05, **settings})
+    config = RunnerConfig.model_validate({"kind": kind, "workers": 2, "retry_seconds": 0.1, **settings})
     map_episodes(shard_mapper(config), NumberWork(folder), list(batched(values, size)))
 
 
