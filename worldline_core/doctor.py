@@ -75,15 +75,16 @@ def third_party_licences(project: Path) -> list[str]:
     """A line for each installed package with the licence that it states and the libraries in its wheel, and for each licence
     file beside shipped files."""
     lines = []
-    for package in sorted(importlib.metadata.distributions(), key=lambda found: found.name.lower()):
-        facts = package.metadata
+    # Each access parses a package's metadata anew.
+    packages = [(found.metadata, found.read_text("RECORD") or "") for found in importlib.metadata.distributions()]
+    for facts, record in sorted(packages, key=lambda package: package[0]["Name"].lower()):
         listed = facts.get_all("Classifier") or []
         classifiers = [text.rsplit(" :: ", 1)[-1] for text in listed if text.startswith("License ::")]
         stated = facts.get("License-Expression") or ", ".join(classifiers) or (facts.get("License") or "").strip()
-        bundled = sorted(set(_BUNDLED.findall(package.read_text("RECORD") or "")))
+        bundled = sorted(set(_BUNDLED.findall(record)))
         gpl = [name for name in bundled if name in _BUNDLED_GPL]
         lines.append(
-            f"{package.name} {package.version}: {stated.splitlines()[0][:80] if stated else 'not stated'}"
+            f"{facts['Name']} {facts['Version']}: {stated.splitlines()[0][:80] if stated else 'not stated'}"
             + (f"; in its wheel: {', '.join(bundled)}" if bundled else "")
             + (f" ({' and '.join(gpl)}: GPL-2.0-or-later)" if gpl else "")
         )

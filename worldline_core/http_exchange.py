@@ -57,12 +57,11 @@ def exchange(
         urlsplit(url).port  # noqa: B018  (raises for a port above 65535)
         # Half a second to end by itself; only the resolution of a name cannot be cancelled.
         return within(timeout_s + 0.5, lambda: asyncio.run(answered()))
-    except TimeoutError:
-        raise IncompleteResponseError(f"TimeoutError: no whole answer within {timeout_s:g} s") from None
     except (httpx.ConnectError, httpx.UnsupportedProtocol, httpx.ProxyError, httpx.InvalidURL, ValueError) as error:
         raise UnreachableError(f"{type(error).__name__}: {error}") from error
     except (httpx.HTTPError, OSError) as error:
-        raise IncompleteResponseError(f"{type(error).__name__}: {error}") from error
+        detail = f"no whole answer within {timeout_s:g} s" if isinstance(error, TimeoutError) else error
+        raise IncompleteResponseError(f"{type(error).__name__}: {detail}") from error
 
 
 def within[T](seconds: float, call: Callable[[], T], *, discard: Callable[[T], object] = lambda late: None) -> T:
@@ -103,9 +102,8 @@ def hub_snapshot(repo_id: str, patterns: list[str], *, what: str, **options: Any
         return Path(snapshot_download(repo_id, allow_patterns=patterns, **hub_access(), **options))
     except (httpx.HTTPError, OSError, ValueError) as error:  # which the client's own errors are
         raise UnavailableError(
-            f"The hub does not give this {what}",
-            where=repo_id,
-            expected="a folder of that name here, or the repository on the hub or in its local cache",
+            f"The hub does not give this {what}", where=repo_id,
             got=f"{type(error).__name__}: {next(iter(str(error).strip().splitlines()), '')}"[:300],
+            expected="a folder of that name here, or the repository on the hub or in its local cache",
             next_step="check the name, the network and HF_TOKEN; offline, download it elsewhere and give its folder",
-        ) from error
+        ) from error  # fmt: skip

@@ -17,7 +17,7 @@ from typing import Any, Literal, cast
 
 import httpx
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from upath import UPath
 
 from worldline_core.config import StrictModel
@@ -30,8 +30,10 @@ from worldline_core.report.data import write_card
 from worldline_core.store.artifact_files import (
     MANIFEST_NAME,
     VOLATILE_FOLDER,
-    digest_file,
+    ListedFile,
+    describe_file,
     folder_files,
+    shortened,
     verify_artifact,
 )
 from worldline_core.store.remote import AnyPath, file_system, first_line, list_files, parse_location
@@ -44,27 +46,11 @@ _PIECE_BYTES = 1 << 20
 _HUB_LOCATION = re.compile(r"hf://datasets/(?P<id>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?/?")
 
 
-class PublishedFile(StrictModel):
-    """Size and digest of a file."""
-
-    size: int = Field(ge=0)
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
-
-    @classmethod
-    def of(cls, path: Path) -> PublishedFile:
-        """Size and digest of the file at a path."""
-        return cls(size=path.stat().st_size, sha256=digest_file(path))
-
-    def is_at(self, path: Path) -> bool:
-        """Returns whether this is the file at a path."""
-        return path.is_file() and self.of(path) == self
-
-
 class FileList(StrictModel):
     """The files of a published set by path; neither the list itself nor the dataset card is among them."""
 
     version: Literal[3] = 3
-    files: dict[str, PublishedFile]
+    files: dict[str, ListedFile]
 
     @property
     def num_bytes(self) -> int:
@@ -85,29 +71,27 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
         ConfigError for an unknown location; UnavailableError without a token.
     """
     verify_artifact(folder)
-    sources = set_files(folder)
+    sending = set_files(folder)
     if not allow_restricted:
         _check_may_publish(folder, public=public)
-    contents = FileList(files={name: PublishedFile.of(path) for name, path in sorted(sources.items())})
-    _check_names(sources, folder)
-    card = {} if "README.md" in sources else {"README.md": write_card(folder, folder / VOLATILE_FOLDER / "card")}
-    sending = sources | card
+    _check_names(sending, folder)
+    contents = FileList(files={name: describe_file(path) for name, path in sorted(sending.items())})
+    if "README.md" not in sending:
+        sending["README.md"] = write_card(folder, folder / VOLATILE_FOLDER / "card")
     with _client_errors(where, "push"):
-        hub = _Repository(where) if where.startswith("hf://") else None
-        location = hub.prepare(public=public) if hub else _location(where)
+        if where.startswith("hf://"):
+            _prepare_repository(where, public=public)
+        location = _location(where)
         present = _sizes(location)
         foreign = sorted(present.keys() - sending.keys() - {".gitattributes"})
         if FILE_LIST not in present and foreign:
             raise ArtifactError(
-                "The location holds files that are not of this set",
-                where=where,
-                expected="an empty location, or an earlier push",
-                got=_shortened(foreign),
-                next_step="push to a location of its own",
-            )
+                "The location holds files that are not of this set", where=where, got=shortened(foreign),
+                expected="an empty location, or an earlier push", next_step="push to a location of its own",
+            )  # fmt: skip
         earlier = _read_list(location, present).files if FILE_LIST in present else {}
         gone = sorted((earlier.keys() - sending.keys()) & present.keys())
-        (hub.commit if hub else partial(_send, location))(sending, gone, contents.model_dump_json(indent=1).encode())
+        _send(where, location, sending, gone, contents.model_dump_json(indent=1).encode())
     return contents
 
 
@@ -117,28 +101,30 @@ def pull(where: str, folder: Path) -> FileList:
     Raises: ArtifactError when the folder exists, no finished set is published there, names or files do not match the list,
         or the store refuses; ConfigError for an unknown location; UnreachableInputError when the store does not answer.
     """
-    if folder.exists():
-        raise ArtifactError("Folder exists already", where=folder, next_step="pull into a new folder")
+    _check_new(folder)
     unfinished = folder.with_name(f"{folder.name}.partial")
     with folder_lock(unfinished):
-        if folder.exists():
-            raise ArtifactError("Another command has pulled into this folder", where=folder)
+        _check_new(folder)  # another command may have finished meanwhile
         with _client_errors(where, "pull"):
-            location = _Repository(where).pinned() if where.startswith("hf://") else _location(where)
+            location = _location(where)
             present = _sizes(location)
             if FILE_LIST not in present:
                 raise ArtifactError("No finished EpisodeSet is published here", where=where, expected=FILE_LIST)
             contents = _read_list(location, present)
             _check_names(contents.files, where)
-            _raise_mismatch([name for name, file in contents.files.items() if present.get(name) != file.size], where)
-            for path in folder_files(unfinished, everything=True):  # of an earlier, interrupted pull
-                name = path.relative_to(unfinished)
-                if name.as_posix() not in contents.files and name.parts[0] != VOLATILE_FOLDER:
-                    path.unlink()
-            missing = {name: file for name, file in contents.files.items() if not file.is_at(unfinished / name)}
-            with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-                list(pool.map(partial(_fetch, location, unfinished), missing, [file.size for file in missing.values()]))
-            _raise_mismatch([name for name, file in missing.items() if not file.is_at(unfinished / name)], where)
+            wrong = [name for name, file in contents.files.items() if present.get(name) != file.size]
+            if not wrong:
+                for name, path in folder_files(unfinished, everything=True).items():  # of an earlier, interrupted pull
+                    if name not in contents.files and not name.startswith(f"{VOLATILE_FOLDER}/"):
+                        path.unlink()
+                with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
+                    wrong = list(filter(None, pool.map(partial(_fetch, location, unfinished), contents.files.items())))
+        if wrong:
+            raise ArtifactError(
+                "Published files are not those of the set", where=where, got=shortened(wrong),
+                expected=f"the files with the sizes and digests of {FILE_LIST}",
+                next_step="pull again; if it stays, delete the published copy and push the set again",
+            )  # fmt: skip
         set_files(unfinished)  # a set that refers to folders beside it would read what others put there
         verify_artifact(unfinished)
         unfinished.rename(folder)
@@ -154,14 +140,15 @@ def set_files(folder: Path) -> dict[str, Path]:
     linked = sorted({r.dataset for r in EpisodeSet.open(folder).rows if ".." in PurePosixPath(r.dataset).parts})
     if linked:
         raise ArtifactError(
-            "The set refers to datasets of another artifact",
-            where=folder,
-            expected="datasets inside of the folder",
-            got=_shortened(linked),
+            "The set refers to datasets of another artifact", where=folder, got=shortened(linked),
             next_step=f"make it whole first: worldline export {folder} --format lerobot --output FOLDER",
-        )
-    paths = [*folder_files(folder), *(folder.glob(MANIFEST_NAME))]
-    return {path.relative_to(folder).as_posix(): path for path in paths}
+        )  # fmt: skip
+    return folder_files(folder) | {path.name: path for path in folder.glob(MANIFEST_NAME)}
+
+
+def _check_new(folder: Path) -> None:
+    if folder.exists():
+        raise ArtifactError("Folder exists already", where=folder, next_step="pull into a new folder")
 
 
 def _check_may_publish(folder: Path, *, public: bool) -> None:
@@ -169,24 +156,20 @@ def _check_may_publish(folder: Path, *, public: bool) -> None:
     for recordings meant for evaluation only.
     """
     sources, rows = read_source_table(folder), EpisodeSet.open(folder).rows
-    forbidden, unknown = (
-        [f"{source.label} ({source.license})" for source in sources if source.redistribution == kind]
-        for kind in ("no", "unknown")
-    )
-    evaluation = {r.source for r in rows if for_evaluation_only(json.loads(r.conventions), r.source, r.embodiment)}
-    for what, names in (
-        ("Sources forbid redistribution", forbidden),
-        ("Sources are for evaluation only", sorted(evaluation)),
-        ("Sources do not state whether redistribution is allowed", (unknown if sources else ["all"]) if public else []),
-    ):
+    unknown = [source.label for source in sources if source.redistribution == "unknown"] if sources else ["all"]
+    refused = {
+        "Sources forbid redistribution": [f"{s.label} ({s.license})" for s in sources if s.redistribution == "no"],
+        "Sources are for evaluation only": sorted(
+            {r.source for r in rows if for_evaluation_only(json.loads(r.conventions), r.source, r.embodiment)}
+        ),
+        "Sources do not state whether redistribution is allowed": unknown if public else [],
+    }
+    for what, names in refused.items():
         if names:
             raise DataError(
-                what,
-                where=folder,
-                expected="curate.sources[].redistribution: yes",
-                got=", ".join(names),
+                what, where=folder, expected="curate.sources[].redistribution: yes", got=", ".join(names),
                 next_step="leave these sources out, or, if you have the right, add --allow-restricted",
-            )
+            )  # fmt: skip
 
 
 def _check_names(names: Mapping[str, object], where: object) -> None:
@@ -200,21 +183,6 @@ def _check_names(names: Mapping[str, object], where: object) -> None:
             raise ArtifactError(what, where=where, expected=expected, got=repr(name))
 
 
-def _shortened(items: list[str]) -> str:
-    return "; ".join(items[:5]) + (f"; and {len(items) - 5} more" if len(items) > 5 else "")
-
-
-def _raise_mismatch(wrong: list[str], where: str) -> None:
-    if wrong:
-        raise ArtifactError(
-            "Published files are not those of the set",
-            where=where,
-            expected=f"the files with the sizes and digests of {FILE_LIST}",
-            got=_shortened(wrong),
-            next_step="pull again; if it stays, delete the published copy and push the set again",
-        )
-
-
 @contextmanager
 def _client_errors(where: str, verb: str) -> Iterator[None]:
     """Turn errors of a store's client, also those by odd answers of a server, into one that names the next step."""
@@ -222,19 +190,9 @@ def _client_errors(where: str, verb: str) -> Iterator[None]:
         yield
     except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, httpx.HTTPError) as error:
         raise ArtifactError(
-            f"The store did not finish the {verb}",
-            where=where,
-            got=first_line(error)[:300],
+            f"The store did not finish the {verb}", where=where, got=first_line(error)[:300],
             next_step="check the name, the room and the rights (of HF_TOKEN), then run the same command again",
-        ) from error
-
-
-def _location(where: str) -> AnyPath:
-    """A folder or an object store, as fsspec addresses it."""
-    location = parse_location(where)
-    if isinstance(location, Path):
-        return cast("AnyPath", UPath(location.absolute(), protocol="file", auto_mkdir=True))
-    return location
+        ) from error  # fmt: skip
 
 
 def _sizes(location: AnyPath) -> dict[str, int]:
@@ -266,65 +224,71 @@ def _pieces(source: AnyPath, size: int) -> Iterator[bytes]:
             yield piece
 
 
-def _fetch(location: AnyPath, folder: Path, name: str, size: int) -> None:
-    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    with (folder / name).open("wb") as stream:
-        stream.writelines(_pieces(location / name, size))
+def _fetch(location: AnyPath, folder: Path, listed: tuple[str, ListedFile]) -> str | None:
+    """Fetch a file that is not there yet; returns its name where it is not the listed one."""
+    name, file = listed
+    path = folder / name
+    if path.is_file() and describe_file(path) == file:
+        return None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as stream:
+        stream.writelines(_pieces(location / name, file.size))
+    return None if describe_file(path) == file else name
 
 
-def _send(location: AnyPath, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
-    """Send files, remove those that are gone, and write the list of what is there."""
+def _location(where: str) -> AnyPath:
+    """A folder, an object store, or the newest commit of a hub's repository, as fsspec addresses it."""
+    if where.startswith("hf://"):
+        api, repository, revision = _hub(where)
+        commit = str(api.repo_info(**repository, revision=revision).sha)
+        if not re.fullmatch("[0-9a-f]{40}", commit):
+            raise ValueError(f"the repository's commit is {commit!r}")
+        name = f"hf://datasets/{repository['repo_id']}@{commit}"
+        return cast("AnyPath", UPath(name, **hub_access(), skip_instance_cache=True))
+    location = parse_location(where)
+    if isinstance(location, Path):
+        return cast("AnyPath", UPath(location.absolute(), protocol="file", auto_mkdir=True))
+    return location
+
+
+def _send(where: str, location: AnyPath, files: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
+    """Send files, remove those that are gone, and write the list of what is there: in one commit, or last."""
+    if where.startswith("hf://"):
+        api, repository, revision = _hub(where)
+        added = [CommitOperationAdd(name, content) for name, content in {**files, FILE_LIST: listed}.items()]
+        changes = [*map(CommitOperationDelete, gone), *added]
+        api.create_commit(**repository, revision=revision, operations=changes, commit_message="Upload EpisodeSet")
+        return
     fs = file_system(location)
-    fs.put([str(path) for path in sources.values()], [str(location / name) for name in sources])
+    fs.put([str(path) for path in files.values()], [str(location / name) for name in files])
     for name in gone:
         fs.rm_file(str(location / name))
     fs.pipe_file(str(location / FILE_LIST), listed)
 
 
-class _Repository:
-    """A dataset repository of the hub, changed by one commit."""
+def _hub(where: str) -> tuple[HfApi, dict[str, Any], str | None]:
+    """Client, dataset repository and revision of a location on the hub."""
+    match = _HUB_LOCATION.fullmatch(where)
+    if match is None:
+        raise ConfigError("Not a place on the hub", expected="hf://datasets/ORG/NAME[@REVISION]", got=where)
+    return HfApi(**hub_access()), {"repo_id": match["id"], "repo_type": "dataset"}, match["revision"]
 
-    def __init__(self, where: str) -> None:
-        match = _HUB_LOCATION.fullmatch(where)
-        if match is None:
-            raise ConfigError("Not a place on the hub", expected="hf://datasets/ORG/NAME[@REVISION]", got=where)
-        self._where, self._revision = where, match["revision"]
-        self._repo: dict[str, Any] = {"repo_id": match["id"], "repo_type": "dataset"}
-        self._api = HfApi(**hub_access())
 
-    def prepare(self, *, public: bool) -> AnyPath:
-        """Make the repository where it does not exist, and return its newest commit.
+def _prepare_repository(where: str, *, public: bool) -> None:
+    """Make the repository, and the branch, where they do not exist.
 
-        Raises: ArtifactError when it exists with another visibility: private data must not become public.
-        """
-        if not self._api.token:
-            step = "make a token with write access and export HF_TOKEN"
-            raise UnavailableError("Pushing to the hub needs a token", where=self._where, next_step=step)
-        self._api.create_repo(**self._repo, private=not public, exist_ok=True)
-        if bool(self._api.repo_info(**self._repo).private) == public:
-            names = ("private", "public")
-            raise ArtifactError(
-                "Repository has another visibility than asked for",
-                where=self._where,
-                expected=names[public],
-                got=names[not public],
-                next_step="push to another repository, or " + ("leave out --public" if public else "add --public"),
-            )
-        if self._revision is not None:
-            self._api.create_branch(**self._repo, branch=self._revision, exist_ok=True)
-        return self.pinned()
-
-    def pinned(self) -> AnyPath:
-        """The newest commit of the revision."""
-        commit = str(self._api.repo_info(**self._repo, revision=self._revision).sha)
-        if not re.fullmatch("[0-9a-f]{40}", commit):
-            raise ValueError(f"the repository's commit is {commit!r}")
-        name = f"hf://datasets/{self._repo['repo_id']}@{commit}"
-        return cast("AnyPath", UPath(name, **hub_access(), skip_instance_cache=True))
-
-    def commit(self, sources: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
-        """As `_send`; the client sends what differs."""
-        added = [CommitOperationAdd(name, path) for name, path in sources.items()]
-        operations = [*map(CommitOperationDelete, gone), *added, CommitOperationAdd(FILE_LIST, listed)]
-        message = "Upload EpisodeSet"
-        self._api.create_commit(**self._repo, revision=self._revision, operations=operations, commit_message=message)
+    Raises: ArtifactError when it exists with another visibility: private data must not become public.
+    """
+    api, repository, revision = _hub(where)
+    if not api.token:
+        step = "make a token with write access and export HF_TOKEN"
+        raise UnavailableError("Pushing to the hub needs a token", where=where, next_step=step)
+    api.create_repo(**repository, private=not public, exist_ok=True)
+    if bool(api.repo_info(**repository).private) == public:
+        expected, got = ("public", "private") if public else ("private", "public")
+        step = "push to another repository, or " + ("leave out --public" if public else "add --public")
+        raise ArtifactError(
+            "Repository has another visibility than asked for", where=where, expected=expected, got=got, next_step=step
+        )
+    if revision is not None:
+        api.create_branch(**repository, branch=revision, exist_ok=True)

@@ -46,4 +46,4 @@ def content() -> RecordingContent:
     uv[..., 1, 0] = 30.0
     valid = np.ones((COUNT, 3, 2), bool)
     valid[3:, :, 1] = False
-    return RecordingContent(episode, frames, {"stage2": frames}, tracks_of(uv, valid))
+    return RecordingContent(episode, frames, frames, "stage2", tracks_of(uv, valid))

@@ -147,7 +147,7 @@ def test_packed_masks_are_those_of_one_piece_and_read_in_pieces() -> None:
     import zlib
 
     random = np.random.default_rng(0)
-    for count, height, width in ((1, 1, 1), (7, 3, 5), (33, 13, 11), (300, 48, 64)):
+    for count, height, width in ((1, 1, 1), (7, 3, 5), (33, 13, 11), (60, 24, 32)):
         masks = random.random((count, height, width)) < 0.1
         masks[:, : height // 2] = False
         labels = masks.astype(np.uint8) * random.integers(1, 4, (count, 1, 1), dtype=np.uint8)

@@ -174,18 +174,12 @@ def clip(count: int, value: int, size: tuple[int, int] = (64, 96)) -> np.ndarray
     return np.full((count, *size, 3), value, dtype=np.uint8)
 
 
-@pytest.mark.parametrize(
-    ("size", "expected"),
-    [((64, 96, 256), (256, 384)), ((480, 640, 256), (256, 342)), ((63, 95, 64), (64, 96)), ((300, 301, 256), (256, 258))],
-)  # fmt: skip
-def test_display_sizes_are_even_and_fit(size: tuple[int, int, int], expected: tuple[int, int]) -> None:
-    assert scaled_size(*size) == expected
-
-
-def test_evenly_spaced_holds_both_ends() -> None:
-    assert evenly_spaced(33, 5) == [0, 8, 16, 24, 32]
-    assert evenly_spaced(2, 5) == [0, 1]
-    assert evenly_spaced(0, 5) == []
+def test_display_sizes_are_even_and_fit_and_spaced_frames_hold_both_ends() -> None:
+    for size, expected in (((64, 96), (256, 384)), ((480, 640), (256, 342)), ((300, 301), (256, 258))):
+        assert scaled_size(*size, 256) == expected
+    assert scaled_size(63, 95, 64) == (64, 96)
+    for count, spaced in ((33, [0, 8, 16, 24, 32]), (2, [0, 1]), (0, [])):
+        assert evenly_spaced(count, 5) == spaced
 
 
 def test_contact_sheet_holds_every_picture() -> None:

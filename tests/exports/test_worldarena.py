@@ -24,11 +24,9 @@ from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 NUMBERS = (1, 12)
 
 
-@pytest.fixture(scope="module")
-def episodes(tmp_path_factory: pytest.TempPathFactory) -> EpisodeSet:
-    root = tmp_path_factory.mktemp("worldarena")
-    for number in NUMBERS:
-        write_track_1(root / "raw", number, scale=10)
+def recorded(root: Path, *numbers: int, scale: int = 1) -> EpisodeSet:
+    for number in numbers:
+        write_track_1(root / "raw", number, scale=scale)
     return run(root, settings(root / "raw"))[1]
 
 
@@ -41,7 +39,8 @@ def predicted(root: Path, episodes: EpisodeSet, method: str, change: Any = lambd
 
 
 @pytest.mark.slow
-def test_an_archive_is_read_back_and_measured(episodes: EpisodeSet, tmp_path: Path) -> None:
+def test_an_archive_is_read_back_and_measured(tmp_path: Path) -> None:
+    episodes = recorded(tmp_path, *NUMBERS, scale=10)
     for method in ("ours_v2_test", "ours_v2_test_1", "ours_v2_10data"):
         rollouts = predicted(tmp_path / method, episodes, method)
         export_worldarena_archive(rollouts, episodes, rollouts.episode_ids, tmp_path)
@@ -67,31 +66,40 @@ def test_an_archive_is_read_back_and_measured(episodes: EpisodeSet, tmp_path: Pa
     assert {"psnr", "ssim"} <= {score["metric"] for score in scores}
 
 
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> EpisodeSet:
+    return recorded(tmp_path_factory.mktemp("small"), 1)
+
+
+def enlarged(frames: np.ndarray, factor: int = 10) -> np.ndarray:
+    return frames.repeat(factor, axis=1).repeat(factor, axis=2)
+
+
 @pytest.mark.parametrize(
     ("method", "change", "match"),
     [
-        ("ours", None, r"(?s)named by its sets.*MODEL_test"),
+        ("ours", lambda f: f, r"(?s)named by its sets.*MODEL_test"),
         (
             "ours_test",
-            lambda frames: frames[:-1],
+            lambda f: enlarged(f)[:-1],
             rf"(?s)Not the length.*{T} \(its trajectory\), or 121.*{T - 1} frames",
         ),
-        ("ours_test", lambda frames: frames[:, ::2, ::2], r"(?s)Not the pictures.*640 x 480.*320 x 240"),
-        ("ours_test", lambda frames: frames[:, :, :480], r"(?s)Not the pictures.*480 x 480"),
+        ("ours_test", lambda f: enlarged(f, 5), r"(?s)Not the pictures.*640 x 480.*320 x 240"),
+        ("ours_test", lambda f: enlarged(f)[:, :, :480], r"(?s)Not the pictures.*480 x 480"),
     ],
 )
 def test_what_worldarena_does_not_take_is_not_archived(
-    episodes: EpisodeSet, tmp_path: Path, method: str, change: Any, match: str
+    small: EpisodeSet, tmp_path: Path, method: str, change: Any, match: str
 ) -> None:
-    rollouts = predicted(tmp_path / "set", episodes, method, change or (lambda frames: frames[:, ::10, ::10]))
+    rollouts = predicted(tmp_path / "set", small, method, change)
     with pytest.raises(DataError, match=match):
-        export_worldarena_archive(rollouts, episodes, rollouts.episode_ids, tmp_path / "out")
+        export_worldarena_archive(rollouts, small, rollouts.episode_ids, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_an_episode_of_another_set_is_not_archived(episodes: EpisodeSet, tmp_path: Path) -> None:
+def test_an_episode_of_another_set_is_not_archived(small: EpisodeSet, tmp_path: Path) -> None:
     writer = RolloutSetWriter(tmp_path, "ours_test", 24.0)
     writer.add("lift-the-cube", 42, {"head": np.zeros((T, HEIGHT, WIDTH, 3), np.uint8)})
     writer.close()
     with pytest.raises(DataError, match=r"(?s)Not a prediction of an episode of WorldArena.*kind: worldarena"):
-        export_worldarena_archive(RolloutSet.open(tmp_path), episodes, ["lift-the-cube"], tmp_path / "out")
+        export_worldarena_archive(RolloutSet.open(tmp_path), small, ["lift-the-cube"], tmp_path / "out")

@@ -86,11 +86,3 @@ def test_without_the_hub_the_cache_serves(
     for name in (tmp_path / "nothing", "three/part/name"):
         with pytest.raises(CheckpointError, match="No model here"):
             pretrained_folder(name)
-
-
-def test_a_damaged_repository_is_refused(hub: Hub, folder: Path) -> None:
-    repository = publish(hub, folder)
-    content, large = repository.files["model.safetensors"]
-    repository.files["model.safetensors"] = (content[:-1], large)
-    with pytest.raises(CheckpointError, match="not those that are described"):
-        load_checkpoint(pretrained_folder("ORG/NAME"))

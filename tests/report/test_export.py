@@ -12,20 +12,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import decode_video
 from worldline_core.errors import ArtifactError, DataError
-from worldline_core.exports.export import export, export_rollout, export_worldarena
+from worldline_core.exports.export import export, export_worldarena
 from worldline_core.rollout.rollout_set import RolloutSet
+from worldline_core.store.artifact_files import write_manifest
 
 
 @pytest.mark.slow
 def test_a_prediction_is_exported_in_every_format(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
-    rollouts = RolloutSet.open(run_artifacts["rollout.shipped_causal"])
-    episodes, tracks = EpisodeSet.open(run_artifacts["curate"]), ActionTracks.open(run_artifacts["render_actions"])
-    formats = ("mp4", "rrd", "mcap")
-    written = export_rollout({rollouts.method: rollouts}, episodes, tracks, "aloha_viperx-1", tmp_path, formats)
+    folder = shutil.copytree(run_artifacts["rollout.shipped_causal"], tmp_path / "set")
+    inputs = {"episodes": run_artifacts["curate"], "tracks": run_artifacts["render_actions"]}
+    facts = {name: {"path": str(path.resolve()), "digest": "1"} for name, path in inputs.items()}
+    write_manifest(folder, {"step": "rollout", "inputs": facts})
+    written = export(folder, tmp_path / "out", ["mp4", "rrd", "mcap"], episode_ids=["aloha_viperx-1"])
     assert sorted(path.suffix for path in written) == [".jpg"] * 3 + [".mcap"] + [".mp4"] * 3 + [".rrd"]
     assert all(path.stat().st_size > 500 for path in written)
 
@@ -33,6 +34,8 @@ def test_a_prediction_is_exported_in_every_format(run_artifacts: dict[str, Path]
 def test_predictions_are_exported_in_the_layout_of_worldarena(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     folder = run_artifacts["rollout.shipped_causal"]
     rollouts = RolloutSet.open(folder)
+    with pytest.raises(DataError, match=r"(?s)No prediction of this episode.*none"):
+        export(folder, tmp_path, ["worldarena"], episode_ids=["none"], episodes=run_artifacts["curate"])
     written = export(folder, tmp_path, ["worldarena"], episodes=run_artifacts["curate"])
     ids = json.loads((tmp_path / "episodes.json").read_text())
     assert sorted(ids.values()) == sorted(rollouts.episode_ids)

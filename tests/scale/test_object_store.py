@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shutil
 import stat
 from collections import Counter
 from pathlib import Path
@@ -12,11 +13,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
-from object_store import BUCKET, ObjectStore
 from upath import UPath
 
 from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImports]
-from tools.corrupted import lerobot_v21
+from tests.data.curating import record, run
+from tests.scale.conftest import BUCKET, ObjectStore
+from tools.corrupted import lerobot_v21, mcap
 from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
@@ -32,36 +34,30 @@ from worldline_core.store.remote import RemoteCache, UnreachableInputError, list
 from worldline_core.store.store import ArtifactStore
 
 
-@pytest.fixture
-def recordings(tmp_path: Path) -> Path:
-    with EpisodeSetWriter(tmp_path / "raw", video_crf=8) as writer:
-        for number in range(2):
-            writer.add(*make_sample(number, views=("head",)))
-    return tmp_path / "raw"
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(
+        tmp_path_factory.mktemp("recorded") / "raw", [make_sample(number, views=("head",)) for number in (0, 1)]
+    )
 
 
-def config(path: object, **changes: Any) -> CurateConfig:
+def curated_digest(path: object, output: Path) -> str:
     source = {"kind": "episode_set", "path": str(path), "name": "raw"}
-    return CurateConfig.model_validate({"sources": [source], "image_size": (16, 24), "fps": 8, **changes})
-
-
-def curated_digest(configured: CurateConfig, output: Path) -> str:
-    curate(configured, {}, output, SerialMapper(RunnerConfig(episodes_per_shard=1, retries=1, retry_seconds=0.01)))
+    config = CurateConfig.model_validate({"sources": [source], "image_size": (16, 24), "fps": 8})
+    curate(config, {}, output, SerialMapper(RunnerConfig(episodes_per_shard=1, retries=1, retry_seconds=0.01)))
     return digest_folder(output)
 
 
-@pytest.mark.slow
-def test_a_set_in_the_store_gives_the_bytes_of_one_in_a_folder(
-    tmp_path: Path, recordings: Path, store: ObjectStore
-) -> None:
-    url = store.upload(recordings, "same")
-    assert curated_digest(config(url), tmp_path / "remote") == curated_digest(config(recordings), tmp_path / "local")
+@pytest.fixture(scope="module")
+def digest(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The curated recordings', read from their folder."""
+    return curated_digest(recordings, tmp_path_factory.mktemp("local"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["busy", "broken", "hang up"])
-def test_a_store_that_flickers_changes_nothing(
-    tmp_path: Path, recordings: Path, store: ObjectStore, fault: str
+def test_a_store_that_flickers_gives_the_bytes_of_a_folder(
+    tmp_path: Path, recordings: Path, digest: str, store: ObjectStore, fault: str
 ) -> None:
     url = store.upload(recordings, f"flicker-{fault.replace(' ', '-')}")
     asked: Counter[str] = Counter()
@@ -72,23 +68,23 @@ def test_a_store_that_flickers_changes_nothing(
         return fault if asked[path] % 3 == 1 else None
 
     store.misbehave = every_third
-    assert curated_digest(config(url), tmp_path / "remote") == curated_digest(config(recordings), tmp_path / "local")
+    assert curated_digest(url, tmp_path) == digest
     assert len(asked) > 3
 
 
 @pytest.mark.slow
 def test_a_store_that_stays_away_is_no_reason_to_quarantine(
-    tmp_path: Path, recordings: Path, store: ObjectStore
+    tmp_path: Path, recordings: Path, digest: str, store: ObjectStore
 ) -> None:
     url = store.upload(recordings, "away")
     store.misbehave = lambda method, path: "broken" if method == "GET" and path.endswith(".mp4") else None
     with pytest.raises(UnreachableInputError, match="shards could not read all of their inputs"):
-        curated_digest(config(url), tmp_path / "out")
-    writer = EpisodeSetWriter(tmp_path / "out")
+        curated_digest(url, tmp_path)
+    writer = EpisodeSetWriter(tmp_path)
     assert (writer.kept(), writer.rejected()) == ([], [])
     store.misbehave = lambda method, path: None
-    assert curated_digest(config(url), tmp_path / "out") == curated_digest(config(recordings), tmp_path / "local")
-    assert {row.status for row in read_account(tmp_path / "out")} == {"kept"}
+    assert curated_digest(url, tmp_path) == digest
+    assert {row.status for row in read_account(tmp_path)} == {"kept"}
 
 
 class Forgetful(MemoryFileSystem):
@@ -149,15 +145,12 @@ def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, store: Ob
         url.fs.invalidate_cache()
         digests.append(artifacts.input_digest(url))
     assert digests[0] == digests[1] != digests[2]
-    assert not [
-        path for method, path in store.requests if method == "GET" and "/key/" in path
-    ]  # the listing says enough
+    assert not [path for method, path in store.requests if method == "GET" and "/key/" in path]  # listings say enough
 
 
-@pytest.mark.parametrize("kind", ["store", "folder"])
-def test_a_set_is_pushed_and_pulled(tmp_path: Path, recordings: Path, store: ObjectStore, kind: str) -> None:
-    where = f"s3://{BUCKET}/there" if kind == "store" else str(tmp_path / "there")
-    store.upload(tmp_path / "nothing", "x")  # makes the bucket
+@pytest.mark.usefixtures("store")
+def test_a_set_is_pushed_and_pulled(tmp_path: Path, recordings: Path) -> None:
+    where = f"s3://{BUCKET}/there"
     pushed = push(recordings, where)
     assert pull(where, tmp_path / "back") == pushed
     assert digest_folder(tmp_path / "back") == digest_folder(recordings)
@@ -165,45 +158,40 @@ def test_a_set_is_pushed_and_pulled(tmp_path: Path, recordings: Path, store: Obj
         pull(where, tmp_path / "back")
 
 
-def test_the_card_takes_the_place_of_a_page_that_is_gone(tmp_path: Path, recordings: Path) -> None:
-    (recordings / "README.md").write_text("of its own")
-    push(recordings, str(tmp_path / "there"))
-    (recordings / "README.md").unlink()
-    push(recordings, str(tmp_path / "there"))
+def test_in_a_folder_the_card_takes_the_place_of_a_page_that_is_gone(tmp_path: Path, recordings: Path) -> None:
+    folder = shutil.copytree(recordings, tmp_path / "set")
+    (folder / "README.md").write_text("of its own")
+    push(folder, str(tmp_path / "there"))
+    (folder / "README.md").unlink()
+    push(folder, str(tmp_path / "there"))
     assert (tmp_path / "there/README.md").read_text().startswith("---\n")
+    pull(str(tmp_path / "there"), tmp_path / "back")
+    assert digest_folder(tmp_path / "back") == digest_folder(recordings)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("refused", [".json", ".txt"])
 def test_an_interrupted_second_push_goes_on(tmp_path: Path, recordings: Path, store: ObjectStore, refused: str) -> None:
     """Files that the second set lacks are removed and those of another content sent, also after an interruption."""
-    store.upload(tmp_path / "nothing", "x")
-    where = f"s3://{BUCKET}/again{refused}"
-    (recordings / "first.txt").write_text("of the first push alone")
-    (recordings / "both.txt").write_text("one")
-    push(recordings, where)
-    (recordings / "first.txt").rename(recordings / "second.txt")
-    (recordings / "both.txt").write_text("two")
+    where, folder = f"s3://{BUCKET}/again{refused}", shutil.copytree(recordings, tmp_path / "set")
+    (folder / "first.txt").write_text("of the first push alone")
+    (folder / "both.txt").write_text("one")
+    push(folder, where)
+    (folder / "first.txt").rename(folder / "second.txt")
+    (folder / "both.txt").write_text("two")
     store.misbehave = lambda method, path: "broken" if method == "PUT" and path.endswith(refused) else None
     with pytest.raises(ArtifactError, match="did not finish the push"):
-        push(recordings, where)
+        push(folder, where)
     store.misbehave = lambda method, path: None
-    push(recordings, where)
+    push(folder, where)
     pull(where, tmp_path / "back")
-    assert digest_folder(tmp_path / "back") == digest_folder(recordings)
+    assert digest_folder(tmp_path / "back") == digest_folder(folder)
 
 
 @pytest.fixture(scope="module")
-def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+def one_of_each(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
     pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
-    written = write_one_of_each(tmp_path_factory.mktemp("layouts"))
-    for name, suffix in (("mcap", "mcap"), ("video_folder", "mp4")):
-        (Path(written[name]["path"]) / f"broken.{suffix}").write_bytes(b"no recording")
-    root = Path(written["lerobot_v21"]["path"]).parent / "two"
-    _, written["lerobot_v21"] = lerobot_v21.write(root, 2, 0, np.random.default_rng(0))
-    for number, table in enumerate(sorted(root.glob("data/chunk-000/*.parquet"))):  # whole, and cut
-        pq.write_table(pq.read_table(table).drop(["frame_index"]).slice(0, (99, 9)[number]), table)
-    return written
+    return write_one_of_each(tmp_path_factory.mktemp("layouts"))
 
 
 @pytest.mark.usefixtures("reading_in_this_process")  # which alone has a file system in memory
@@ -216,19 +204,25 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any
     ],
 )
 def test_the_same_bytes_from_a_folder_and_from_elsewhere(
-    sources: dict[str, dict[str, Any]], tmp_path: Path, layout: str
+    tmp_path: Path, request: pytest.FixtureRequest, layout: str
 ) -> None:
-    local = Path(sources[layout]["path"])
+    if layout == "lerobot_v21":
+        source = lerobot_v21.write(tmp_path / layout, 2, 0, np.random.default_rng(0))[1]
+        for number, table in enumerate(sorted(tmp_path.rglob("data/chunk-000/*.parquet"))):  # whole, and cut
+            pq.write_table(pq.read_table(table).drop(["frame_index"]).slice(0, (99, 9)[number]), table)
+    elif layout == "mcap":
+        source = mcap.write(tmp_path / layout, 1, 0, np.random.default_rng(0))[1]
+    else:
+        source = request.getfixturevalue("one_of_each")[layout]
+    local = Path(source["path"])
+    if broken := {"mcap": "broken.mcap", "video_folder": "broken.mp4"}.get(layout):
+        (local / broken).write_bytes(b"no recording")
     remote = UPath(f"memory://{tmp_path.name}/{local.name}")
-    for file in (path for path in local.rglob("*") if path.is_file()):
-        place = remote / file.relative_to(local).as_posix()
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes(file.read_bytes())
+    remote.fs.put(f"{local}/", remote.path, recursive=True)
     made = []
     for number, path in enumerate((local, remote)):
-        source = sources[layout] | {"path": str(path), "name": "rec"}
-        counts = curate(CurateConfig.model_validate({"sources": [source], "min_frames": 1}), {}, tmp_path / f"{number}")
-        made.append((counts, digest_folder(tmp_path / f"{number}")))
+        counts, curated = run(tmp_path / str(number), source | {"path": str(path), "name": "rec"}, min_frames=1)
+        made.append((counts, digest_folder(curated.root)))
     assert made[0][0]["kept"] == 1
     assert made[0][0]["quarantined"] == (layout in ("lerobot_v21", "mcap", "video_folder"))
     assert made[0] == made[1]

@@ -144,55 +144,35 @@ def test_steps_name_the_weights_and_tokenizers_that_they_read(tmp_path: Path) ->
     assert read("rollout", baseline) == {}
 
 
-def test_failed_step_leaves_no_artifact_and_continues(tmp_path: Path) -> None:
+@pytest.mark.parametrize("killed", [False, True])
+def test_an_interrupted_step_leaves_no_artifact_and_continues_to_the_same_digest(tmp_path: Path, killed: bool) -> None:
     store = ArtifactStore(tmp_path)
 
-    def fail_halfway(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    def begin(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
         count(CountConfig(upto=2), inputs, output)
         (output / "videos").mkdir()
         (output / "videos" / ".head.123.tmp.mp4").write_bytes(b"half")  # does not reach the artifact
+        if killed:
+            os.kill(os.getpid(), signal.SIGKILL)
         raise DataError("stopped", where="halfway")
 
-    with pytest.raises(DataError, match="stopped"):
-        store.run("count", 1, fail_halfway, CountConfig(), {})
+    arguments: Any = ("count", 1, begin, CountConfig(), {})
+    if killed:
+        process = multiprocessing.get_context("fork").Process(target=store.run, args=arguments)
+        process.start()
+        process.join()
+    else:
+        with pytest.raises(DataError, match="stopped"):
+            store.run(*arguments)
     assert store.find("count", store.key("count", 1, CountConfig(), {})) is None
+    assert len(list(tmp_path.glob("count/*.partial/1.txt"))) == 1
     artifact = store.run("count", 1, count, CountConfig(), {})
     manifest = json.loads((artifact.path / "manifest.json").read_text())
-    assert manifest["resumed"] is True
-    assert manifest["metrics"] == {"written": 3}
-    assert manifest["seeds"] == {"seed": 7}
+    facts = [manifest[name] for name in ("resumed", "metrics", "seeds")]
+    assert facts == [True, {"written": 3}, {"seed": 7}]
     undisturbed = ArtifactStore(tmp_path / "other").run("count", 1, count, CountConfig(), {})
     assert undisturbed.digest == artifact.digest
-
-
-def _run_slow(root: Path, waits_at: int | None = None) -> None:
-    def count_slowly(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-        for number in range(config.upto):
-            path = output / f"{number}.txt"
-            if not path.exists():
-                if number == waits_at:
-                    time.sleep(60)  # to be killed
-                write_bytes_atomic(path, str(number).encode())
-        return {}
-
-    ArtifactStore(root).run("slow", 1, count_slowly, CountConfig(upto=5), {})
-
-
-def test_killed_run_continues_to_the_same_digest(tmp_path: Path) -> None:
-    process = multiprocessing.get_context("fork").Process(target=_run_slow, args=(tmp_path / "killed", 3))
-    process.start()
-    deadline = time.time() + 30
-    while time.time() < deadline and len(list((tmp_path / "killed").rglob("[0-9]*.txt"))) < 3:
-        time.sleep(0.01)
-    assert process.pid is not None
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    assert len(list((tmp_path / "killed" / "slow").glob("*.partial"))) == 1
-    _run_slow(tmp_path / "killed")
-    _run_slow(tmp_path / "undisturbed")
-    manifests = [next((tmp_path / name / "slow").glob("*/manifest.json")) for name in ("killed", "undisturbed")]
-    assert len({json.loads(manifest.read_text())["digest"] for manifest in manifests}) == 1
-    assert not list((tmp_path / "killed" / "slow").glob("*.partial"))
+    assert not list(tmp_path.glob("count/*.partial"))
 
 
 @pytest.mark.parametrize(

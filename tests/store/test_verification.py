@@ -6,17 +6,18 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from flows.command_line import main
-from flows.pipeline import chain
-from tasks.execution.chain import outline, ready_inputs
-from worldline_core.config import StrictModel, load_config
+from tests.data.conftest import make_sample
+from tests.data.curating import record
+from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.errors import ArtifactError
-from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store import artifact_files
@@ -57,21 +58,27 @@ def flipped(path: Path, position: int, bit: int) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> dict[str, Path]:
-    """A curated and a filtered set of one recording."""
-    recordings = "curate.sources=[{kind: episode_set, path: artifacts/shipped/recordings, name: shipped, include: [ur5e_silver-test-s1-00000]}]"  # fmt: skip
-    calls = outline(chain, load_config(PipelineConfig, preset="smoke", overrides=[recordings]))
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A set of one recording as curation leaves it, and one like a filter's, which shares its videos."""
     store = ArtifactStore(tmp_path_factory.mktemp("store"))
-    made = {}
-    for call in (calls["curate"], calls["filter"]):
-        made[call.name] = call.task.run(store, call.config, ready_inputs(call, calls, store)).path
-    return made
+
+    def curate(config: StrictModel, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+        record(output, [make_sample()])
+        return {}
+
+    def keep(config: StrictModel, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+        above = os.path.relpath(inputs["episodes"], output)
+        write_index(output, [replace(row, dataset=f"{above}/{row.dataset}") for row in read_index(inputs["episodes"])])
+        return {}
+
+    curated = store.run("curate", 1, curate, StrictModel(), {}).path
+    return {"curate": curated, "filter": store.run("filter", 1, keep, StrictModel(), {"episodes": curated}).path}
 
 
 @pytest.mark.parametrize("kind", ["curate", "filter"])
 def test_a_flipped_byte_is_named_before_it_is_used(run: Run, kind: str, tmp_path: Path) -> None:
     folder = run[kind]
-    for path in [*folder_files(folder), folder / "manifest.json"]:
+    for path in [*folder_files(folder).values(), folder / "manifest.json"]:
         size = path.stat().st_size
         for place, position in enumerate(sorted({0, 4 * size // 5} & set(range(size)))):
             with flipped(path, position, 0 if path.suffix == ".json" else place):
@@ -88,22 +95,19 @@ READERS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("command", READERS)
 @pytest.mark.parametrize("kind", ["curate", "filter"])
-def test_no_command_reads_a_flipped_byte(run: Run, tmp_path: Path, command: str, kind: str, capsys: Capsys) -> None:
-    video = next(run["curate"].rglob("*.mp4"))
-    artifact_files._digests.clear()
-    with flipped(video, video.stat().st_size // 2, 3), pytest.raises(SystemExit, match=r"[12]"):
-        main(command.format(set=run[kind], out=tmp_path / "out").split())
-    assert f"{video.name}: sha256" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists() or [p.name for p in (tmp_path / "out").rglob("*")] == ["run", ".lock"]
-
-
-@pytest.mark.parametrize("kind", ["curate", "filter"])
-def test_no_step_and_no_simulation_starts_from_a_flipped_byte(run: Run, kind: str, tmp_path: Path) -> None:
+def test_no_command_step_or_simulation_reads_a_flipped_byte(
+    run: Run, tmp_path: Path, kind: str, capsys: Capsys
+) -> None:
     """A filtered set shares the videos of the curated one."""
-    video = next(run["curate"].rglob("*.mp4"))
+    video, out = next(run["curate"].rglob("*.mp4")), tmp_path / "out"
     with flipped(video, video.stat().st_size // 2, 3):
+        for command in READERS:
+            artifact_files._digests.clear()
+            with pytest.raises(SystemExit, match=r"[12]"):
+                main(command.format(set=run[kind], out=out).split())
+            assert f"{video.name}: sha256" in capsys.readouterr().err, command
+        assert [path.name for path in out.rglob("*")] == ["run", ".lock"]
         with pytest.raises(ArtifactError, match=rf"{video.name}: sha256"):
             next_step(tmp_path, run[kind])
         artifact_files._digests.clear()
@@ -111,16 +115,17 @@ def test_no_step_and_no_simulation_starts_from_a_flipped_byte(run: Run, kind: st
             RecordedStarts(run[kind], view_sets=[("head",)], fps=8)
 
 
-@pytest.mark.parametrize("command", ["card {set}", "export {set} --format model --output {out}", "inspect {set}"])
-def test_no_command_reads_a_damaged_model(project_root: Path, tmp_path: Path, command: str, capsys: Capsys) -> None:
+def test_no_command_reads_a_damaged_model(project_root: Path, tmp_path: Path, capsys: Capsys) -> None:
     copy = shutil.copytree(project_root / "artifacts/shipped/models/causal", tmp_path / "model")
     weights = next(copy.glob("*.safetensors"))
     with flipped(weights, weights.stat().st_size - 1, 3):
-        with pytest.raises(SystemExit, match="1"):
-            main(command.format(set=copy, out=tmp_path / "out").split())
+        for command in ("card {set}", "export {set} --format model --output {out}", "inspect {set}"):
+            artifact_files._digests.clear()
+            with pytest.raises(SystemExit, match="1"):
+                main(command.format(set=copy, out=tmp_path / "out").split())
+            assert f"{weights.name}: sha256" in capsys.readouterr().err
         with pytest.raises(ArtifactError, match=f"{weights.name}: sha256"):
             WorldLine.from_pretrained(copy)
-    assert f"{weights.name}: sha256" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -180,31 +185,11 @@ def test_verify_names_damaged_files_and_how_to_rebuild(artifact: Path, tmp_path:
     assert "Not a finished artifact" in capsys.readouterr().err
 
 
-def test_recordings_outside_of_a_store_are_not_to_be_deleted(tmp_path: Path) -> None:
-    (tmp_path / "one").write_text("abc")
-    write_manifest(tmp_path, {"step": "record_episodes"})
-    (tmp_path / "one").write_text("abd")
-    with pytest.raises(ArtifactError, match=r"one: sha256[\s\S]*git checkout"):
-        next_step(tmp_path / "store", tmp_path)
-
-
 def test_shipped_files_are_those_of_their_manifests(project_root: Path) -> None:
     shipped = project_root / "artifacts" / "shipped"
     folders = [shipped / "recordings", shipped / "banks", *sorted((shipped / "models").iterdir())]
     damaged = [folder for folder, damage in check_artifacts(folders).items() if damage]
     assert not damaged, "changed on purpose? python -m tools.state_files FOLDER..."
-
-
-def copy(config: StrictModel, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    for path in inputs["source"].rglob("*.txt"):
-        (output / path.name).write_bytes(path.read_bytes())
-    return {}
-
-
-def read(store: Path, source: Path, mode: VerifyMode = "full") -> Artifact:
-    """A step that reads a folder, in a process that has read nothing yet."""
-    artifact_files._digests.clear()
-    return ArtifactStore(store, mode).run("copy", 1, copy, StrictModel(), {"source": source})
 
 
 FOREIGN = ['{"episodes": 3}', '{"digest": "0123", "files": {}}', "[1, 2]", "no JSON", ""]
@@ -223,16 +208,16 @@ def test_a_source_with_its_own_manifest_is_read_again_when_it_changes(
     tmp_path: Path, source: Path, manifest: str
 ) -> None:
     (source / "manifest.json").write_text(manifest)
-    keys = {read(tmp_path / "store", source).key}
-    assert read(tmp_path / "store", source).cached
+    keys = {next_step(tmp_path / "store", source).key}
+    assert next_step(tmp_path / "store", source).cached
     changed = ("a.txt", "run/b.txt", "run/deep/c.txt", "manifest.json")
     for name in changed:
         (source / name).write_text('{"another": "content"}')
-        keys.add(read(tmp_path / "store", source).key)
+        keys.add(next_step(tmp_path / "store", source).key)
     gone = ("a.txt", "run/deep/c.txt", "run")
     for name in gone:
         shutil.rmtree(source / name) if (source / name).is_dir() else (source / name).unlink()
-        keys.add(read(tmp_path / "store", source).key)
+        keys.add(next_step(tmp_path / "store", source).key)
     assert len(keys) == 1 + len(changed) + len(gone)
 
 
@@ -240,14 +225,14 @@ def test_a_source_with_its_own_manifest_is_read_again_when_it_changes(
 @pytest.mark.parametrize("damage", ["change", "remove", "add"])
 def test_recordings_are_compared_with_our_manifest(tmp_path: Path, source: Path, mode: VerifyMode, damage: str) -> None:
     write_manifest(source, {"step": "record_episodes"})
-    read(tmp_path / "store", source)
+    next_step(tmp_path / "store", source)
     path = source / ("new.txt" if damage == "add" else "a.txt")
     path.unlink() if damage == "remove" else path.write_text("A.txt")
     if damage != "remove":
         later = (source / "manifest.json").stat().st_mtime_ns + 10**9
         os.utime(path, ns=(later, later))
-    with pytest.raises(ArtifactError, match=f"{path.name}: "):
-        read(tmp_path / "store", source, mode)
+    with pytest.raises(ArtifactError, match=rf"{path.name}: [\s\S]*git checkout"):  # it is not to be deleted
+        next_step(tmp_path / "store", source, mode)
     # What the owner meant becomes another input once the manifest is gone, as the message says.
     (source / "manifest.json").unlink()
-    assert not read(tmp_path / "store", source, mode).cached
+    assert not next_step(tmp_path / "store", source, mode).cached

@@ -6,7 +6,7 @@ import json
 import logging
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -136,7 +136,7 @@ def _export_episodes(
             except WorldLineError as error:
                 logger.warning("%s.rrd has no tool poses: %s (%s)", stem, error.what, error.where)
             written.append(output / f"{stem}.rrd")
-            write_rerun_recording(written[-1], recording_content({}, episodes, tracks, row.episode_id))
+            write_rerun_recording(written[-1], recording_content(episodes, row.episode_id, tracks))
     return written
 
 
@@ -219,85 +219,54 @@ def _export_rollouts(
     if "worldarena-archive" in formats:
         written += export_worldarena_archive(rollouts, recorded, names, output)
     for name in names:
-        written += export_rollout({rollouts.method: rollouts}, recorded, tracks, name, output, formats)
-    return written
-
-
-def export_rollout(
-    rollouts: Mapping[str, RolloutSet],
-    episodes: EpisodeSet,
-    tracks: ActionTracks | None,
-    episode_id: str,
-    output: Path,
-    formats: Sequence[str],
-) -> list[Path]:
-    """Write an episode's predictions below `output` and return the files.
-
-    Args:
-        rollouts: by method name.
-        tracks: action tracks for tool poses and heat maps; left out when None.
-        formats: `mp4` (one side-by-side video per view), `rrd` (one recording with everything), `mcap` and `mcap-ros2`
-            (one per method).
-
-    Raises: DataError when no set predicted this episode, or the set does not hold it.
-    """
-    predicted = {method: rollout for method, rollout in rollouts.items() if episode_id in rollout.episode_ids}
-    if not predicted:
-        raise DataError("No prediction of this episode", where=episode_id, got=", ".join(rollouts) or "no RolloutSet")
-    sigma_px_ref = SIGMA_PX_REFERENCE if tracks is None else tracks.sigma_px_ref
-    drawn = None if tracks is None else tracks.tracks(episode_id)
-    content = recording_content(predicted, episodes, drawn, episode_id, sigma_px_ref=sigma_px_ref)
-    stem, written = safe_stem(episode_id), list[Path]()
-    output.mkdir(parents=True, exist_ok=True)
-    if "mp4" in formats:
-        for view, frames in content.true_frames.items():
-            columns = {method: views[view] for method, views in content.predicted_frames.items() if view in views}
-            made = write_side_by_side(output / f"{stem}_{view}.mp4", {"true": frames, **columns}, content.episode.fps)
-            written += [made.video, made.poster]
-    if "rrd" in formats:
-        written.append(output / f"{stem}.rrd")
-        write_rerun_recording(written[-1], content)
-    for encoding, suffix in (MCAP_FORMATS[wanted] for wanted in formats if wanted in MCAP_FORMATS):
-        for method in content.predicted_frames:
-            written.append(output / f"{stem}_{safe_stem(method)}{suffix}")
-            write_prediction_mcap(written[-1], content, method, encoding)
+        drawn, sigma_px = (None, SIGMA_PX_REFERENCE) if tracks is None else (tracks.tracks(name), tracks.sigma_px_ref)
+        content, stem = recording_content(recorded, name, drawn, rollouts, sigma_px), safe_stem(name)
+        if "mp4" in formats:
+            for view, frames in content.true_frames.items():
+                predicted = content.predicted_frames.get(view)
+                shown = {"true": frames} if predicted is None else {"true": frames, content.method: predicted}
+                made = write_side_by_side(output / f"{stem}_{view}.mp4", shown, content.episode.fps)
+                written += [made.video, made.poster]
+        if "rrd" in formats:
+            written.append(output / f"{stem}.rrd")
+            write_rerun_recording(written[-1], content)
+        for encoding, suffix in (MCAP_FORMATS[wanted] for wanted in formats if wanted in MCAP_FORMATS):
+            written.append(output / f"{stem}_{safe_stem(content.method)}{suffix}")
+            write_prediction_mcap(written[-1], content, encoding)
     return written
 
 
 def recording_content(
-    rollouts: Mapping[str, RolloutSet],
     episodes: EpisodeSet,
-    tracks: EpisodeTracks | None,
     episode_id: str,
-    *,
+    tracks: EpisodeTracks | None,
+    rollouts: RolloutSet | None = None,
     sigma_px_ref: float = SIGMA_PX_REFERENCE,
 ) -> RecordingContent:
     """Gather the frames, predictions and tracks of one episode."""
-    position = episodes.position(episode_id)
+    position, predicted = episodes.position(episode_id), dict[str, VideoFrames]()
     views = [view for view in VIEWS if view in episodes.rows[position].views]
-    predicted = {
-        method: {
-            view: VideoFrames(rollout.clip(episode_id, view)) for view in views if view in rollout.views(episode_id)
-        }
-        for method, rollout in rollouts.items()
-    }
     recorded = {view: VideoFrames(episodes.clip(position, view)) for view in views}
-    return RecordingContent(episodes.episode(position), recorded, predicted, tracks, sigma_px_ref)
+    if rollouts is not None:
+        there = [view for view in views if view in rollouts.views(episode_id)]
+        predicted = {view: VideoFrames(rollouts.clip(episode_id, view)) for view in there}
+    method = "" if rollouts is None else rollouts.method
+    return RecordingContent(episodes.episode(position), recorded, predicted, method, tracks, sigma_px_ref)
 
 
-def write_prediction_mcap(path: Path, content: RecordingContent, method: str, encoding: Encoding) -> None:
-    """Write a method's predicted views as MCAP with cameras and commanded tool poses.
+def write_prediction_mcap(path: Path, content: RecordingContent, encoding: Encoding) -> None:
+    """Write the predicted views as MCAP with cameras and commanded tool poses.
 
     Calibration follows the frames' size; poses are cut to the prediction's length.
     """
-    episode, views = content.episode, content.predicted_frames[method]
+    episode, views = content.episode, content.predicted_frames
     count = min(len(frames) for frames in views.values())
     facts = {name: getattr(episode, name) for name in ("episode_id", "embodiment", "instruction")}
     write_rollout_mcap(
         path,
         {view: MadeFrames(frames.__iter__, frames.shape, np.uint8)[:count] for view, frames in views.items()},
         episode.fps,
-        metadata={key: json.dumps(value) for key, value in ({"method": method} | facts).items()},
+        metadata={key: json.dumps(value) for key, value in ({"method": content.method} | facts).items()},
         cameras={
             view: episode.cameras[view].resized(frames.shape[2], frames.shape[1]).cut(0, count)
             for view, frames in views.items()

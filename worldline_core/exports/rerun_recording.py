@@ -59,13 +59,15 @@ class RecordingContent:
 
     Attributes:
         true_frames: by view.
-        predicted_frames: by method and view.
+        predicted_frames: by view.
+        method: that predicted them.
         sigma_px_ref: width of the heat, pixels on the 384 x 512 reference canvas.
     """
 
     episode: Episode
     true_frames: Mapping[str, Frames]
-    predicted_frames: Mapping[str, Mapping[str, Frames]] = field(default_factory=dict)
+    predicted_frames: Mapping[str, Frames] = field(default_factory=dict)
+    method: str = ""
     tracks: EpisodeTracks | None = None
     sigma_px_ref: float = SIGMA_PX_REFERENCE
 
@@ -87,9 +89,8 @@ def _log_content(stream: rr.RecordingStream, content: RecordingContent) -> None:
     episode, tracks = content.episode, content.tracks
     stream.send_recording_name(episode.episode_id)
     _log_cameras(stream, content)
-    for method, views in content.predicted_frames.items():
-        for view, frames in views.items():
-            _log_frames(stream, f"predicted/{method}/{view}", frames, episode.fps)
+    for view, frames in content.predicted_frames.items():
+        _log_frames(stream, f"predicted/{content.method}/{view}", frames, episode.fps)
     if tracks is not None:
         _log_tools(stream, tracks, episode.fps)
         _log_robot(stream, tracks, episode.fps)
@@ -226,20 +227,18 @@ def _log_description(stream: rr.RecordingStream, episode: Episode, tools: str) -
 
 
 def _blueprint(content: RecordingContent) -> rrb.Blueprint:
-    """The initial layout: the views in a row per method, the scene under or beside them, time series below."""
-    views = list(content.true_frames)
-    rows = [[(f"world/cameras/{view}", f"true, {view.replace('_', ' ')}") for view in views]]
-    for method, predicted in content.predicted_frames.items():
-        rows.append([(f"predicted/{method}/{view}", f"{method}, {view.replace('_', ' ')}") for view in predicted])
-    pictures = [rrb.Horizontal(*[rrb.Spatial2DView(origin=at, name=name) for at, name in row]) for row in rows]
+    """The initial layout: true and predicted views in a row each, the scene under or beside them, time series below."""
+    views, method = list(content.true_frames), content.method
+    rows = [("world/cameras", "true", views), (f"predicted/{method}", method, list(content.predicted_frames))]
+    pictures = [
+        rrb.Horizontal(*[rrb.Spatial2DView(origin=f"{at}/{v}", name=f"{name}, {v.replace('_', ' ')}") for v in shown])
+        for at, name, shown in rows
+        if shown
+    ]
     # The heat over the frames would float in the scene twice.
     flat = [f"- $origin/cameras/{view}/actions" for view in views]
     scene = rrb.Spatial3DView(
-        origin="world",
-        name="scene",
-        contents=["$origin/**", *flat],
-        line_grid=True,
-        background=(24, 26, 31),
+        origin="world", name="scene", contents=["$origin/**", *flat], line_grid=True, background=(24, 26, 31)
     )
     if len(pictures) == 1:
         top = rrb.Vertical(*pictures, scene, row_shares=[5, 6])

@@ -16,8 +16,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError
 from worldline_core.store.atomic import write_json_atomic
 
@@ -176,6 +177,18 @@ def digest_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+class ListedFile(StrictModel):
+    """Size [bytes] and digest of a file, as manifests and publications list it."""
+
+    size: int = Field(ge=0)
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+def describe_file(path: Path) -> ListedFile:
+    """Size and digest of the file at a path."""
+    return ListedFile(size=path.stat().st_size, sha256=digest_file(path))
+
+
 def leads_out(path: Path, root: Path) -> bool:
     """True if a path ends outside of a folder. Snapshots of the Hub's cache may use the blobs of their own repository."""
     target, root = path.resolve(), root.resolve()
@@ -183,8 +196,8 @@ def leads_out(path: Path, root: Path) -> bool:
     return not any(target.is_relative_to(folder) for folder in (root, *blobs[:1]))
 
 
-def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
-    """The files of a folder's content, sorted: all but the manifest and the volatile folder, or ``everything``.
+def folder_files(folder: Path, *, everything: bool = False) -> dict[str, Path]:
+    """The files of a folder's content by relative name, sorted: all but the manifest and the volatile folder, or ``everything``.
 
     Raises:
         ArtifactError: a symbolic link leads out of the folder.
@@ -199,24 +212,18 @@ def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
     for path in files:
         if path.is_symlink() and leads_out(path, root):
             raise ArtifactError("A symbolic link leads out of the folder", where=path, got=path.resolve())
-    return sorted(files, key=lambda path: path.parts[depth:])
+    # relative_to takes longer than everything else here
+    return {"/".join(path.parts[depth:]): path for path in sorted(files, key=lambda path: path.parts[depth:])}
 
 
 def _refuse(error: OSError) -> None:
     raise error  # os.walk would leave out a folder that cannot be listed
 
 
-def _files_by_name(folder: Path, *, everything: bool = False) -> dict[str, Path]:
-    depth = len(folder.parts)  # relative_to takes longer than everything else here
-    return {"/".join(path.parts[depth:]): path for path in folder_files(folder, everything=everything)}
-
-
 def content_files(folder: Path, *, everything: bool = False) -> dict[str, JsonObject]:
     """`size` [bytes] and `sha256` of every file of a folder's content by relative name, as a manifest lists them."""
-    return {
-        name: {"size": path.stat().st_size, "sha256": digest_file(path)}
-        for name, path in _files_by_name(folder, everything=everything).items()
-    }
+    files = folder_files(folder, everything=everything)
+    return {name: describe_file(path).model_dump() for name, path in files.items()}
 
 
 def digest_listed(files: Mapping[str, JsonObject]) -> str:
@@ -257,17 +264,12 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> str:
     return content["digest"]
 
 
-class _ListedFile(BaseModel):
-    size: int
-    sha256: str
-
-
 class _Manifest(BaseModel):
     """Fields of a manifest that readers rely on."""
 
     model_config = ConfigDict(strict=True)
     digest: str
-    files: dict[str, _ListedFile]
+    files: dict[str, ListedFile]
     step: str = ""
     metrics: dict[str, Any] = {}
     config: dict[str, Any] = {}
@@ -291,22 +293,17 @@ def read_manifest(folder: Path) -> JsonObject:
     stated = manifest.pop("manifest_sha256", None)
     if stated != (found := digest_value(manifest)):
         raise ArtifactError(
-            "A manifest is damaged",
-            where=path,
-            expected=f"content of sha256 {stated}",
-            got=f"content of sha256 {found}",
+            "A manifest is damaged", where=path, expected=f"content of sha256 {stated}", got=f"content of sha256 {found}",
             next_step=how_to_rebuild(folder),
-        )
+        )  # fmt: skip
     try:
         _Manifest.model_validate(manifest)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         raise ArtifactError(
-            "A manifest is of another form, as an earlier version wrote it",
-            where=path,
-            expected=f"{'.'.join(map(str, first['loc']))}: {first['msg']}",
-            next_step=how_to_rebuild(folder),
-        ) from error
+            "A manifest is of another form, as an earlier version wrote it", where=path,
+            expected=f"{'.'.join(map(str, first['loc']))}: {first['msg']}", next_step=how_to_rebuild(folder),
+        ) from error  # fmt: skip
     return manifest
 
 
@@ -331,7 +328,7 @@ def find_damage(folder: Path, mode: VerifyMode = "full") -> list[str]:
         stated = read_manifest(folder)["files"]
     except ArtifactError as error:
         return [f"{MANIFEST_NAME}: {error.got or error.expected}"]
-    present = _files_by_name(folder)
+    present = folder_files(folder)
     damage = [f"{name}: missing" for name in sorted(stated.keys() - present.keys())]
     damage += [f"{name}: not listed" for name in sorted(present.keys() - stated.keys())]
     written = (folder / MANIFEST_NAME).stat().st_mtime_ns
@@ -358,6 +355,11 @@ def _digest_or_error(path: Path) -> str:
         return digest_file(path)
     except OSError as error:
         return f"({error.strerror})"
+
+
+def shortened(items: list[str]) -> str:
+    """The first five of some texts for a message, and how many more there are."""
+    return "; ".join(items[:5]) + (f"; and {len(items) - 5} more" if len(items) > 5 else "")
 
 
 def check_artifacts(folders: Iterable[Path], mode: VerifyMode = "full") -> dict[Path, list[str]]:
@@ -392,14 +394,10 @@ def verify_artifact(folder: Path, mode: VerifyMode = "full", what: str = "Artifa
     """
     for artifact, damage in check_artifacts([folder], mode).items():
         if damage:
-            more = f"; and {len(damage) - 5} more" if len(damage) > 5 else ""
             raise ArtifactError(
-                f"{what} is damaged: files differ from what was written",
-                where=artifact,
-                expected=f"the files of its {MANIFEST_NAME}",
-                got="; ".join(damage[:5]) + more,
-                next_step=how_to_rebuild(artifact),
-            )
+                f"{what} is damaged: files differ from what was written", where=artifact,
+                expected=f"the files of its {MANIFEST_NAME}", got=shortened(damage), next_step=how_to_rebuild(artifact),
+            )  # fmt: skip
 
 
 def finished_artifacts(root: Path) -> list[Path]:

@@ -23,7 +23,7 @@ from fsspec.asyn import AsyncFileSystem
 from upath import UPath
 from upath.implementations.local import FilePath
 
-from worldline_core.errors import ArtifactError, ConfigError, UnavailableError, installing
+from worldline_core.errors import ArtifactError, ConfigError, UnavailableError, needing
 from worldline_core.store.artifact_files import digest_value
 from worldline_core.untrusted_text import carries_credentials
 
@@ -68,12 +68,9 @@ def _answering(path: AnyPath) -> Iterator[None]:
     except Exception as error:
         if not is_transient(error):
             raise
-        raise UnreachableInputError(
-            "A store could not be reached",
-            where=path,
-            got=first_line(error),
-            next_step="run the same command again when the store answers; finished work is kept",
-        ) from error
+        step = "run the same command again when the store answers; finished work is kept"
+        got = first_line(error)
+        raise UnreachableInputError("A store could not be reached", where=path, got=got, next_step=step) from error
 
 
 def first_line(error: BaseException) -> str:
@@ -97,11 +94,10 @@ def parse_location(text: str | Path | UPath) -> AnyPath:
         return text
     if carries_credentials(str(text)):
         raise ConfigError(
-            "A location carries credentials, which manifests and logs would keep",
+            "A location carries credentials, which manifests and logs would keep", got=text,
             expected="a URL without password, key or signature",
-            got=text,
             next_step="leave them to the store's environment variables (AWS_*, or FSSPEC_<PROTOCOL>_<OPTION>)",
-        )
+        )  # fmt: skip
     try:
         location = UPath(text)
     except ValueError as error:
@@ -121,11 +117,8 @@ def file_system(path: AnyPath) -> Any:
 
     Raises: UnavailableError where the store's library is not installed.
     """
-    try:
+    with needing("s3", "The store's library", where=str(path), otherwise="install the fsspec library of that store"):
         return cast("UPath", path).fs
-    except ImportError as error:
-        step = f"for s3:// {installing('s3')}; otherwise install the fsspec library of that store"
-        raise UnavailableError("A store's library is not installed", where=path, got=error, next_step=step) from error
 
 
 def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
@@ -135,23 +128,19 @@ def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
     """
     fs = file_system(root)
     base = fs._strip_protocol(str(root)).rstrip("/")
-    with _answering(root):
-        found = _find(fs, base)
-    return {name: found[path] for path in sorted(found) if (name := path.removeprefix(base).lstrip("/"))}
-
-
-def _find(fs: Any, base: str) -> dict[str, dict[str, Any]]:
+    found: dict[str, Any]
     own: Any = type(fs)._find if isinstance(fs, AsyncFileSystem) else type(fs).find
-    if own not in (AsyncFileSystem._find, AbstractFileSystem.find):
-        return cast("dict[str, dict[str, Any]]", fs.find(base, detail=True))
-    # fsspec's own walk silently omits the folders it could not list: `on_error` does not reach folders further down.
-    found: dict[str, dict[str, Any]] = {}
-    folders = [base] if fs.exists(base) else []
-    for folder in folders:
-        listed = {about["name"].rstrip("/"): about for about in fs.ls(folder, detail=True)}
-        found |= {name: about for name, about in listed.items() if about["type"] != "directory"}
-        folders += [name for name in listed.keys() - found.keys() if name != folder]
-    return found
+    with _answering(root):
+        if own in (AsyncFileSystem._find, AbstractFileSystem.find):
+            # This walk silently omits folders that it could not list: `on_error` does not reach folders further down.
+            found, folders = {}, [base] if fs.exists(base) else []
+            for folder in folders:
+                listed = {about["name"].rstrip("/"): about for about in fs.ls(folder, detail=True)}
+                found |= {name: about for name, about in listed.items() if about["type"] != "directory"}
+                folders += [name for name in listed.keys() - found.keys() if name != folder]
+        else:
+            found = cast("dict[str, Any]", fs.find(base, detail=True))
+    return {name: found[path] for path in sorted(found) if (name := path.removeprefix(base).lstrip("/"))}
 
 
 def remote_kind(path: AnyPath) -> str | None:
@@ -160,9 +149,8 @@ def remote_kind(path: AnyPath) -> str | None:
     Raises: PermissionError where the store refuses; UnreachableInputError when it does not answer, for which fsspec's
         `isfile` returns False.
     """
-    fs = file_system(path)
     with _answering(path), suppress(FileNotFoundError):
-        return fs.info(str(path))["type"]
+        return file_system(path).info(str(path))["type"]
     return None
 
 
