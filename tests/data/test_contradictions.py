@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.data.conftest import make_sample
 from tests.data.curating import record, run
 from tools.corrupted.conventions import written_as_moving, written_as_wxyz
-from worldline_core.data.curation.episode_checks import check_commands, check_joints, check_tool_poses
+from worldline_core.data.curation.recorded_episode import check_commands, check_joints, check_tool_poses
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, with_rigid_poses

@@ -23,8 +23,7 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import decode_video
 from worldline_core.discovery.cameras import name_views, watch
-from worldline_core.discovery.configuration import write_config
-from worldline_core.discovery.findings import Discovery
+from worldline_core.discovery.findings import Discovery, write_config
 from worldline_core.discovery.look import discover, look
 from worldline_core.errors import DataError
 from worldline_core.exports.export import export

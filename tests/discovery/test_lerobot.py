@@ -25,8 +25,7 @@ from tests.discovery.recorded_sets import (
 )
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.discovery.configuration import write_config
-from worldline_core.discovery.findings import Discovery
+from worldline_core.discovery.findings import Discovery, write_config
 from worldline_core.discovery.look import discover, look
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes

@@ -17,8 +17,7 @@ from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, schema_kind
 from worldline_core.discovery.cameras import name_views
 from worldline_core.discovery.columns import ArmColumns, Column, Side, find_arms, words_of
 from worldline_core.discovery.findings import Discovery, Question, named, stated_licence
-from worldline_core.discovery.robots import joint_order, match_robot
-from worldline_core.discovery.units import gripper_readings
+from worldline_core.discovery.robots import gripper_readings, joint_order, match_robot
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 

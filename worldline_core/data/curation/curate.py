@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits
-from worldline_core.data.curation.episode_checks import check_episode
-from worldline_core.data.curation.recorded_episode import TRIMMED, prepare_episode, trimmed
+from worldline_core.data.curation.recorded_episode import TRIMMED, check_episode, prepare_episode, trimmed
 from worldline_core.data.curation.rules import check_held_out, decided_rows, drawn_episodes
 from worldline_core.data.curation.source_table import write_source_table, write_source_weights
 from worldline_core.data.episodes.episode_index import QuarantineRow, read_index, read_quarantine
