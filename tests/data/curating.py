@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import subprocess
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from functools import lru_cache
@@ -105,6 +107,32 @@ def _encoded(
                 out.mux(stream.encode(frame))
             out.mux(stream.encode(None))
         return file.getvalue()
+
+
+PATCHES = np.array(
+    [[(200, 30, 40), (30, 180, 60), (40, 60, 210)], [(230, 220, 40), (120, 120, 120), (20, 200, 220)]], np.uint8
+)
+
+
+def enlarged(patches: np.ndarray, side: int) -> np.ndarray:
+    return patches.repeat(side, 0).repeat(side, 1)
+
+
+def off(frames: np.ndarray, patches: np.ndarray = PATCHES) -> int:
+    """Largest difference from the patches in their middle, where nothing is smeared."""
+    height, width = frames.shape[-3] // patches.shape[0], frames.shape[-2] // patches.shape[1]
+    centres = frames[..., height // 2 :: height, width // 2 :: width, :]
+    assert centres.shape[-3:] == patches.shape
+    return int(np.abs(centres.astype(int) - patches).max())
+
+
+def by_ffmpeg(path: Path, height: int, width: int) -> np.ndarray | None:
+    """Every frame as the command shows it; None where there is none."""
+    if shutil.which("ffmpeg") is None:
+        return None
+    command = ["ffmpeg", "-v", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run(command, capture_output=True, check=True).stdout
+    return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
 
 
 Damage = Callable[[Path], object]

@@ -7,8 +7,6 @@ takes part in making a video.
 from __future__ import annotations
 
 import itertools
-import shutil
-import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -20,7 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.data.curating import run
+from tests.data.curating import PATCHES, by_ffmpeg, enlarged, off, run
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.file import _decoded  # pyright: ignore[reportPrivateUsage]
@@ -39,9 +37,6 @@ CODECS = {
     "hevc10": ("libx265", "yuv420p10le", {"crf": "2", "x265-params": "log-level=none"}),
     "av1": ("libsvtav1", "yuv420p10le", {"crf": "4", "preset": "8", "svtav1-params": "lp=1"}),
 }
-PATCHES = np.array(
-    [[(200, 30, 40), (30, 180, 60), (40, 60, 210)], [(230, 220, 40), (120, 120, 120), (20, 200, 220)]], np.uint8
-)
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,7 @@ class Made:
 
     def picture(self) -> np.ndarray:
         """The patches, with a mark in a corner by which recordings differ."""
-        picture = PATCHES.repeat(self.side, 0).repeat(self.side, 1)
+        picture = enlarged(PATCHES, self.side)
         picture[:16, :16] = self.mark
         return picture
 
@@ -94,23 +89,6 @@ CASES = [
 ]
 
 
-def off(found: np.ndarray) -> int:
-    """Largest difference to the patches in their middle, where nothing is smeared."""
-    height, width = found.shape[-3] // 2, found.shape[-2] // 3
-    centres = found[..., height // 2 :: height, width // 2 :: width, :]
-    return int(np.abs(centres.astype(int) - PATCHES).max())
-
-
-def by_ffmpeg(path: Path, *options: str) -> np.ndarray | None:
-    if shutil.which("ffmpeg") is None:
-        return None
-    with av.open(str(path)) as container:
-        size = container.streams.video[0].height, container.streams.video[0].width
-    command = ["ffmpeg", "-v", "error", "-i", str(path), *options, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-    raw = subprocess.run(command, capture_output=True, check=True).stdout
-    return np.frombuffer(raw, np.uint8).reshape(-1, *size, 3)
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Made]:
     """A video of every case, in one folder."""
@@ -126,7 +104,7 @@ def test_pictures_have_the_colours_that_ffmpeg_shows(made: dict[Path, Made]) -> 
         found = np.stack([picture.rgb for picture in pictures])
         assert off(found) <= TOLERANCE, case
         assert np.array_equal(np.stack(list(decoder.frames(clip, range(FRAMES)))), found)  # what training reads
-        shown = by_ffmpeg(path)
+        shown = by_ffmpeg(path, *found.shape[1:3])
         assert shown is None or np.abs(shown.astype(int) - found).max() <= TOLERANCE, case
         # What filters look at: the same light, whatever the depth and the range.
         red, blue = LUMA[case.matrix]
@@ -149,7 +127,7 @@ def test_colours_stay_through_curation_and_export(tmp_path: Path, made: dict[Pat
         for episodes in (curated, exported):
             assert off(episodes.frames(number, "head")) <= TOLERANCE, case
     # Without another size the packets are those that the test above shows to ffmpeg; with one, all are encoded alike.
-    shown = by_ffmpeg(Path(str(curated.clip(0, "head").path))) if image_size else None
+    shown = by_ffmpeg(Path(str(curated.clip(0, "head").path)), *image_size) if image_size else None
     assert shown is None or off(shown) <= TOLERANCE
 
 
@@ -191,6 +169,6 @@ def test_what_is_encoded_states_its_colours(tmp_path: Path, pixel_format: Any) -
         assert (context.colorspace, context.color_range) == (6, 1)  # BT.601, limited
         assert (context.color_primaries, context.color_trc) == (1, 1)  # BT.709's, which are those of sRGB
         assert off(next(container.decode(stream)).to_ndarray(format="rgb24")) <= TOLERANCE
-    shown = by_ffmpeg(tmp_path / "a.mp4")
+    shown = by_ffmpeg(tmp_path / "a.mp4", *Made().picture().shape[:2])
     assert shown is None or off(shown) <= TOLERANCE
     assert cv2.VideoCapture(str(tmp_path / "a.mp4")).isOpened()

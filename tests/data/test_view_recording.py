@@ -29,10 +29,10 @@ FRAMES = 40
 Copied = tuple[dict[str, Any], dict[str, Any], EpisodeSet]
 
 
-def recordings(folder: Path, count: int) -> dict[str, Any]:
-    """An EpisodeSet whose videos another program wrote, each in a file of its own."""
+def recordings(folder: Path) -> dict[str, Any]:
+    """An EpisodeSet of two recordings whose videos another program wrote, each in a file of its own."""
     with EpisodeSetWriter(folder / "raw") as writer:
-        for number in range(count):
+        for number in range(2):
             episode, frames, _ = make_sample(number, num_frames=FRAMES, height=128, width=192)
             views = {}
             for view, images in frames.items():
@@ -43,17 +43,17 @@ def recordings(folder: Path, count: int) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def one(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The source of a single recording."""
-    return recordings(tmp_path_factory.mktemp("one"), 1)
-
-
-@pytest.fixture(scope="module")
 def copied(tmp_path_factory: pytest.TempPathFactory) -> Copied:
     """The source of two recordings, the counts of their curation, and the set."""
     folder = tmp_path_factory.mktemp("two")
-    source = recordings(folder, 2)
+    source = recordings(folder)
     return source, *run(folder, source)
+
+
+@pytest.fixture
+def one(copied: Copied) -> dict[str, Any]:
+    """The source of the first recording alone."""
+    return {**copied[0], "include": ["episode-000"]}
 
 
 @pytest.fixture
