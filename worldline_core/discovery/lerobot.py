@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,9 @@ class Sample:
     indices: list[int]
     listed: int
 
+    def __post_init__(self) -> None:
+        self._column = cache(self.dataset.column)  # read again and again: for units, limits, grippers and motion
+
     def values(self, columns: Sequence[Column]) -> np.ndarray:
         """(N, len(columns)) float64 of all sampled episodes; missing numbers are replaced by the median."""
         values = np.concatenate([self.episode(index, columns) for index in self.indices])
@@ -54,7 +58,7 @@ class Sample:
         return np.where(np.isfinite(values), values, usual)
 
     def episode(self, index: int, columns: Sequence[Column]) -> np.ndarray:
-        features = {c.feature: self.dataset.column(index, c.feature) for c in columns}
+        features = {c.feature: self._column(index, c.feature) for c in columns}
         flat = {name: v[:, None] if v.ndim == 1 else v for name, v in features.items()}
         for column in columns:
             if column.index >= flat[column.feature].shape[1]:
