@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from fractions import Fraction
 from functools import lru_cache
 from io import BytesIO
@@ -15,11 +16,14 @@ from typing import Any
 import av
 import h5py
 import numpy as np
+import pytest
 import yaml
 
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.video.encoder import encode_video
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -29,6 +33,13 @@ def run(tmp_path: Path, *sources: dict[str, Any], **changes: Any) -> tuple[dict[
     counts = curate(CurateConfig.model_validate({"sources": sources, **changes}), {}, tmp_path / "out")
     assert counts["kept"] + counts["quarantined"] == counts["found"]
     return counts, EpisodeSet.open(tmp_path / "out")
+
+
+@contextmanager
+def rejected(reason: str, match: str) -> Iterator[pytest.ExceptionInfo[RejectedInputError]]:
+    with pytest.raises(RejectedInputError, match=match) as caught:
+        yield caught
+    assert caught.value.reason == reason
 
 
 def reasons(curated: EpisodeSet) -> dict[str, str]:
@@ -167,6 +178,16 @@ def with_nan(values: np.ndarray) -> np.ndarray:
 
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def moved_out(path: Path) -> None:
+    """The file is beside the recordings' folder `raw`, and a link leads there."""
+    outside = next(parent for parent in path.parents if parent.name == "raw").parent / path.name
+    path.symlink_to(path.rename(outside))
+
+
+def black_video(path: Path, num_frames: int, fps: float) -> None:
+    encode_video(path, np.zeros((num_frames, 48, 64, 3), np.uint8), fps, preset="ultrafast")
 
 
 def check_faults(

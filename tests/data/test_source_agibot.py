@@ -15,7 +15,18 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 from scipy.spatial.transform import Rotation
 
-from tests.data.curating import Damage, check_faults, cut, edit, replaced, run, with_nan, without
+from tests.data.curating import (
+    Damage,
+    black_video,
+    check_faults,
+    cut,
+    edit,
+    moved_out,
+    replaced,
+    run,
+    with_nan,
+    without,
+)
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.agibot import AgibotWorldSourceConfig
 from worldline_core.data.sources.open import SourceConfig, open_source
@@ -258,16 +269,6 @@ def pose(rotation: object) -> Damage:
     )
 
 
-def link_out(path: Path) -> None:
-    elsewhere = video(path).rename(path.parents[4] / "elsewhere.mp4")
-    video(path).symlink_to(elsewhere)
-
-
-def other_video(length: int, fps: float) -> Damage:
-    frames = np.zeros((length, HEIGHT, WIDTH, 3), dtype=np.uint8)
-    return lambda path: encode_video(video(path), frames, fps, preset="ultrafast")
-
-
 FAULTS: dict[str, tuple[Damage, str]] = {
     "no proprioception": (lambda path: path.unlink(), "missing_file"),
     "no task file": (lambda path: task_file(path).unlink(), "missing_file"),
@@ -284,7 +285,7 @@ FAULTS: dict[str, tuple[Damage, str]] = {
     "wrong shape": (replaced("state/end/orientation", lambda _: np.zeros((LENGTH, 4))), "length_mismatch"),
     "empty commands": (replaced("action/joint/position", lambda _: np.zeros((0,))), "length_mismatch"),
     "a state less": (replaced(JOINTS, lambda v: v[1:]), "length_mismatch"),
-    "a frame more": (other_video(LENGTH + 1, 30.0), "length_mismatch"),
+    "a frame more": (lambda path: black_video(video(path), LENGTH + 1, 30.0), "length_mismatch"),
     "times of another rate": (replaced("timestamp", lambda v: 2 * v - v[0]), "wrong_fps"),
     "NaN gripper": (replaced("action/effector/position", with_nan), "nan_state"),
     "NaN time": (replaced("timestamp", with_nan), "nan_state"),
@@ -296,7 +297,7 @@ FAULTS: dict[str, tuple[Damage, str]] = {
     "no rotation": (pose(np.ones((3, 3)).tolist()), "invalid_extrinsics"),
     "ragged rotation": (pose([[1, 0], [0]]), "invalid_extrinsics"),
     "extrinsics without a field": (rewritten(extrinsics, lambda _: [{}]), "missing_column"),
-    "video linked out of the folder": (link_out, "path_traversal"),
+    "video linked out of the folder": (lambda path: moved_out(video(path)), "path_traversal"),
     "array linked out of the file": (leading_out(linked), "path_traversal"),
     "array linked by a detour": (leading_out(linked_by_a_detour), "path_traversal"),
     "array gathered from another file": (leading_out(virtual), "path_traversal"),
@@ -385,15 +386,6 @@ def cut_to(name: str, part: slice) -> Damage:
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[part])
 
 
-def elsewhere(name: str) -> Damage:
-    return lambda folder: (folder / name).symlink_to((folder / name).rename(folder.parents[1] / name))
-
-
-def filmed(length: int, fps: float) -> Damage:
-    frames = np.zeros((length, HEIGHT, WIDTH, 3), np.uint8)
-    return lambda folder: encode_video(folder / "head_color.mp4", frames, fps, preset="ultrafast")
-
-
 PROPRIO, POSES = "proprio_stats.h5", "head_extrinsic_params_aligned.json"
 CLIP_FAULTS: dict[Write, dict[str, tuple[Damage, str]]] = {
     write_clip: {
@@ -409,9 +401,9 @@ CLIP_FAULTS: dict[Write, dict[str, tuple[Damage, str]]] = {
         "a joint less": (h5(replaced("state/joint/position", lambda v: v[:, 1:])), "length_mismatch"),
         "a command less": (h5(replaced("action/joint/position", lambda v: v[1:])), "length_mismatch"),
         "a camera pose less": (changed(POSES, lambda poses: poses[1:]), "length_mismatch"),
-        "another rate": (filmed(LENGTH, 15.0), "wrong_fps"),
-        "a frame less": (filmed(LENGTH - 1, 30.0), "truncated_video"),
-        "a file elsewhere": (elsewhere(PROPRIO), "path_traversal"),
+        "another rate": (lambda folder: black_video(folder / "head_color.mp4", LENGTH, 15.0), "wrong_fps"),
+        "a frame less": (lambda folder: black_video(folder / "head_color.mp4", LENGTH - 1, 30.0), "truncated_video"),
+        "a file elsewhere": (lambda folder: moved_out(folder / PROPRIO), "path_traversal"),
     },
     write_arrays: {
         "no array of actions": (gone("action.npy"), "missing_file"),
@@ -422,7 +414,7 @@ CLIP_FAULTS: dict[Write, dict[str, tuple[Damage, str]]] = {
         "no picture": (gone("frame.png"), "missing_file"),
         "truncated picture": (cut_to("frame.png", slice(60)), "unreadable"),
         "truncated array": (cut_to("action.npy", slice(-8)), "unreadable"),
-        "an array elsewhere": (elsewhere("action.npy"), "path_traversal"),
+        "an array elsewhere": (lambda folder: moved_out(folder / "action.npy"), "path_traversal"),
     },
 }
 

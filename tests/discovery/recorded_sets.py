@@ -41,7 +41,7 @@ def pictures(states: np.ndarray, kind: str, seed: int = 0) -> np.ndarray:
 
 
 def write_video(path: Path, frames: np.ndarray, fps: int) -> None:
-    curating.write_video(path, frames, rate=fps, options={"crf": "12", "g": "4"})
+    curating.write_video(path, frames, rate=fps, options={"crf": "12", "g": "4", "preset": "ultrafast"})
 
 
 def write_lerobot(

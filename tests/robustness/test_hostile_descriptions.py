@@ -87,7 +87,6 @@ URDF = {
     "half a character": chain(2).replace("l1", "\ud800"),
     "a link that is not there": chain(5000).replace("<parent link='l0'/>", "<parent link='z'/>"),
     "a name of a million letters": urdf(f"<joint name='{'x' * 10**6}' type='odd'><parent link='a'/><child link='b'/></joint>"),
-    "a circle": urdf("<joint name='j' type='fixed'><parent link='b'/><child link='b'/></joint>"),
 }  # fmt: skip
 MJCF = {
     "bodies within bodies": "<worldbody>" + "<body>" * 20_000 + "</body>" * 20_000 + "</worldbody>",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.robustness.conftest import rejected  # pyright: ignore[reportMissingImports]
+from tests.data.curating import rejected
 from tools.corrupted import lerobot_v21
 from tools.corrupted.content import FPS, pictures
 from tools.corrupted.one_of_each import write_one_of_each
