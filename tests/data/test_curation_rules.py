@@ -34,7 +34,14 @@ from worldline_core.data.curation.rules import (
     find_scene_leaks,
 )
 from worldline_core.data.curation.source_table import read_source_table, write_source_weights
-from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode import (
+    RAW_INSTRUCTION,
+    Episode,
+    mentions_outcome,
+    normalised_text,
+    one_annotation,
+    with_instruction,
+)
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.fingerprint import (
@@ -44,13 +51,6 @@ from worldline_core.data.episodes.fingerprint import (
     ViewPrint,
     fingerprint,
     motion_hashes,
-)
-from worldline_core.data.episodes.instructions import (
-    RAW_INSTRUCTION,
-    mentions_outcome,
-    normalised_text,
-    one_annotation,
-    with_instruction,
 )
 from worldline_core.errors import ConfigError, DataError
 

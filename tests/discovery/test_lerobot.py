@@ -25,7 +25,7 @@ from tests.discovery.recorded_sets import (
 )
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.discovery.columns import columns_of, find_arms
+from worldline_core.discovery.arms import columns_of, find_arms
 from worldline_core.discovery.findings import Discovery, write_config
 from worldline_core.discovery.look import discover, look
 from worldline_core.errors import ConfigError, DataError

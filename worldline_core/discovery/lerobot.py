@@ -22,18 +22,23 @@ from worldline_core.data.lerobot.dataset import (
 )
 from worldline_core.data.sources.lerobot import AngleUnit, flat_names, is_droid
 from worldline_core.data.video.clip import decode_frames
-from worldline_core.discovery.cameras import Seen, name_views, watch
-from worldline_core.discovery.columns import ArmColumns, Column, Side, columns_of, find_arms, words_of
-from worldline_core.discovery.findings import Discovery, Question, name_calibration, named, stated_licence
-from worldline_core.discovery.robots import (
+from worldline_core.discovery.arms import (
     STRANGERS,
+    ArmColumns,
+    Column,
     Match,
+    Side,
+    columns_of,
+    find_arms,
     gripper_readings,
     is_lerobot_arm,
     joint_order,
     joint_unit,
     match_robot,
+    words_of,
 )
+from worldline_core.discovery.cameras import Seen, name_views, watch
+from worldline_core.discovery.findings import Discovery, Question, name_calibration, named, stated_licence
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 

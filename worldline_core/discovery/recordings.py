@@ -17,10 +17,9 @@ from worldline_core.data.sources.hdf5 import Hdf5File, open_hdf5
 from worldline_core.data.sources.robomind import ROBOMIND_LAYOUTS, LayoutName
 from worldline_core.data.sources.unitree_h5 import ROBOTS, check_columns
 from worldline_core.data.video.clip import video_size
+from worldline_core.discovery.arms import Side, gripper_readings
 from worldline_core.discovery.cameras import name_views
-from worldline_core.discovery.columns import Side
 from worldline_core.discovery.findings import Discovery, Question, named, stated_licence
-from worldline_core.discovery.robots import gripper_readings
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 

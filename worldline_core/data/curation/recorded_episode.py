@@ -17,8 +17,14 @@ import numpy as np
 
 from worldline_core.data.curation.curate_config import AVAILABLE, CurateConfig, DrawnSplits
 from worldline_core.data.episodes.conventions import arm_blocks, is_gripper
-from worldline_core.data.episodes.episode import NO_EMBODIMENT, TRAINING_SPLITS, CameraTrack, Episode, Split
-from worldline_core.data.episodes.instructions import with_instruction
+from worldline_core.data.episodes.episode import (
+    NO_EMBODIMENT,
+    TRAINING_SPLITS,
+    CameraTrack,
+    Episode,
+    Split,
+    with_instruction,
+)
 from worldline_core.data.episodes.recorded_poses import camera_pose, check_intrinsics
 from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, LoadedEpisode, Masks, for_evaluation_only
 from worldline_core.data.episodes.view_recording import ViewImages
