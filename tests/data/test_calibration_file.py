@@ -13,7 +13,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from tests.data import published_robomind, test_source_unitree_h5
+from tests.data import test_source_robomind, test_source_unitree_h5
 from tests.data.curating import preset, reasons, run
 from tests.data.published_lerobot import FRAMES, HEIGHT, WIDTH, picture, wave, write_droid, write_robocoin
 from tests.data.test_source_agibot import write_episode
@@ -42,10 +42,10 @@ STILL = {**SIZE, "maps": "camera_to_base", "axes": "opencv", "T": POSE}
 
 
 def robomind(root: Path) -> dict[str, Any]:
-    published_robomind.write_franka(root / "h5_franka_3rgb")
+    test_source_robomind.write_franka(root / "h5_franka_3rgb")
     source = {"kind": "robomind", "path": str(root / "h5_franka_3rgb"), "layout": "h5_franka_3rgb", "fps": 10}
     views = {"head": "camera_top", "right_wrist": "camera_left"}
-    return {**source, "gripper_state": published_robomind.GRIPPER, "views": views}
+    return {**source, "gripper_state": test_source_robomind.GRIPPER, "views": views}
 
 
 def unitree(write: Callable[..., Path]) -> Callable[[Path], dict[str, Any]]:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from flows.command_line import main
-from tests.data.published_robomind import write_franka
 from tests.data.test_source_agibot import write_clip
 from tests.data.test_source_agibot import write_episode as write_agibot
+from tests.data.test_source_robomind import write_franka
 from tests.data.test_source_robotwin import write_episode as write_robotwin
 from tests.data.test_source_unitree_h5 import write_hdf5, write_transitions
 from tests.discovery.recorded_sets import motion, pictures, write_so101, write_video
