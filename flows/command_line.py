@@ -251,10 +251,8 @@ def _task(arguments: argparse.Namespace) -> None:
 
 
 def _init(arguments: argparse.Namespace) -> None:
-    from worldline_core.discovery.configuration import write_config
-    from worldline_core.discovery.findings import as_json, as_text
-    from worldline_core.discovery.hub import fetch_sample, hub_id
-    from worldline_core.discovery.look import discover
+    from worldline_core.discovery.findings import as_json, as_text, write_config
+    from worldline_core.discovery.look import discover, fetch_sample, hub_id
 
     hub = None if (name := hub_id(arguments.recordings)) is None else fetch_sample(name)
     found = discover(Path(arguments.recordings) if hub is None else hub.folder)

@@ -114,12 +114,11 @@ def check_card(config: PipelineConfig, file: Path, memory: str) -> None:
 
 def fit_command(arguments: argparse.Namespace) -> None:
     """Write the configuration or take the one that is there, check it, and run the flow."""
-    from worldline_core.discovery.hub import fetch_dataset, hub_id
+    from worldline_core.discovery.look import fetch_dataset, hub_id
 
     recordings = Path(arguments.recordings) if (name := hub_id(arguments.recordings)) is None else fetch_dataset(name)
     if not arguments.config.exists():
-        from worldline_core.discovery.configuration import write_config
-        from worldline_core.discovery.findings import as_text
+        from worldline_core.discovery.findings import as_text, write_config
         from worldline_core.discovery.look import discover
         from worldline_core.pipeline.cards import card_memory, preset_for
 

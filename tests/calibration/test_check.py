@@ -23,8 +23,7 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.reader_process import ReaderLimits
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.guarded import GuardedSource
-from worldline_core.data.sources.open import EpisodeSetSourceConfig
+from worldline_core.data.sources.open import EpisodeSetSourceConfig, GuardedSource
 from worldline_core.errors import DataError
 
 CLEAN, INVERTED = "ur5e_silver-test-s1-00000", "ur5e_silver-train-s1-00002"

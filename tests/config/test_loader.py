@@ -1,4 +1,6 @@
-"""The strict YAML loader names every mistake by its file and dotted path, and loads every file in configs."""
+"""The strict YAML loader names every mistake by its file and dotted path, and loads every file in configs; default precision on
+processors with and without native bfloat16.
+"""
 
 from __future__ import annotations
 
@@ -9,22 +11,24 @@ import pytest
 from pydantic import Field, ValidationError
 
 from tasks.execution.artifact_task import find_task
+from worldline_core import processor
 from worldline_core.config import CONFIG_ROOT, StrictModel, apply_overrides, load_config, read_yaml, validate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.sources.open import SourceConfig
 from worldline_core.data.sources.robomind import ROBOMIND_LAYOUTS
 from worldline_core.errors import ConfigError
-from worldline_core.evaluation.evaluation_config import SegmenterConfig
+from worldline_core.evaluation.evaluation_config import JudgeConfig, SegmenterConfig
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.geometry.embodiment import embodiment_names
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 from worldline_core.recorder.attempts import RecordBanksConfig, RecordPoliciesConfig
 from worldline_core.recorder.record import RecordConfig, plan_jobs
-from worldline_core.rollout.rollout_config import GeSimConfig
+from worldline_core.rollout.rollout_config import GeSimConfig, RolloutConfig
 from worldline_core.scale.mapping import RunnerConfig
+from worldline_core.serving.serve_config import ServeConfig
 from worldline_core.training.clip_config import EncodeLatentsConfig
-from worldline_core.training.training_config import TokenizerConfig
+from worldline_core.training.training_config import TokenizerConfig, TrainerConfig
 
 
 class Inner(StrictModel):
@@ -73,7 +77,6 @@ def test_override_forms(tmp_path: Path) -> None:
     for given, override, message in (
         ({}, "a.b", r"form a\.b=value"),
         ({"a": 1}, "a.b=2", "not a mapping"),
-        ({}, "a=[1", "not valid YAML"),
     ):
         with pytest.raises(ConfigError, match=message):
             apply_overrides(given, [override])
@@ -256,3 +259,32 @@ def test_a_robot_without_a_description_is_a_mistake_in_the_configuration(name: s
     with pytest.raises(ConfigError, match=rf"(?s)embodiment: .*no description of the robot {name} .*{hint}.*none"):
         validate(CurateConfig, {"sources": [source(name)]}, where="my.yaml")
     assert validate(CurateConfig, {"sources": [source("none")]}, where="my.yaml").sources[0].label == "x"
+
+
+PROCESSORS = {
+    "model name\t: Sapphire\nflags\t\t: fpu avx512f avx512_bf16 amx_bf16 amx_tile": ("Sapphire", True),
+    "model name\t: Zen 4\nflags\t\t: fpu avx512f avx512_bf16": ("Zen 4", True),
+    "model name\t: Cascade Lake\nflags\t\t: fpu avx2 avx512f avx512_vnni": ("Cascade Lake", False),
+    "model name\t: Zen 3\nflags\t\t: fpu avx avx2 fma": ("Zen 3", False),
+}
+
+
+@pytest.mark.parametrize("facts", PROCESSORS)
+def test_bfloat16_is_the_default_where_the_device_has_it(facts: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processor, "_first_core", lambda: facts)
+    name, has = PROCESSORS[facts]
+    assert (processor.processor_name(), processor.processor_has_bfloat16()) == (name, has)
+    for model in (RolloutConfig, ServeConfig, TokenizerConfig):
+        assert model().bfloat16 is has
+        assert model(device="cuda:1").bfloat16
+        assert not model(device="cuda", bfloat16=False).bfloat16
+    assert TokenizerConfig().trainer.precision == JudgeConfig().trainer.precision == ("bf16" if has else "fp32")
+    assert RolloutConfig(weights="bfloat16").bfloat16
+    assert TrainerConfig(steps=1).precision == ("bf16" if has else "fp32")
+    assert TrainerConfig(steps=1, device="cuda").precision == TrainerConfig(steps=1, weights="bf16").precision == "bf16"
+    assert TrainerConfig(steps=1, precision="bf16").precision == "bf16"
+
+
+def test_a_mistake_beside_it_is_named_alone() -> None:
+    with pytest.raises(ConfigError, match=r"got: \n    device: [^\n]*\(got 3\)$"):
+        validate(RolloutConfig, {"device": 3}, where="a file")

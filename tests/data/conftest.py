@@ -1,14 +1,9 @@
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
-
-sys.path.insert(0, str(Path(__file__).parent))  # several tests write the layouts in `published_*`
 
 HEIGHT, WIDTH, FRAMES, FPS = 32, 48, 9, 8.0
 Sample = tuple[Episode, dict[str, np.ndarray], dict[str, np.ndarray]]

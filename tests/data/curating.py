@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+import shutil
+import subprocess
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from fractions import Fraction
 from functools import lru_cache
 from io import BytesIO
@@ -13,11 +16,14 @@ from typing import Any
 import av
 import h5py
 import numpy as np
+import pytest
 import yaml
 
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.video.encoder import encode_video
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -27,6 +33,13 @@ def run(tmp_path: Path, *sources: dict[str, Any], **changes: Any) -> tuple[dict[
     counts = curate(CurateConfig.model_validate({"sources": sources, **changes}), {}, tmp_path / "out")
     assert counts["kept"] + counts["quarantined"] == counts["found"]
     return counts, EpisodeSet.open(tmp_path / "out")
+
+
+@contextmanager
+def rejected(reason: str, match: str) -> Iterator[pytest.ExceptionInfo[RejectedInputError]]:
+    with pytest.raises(RejectedInputError, match=match) as caught:
+        yield caught
+    assert caught.value.reason == reason
 
 
 def reasons(curated: EpisodeSet) -> dict[str, str]:
@@ -107,6 +120,32 @@ def _encoded(
         return file.getvalue()
 
 
+PATCHES = np.array(
+    [[(200, 30, 40), (30, 180, 60), (40, 60, 210)], [(230, 220, 40), (120, 120, 120), (20, 200, 220)]], np.uint8
+)
+
+
+def enlarged(patches: np.ndarray, side: int) -> np.ndarray:
+    return patches.repeat(side, 0).repeat(side, 1)
+
+
+def off(frames: np.ndarray, patches: np.ndarray = PATCHES) -> int:
+    """Largest difference from the patches in their middle, where nothing is smeared."""
+    height, width = frames.shape[-3] // patches.shape[0], frames.shape[-2] // patches.shape[1]
+    centres = frames[..., height // 2 :: height, width // 2 :: width, :]
+    assert centres.shape[-3:] == patches.shape
+    return int(np.abs(centres.astype(int) - patches).max())
+
+
+def by_ffmpeg(path: Path, height: int, width: int) -> np.ndarray | None:
+    """Every frame as the command shows it; None where there is none."""
+    if shutil.which("ffmpeg") is None:
+        return None
+    command = ["ffmpeg", "-v", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run(command, capture_output=True, check=True).stdout
+    return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
+
+
 Damage = Callable[[Path], object]
 
 
@@ -139,6 +178,16 @@ def with_nan(values: np.ndarray) -> np.ndarray:
 
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def moved_out(path: Path) -> None:
+    """The file is beside the recordings' folder `raw`, and a link leads there."""
+    outside = next(parent for parent in path.parents if parent.name == "raw").parent / path.name
+    path.symlink_to(path.rename(outside))
+
+
+def black_video(path: Path, num_frames: int, fps: float) -> None:
+    encode_video(path, np.zeros((num_frames, 48, 64, 3), np.uint8), fps, preset="ultrafast")
 
 
 def check_faults(

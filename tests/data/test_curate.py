@@ -22,10 +22,11 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import ImageTransform
 
+SMALL: dict[str, Any] = {"image_size": (16, 24), "fps": 8}
 
-def config(*sources: Path, **changes: Any) -> CurateConfig:
-    listed = [{"kind": "episode_set", "path": str(path)} for path in sources]
-    return CurateConfig.model_validate({"sources": listed, "image_size": (16, 24), "fps": 8, **changes})
+
+def own(root: Path) -> dict[str, Any]:
+    return {"kind": "episode_set", "path": str(root)}
 
 
 def test_labels_of_things_are_stored_and_follow_a_resize(tmp_path: Path) -> None:
@@ -41,8 +42,7 @@ def test_labels_of_things_are_stored_and_follow_a_resize(tmp_path: Path) -> None
     assert stored is not None
     assert np.array_equal(stored, labels)
     assert recorded.thing_labels(0, "left_wrist") is None
-    curate(config(tmp_path / "raw"), {}, tmp_path / "out")
-    small = EpisodeSet.open(tmp_path / "out").thing_labels(0, "head")
+    small = run(tmp_path, own(tmp_path / "raw"), **SMALL)[1].thing_labels(0, "head")
     expected = np.zeros((9, 16, 24), np.uint8)
     expected[:, 2:4, 3:5] = 1
     expected[:, 10, 15:17] = 3
@@ -52,9 +52,8 @@ def test_labels_of_things_are_stored_and_follow_a_resize(tmp_path: Path) -> None
 
 def test_kept_episodes_are_resized_and_calibration_follows(tmp_path: Path) -> None:
     samples = [make_sample(number) for number in range(2)]
-    counts = curate(config(record(tmp_path / "raw", samples)), {}, tmp_path / "out")
+    counts, curated = run(tmp_path, own(record(tmp_path / "raw", samples)), **SMALL)
     assert (counts["found"], counts["kept"], counts["quarantined"], counts["reasons"]) == (2, 2, 0, {})
-    curated = EpisodeSet.open(tmp_path / "out")
     episode = curated.episode(0)
     assert curated.frames(0, "left_wrist").shape == (9, 16, 24, 3)
     expected = samples[0][0].cameras["left_wrist"].resized(24, 16)
@@ -69,9 +68,10 @@ def test_kept_episodes_are_resized_and_calibration_follows(tmp_path: Path) -> No
 
 def test_inputs_override_configured_paths(tmp_path: Path) -> None:
     raw = record(tmp_path / "raw", [make_sample(0)])
-    assert curate(config(tmp_path / "elsewhere"), {"source.0": raw}, tmp_path / "out")["kept"] == 1
+    config = CurateConfig.model_validate({"sources": [own(tmp_path / "elsewhere")]})
+    assert curate(config, {"source.0": raw}, tmp_path / "out")["kept"] == 1
     with pytest.raises(DataError, match="Source folder is missing"):
-        curate(config(tmp_path / "elsewhere"), {}, tmp_path / "out2")
+        curate(config, {}, tmp_path / "out2")
 
 
 def with_head(episode: Episode, **changes: Any) -> Episode:
@@ -90,18 +90,18 @@ def test_bad_values_are_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None
     episodes[5] = with_head(episodes[5], T_base_camera=sheared)
     episodes[7].state[:, 6] = 6.0
     raw = record(tmp_path / "raw", [(e, *rest) for e, (_, *rest) in zip(episodes, samples, strict=True)])
-    counts = curate(config(raw), {}, tmp_path / "out")
+    counts, curated = run(tmp_path, own(raw), **SMALL)
     assert (counts["found"], counts["kept"], counts["quarantined"]) == (9, 2, 7)
-    rows = {row.episode_id: row for row in EpisodeSet.open(tmp_path / "out").quarantine()}
-    assert {name: row.reason for name, row in rows.items()} == {
-        "episode-001": "nan_state",
-        "episode-002": "joint_out_of_range",
-        "episode-003": "joint_out_of_range",
-        "episode-004": "singular_intrinsics",
-        "episode-005": "invalid_extrinsics",
-        "episode-006": "wrong_fps",
-        "episode-007": "invalid_gripper",
-    }
+    rows = {row.episode_id: row for row in curated.quarantine()}
+    expected = (
+        "nan_state",
+        *["joint_out_of_range"] * 2,
+        "singular_intrinsics",
+        "invalid_extrinsics",
+        "wrong_fps",
+        "invalid_gripper",
+    )
+    assert reasons(curated) == {f"episode-00{n}": reason for n, reason in enumerate(expected, 1)}
     assert rows["episode-001"].numbers == {"track": "state", "first_frame": 4, "values": 1}
     assert rows["episode-002"].numbers["position_rad"] == pytest.approx(9.0)
     assert rows["episode-006"].numbers == {"wanted_fps": 8.0, "recorded_fps": 5.0}
@@ -112,11 +112,10 @@ def test_a_truncated_video_costs_only_its_own_episodes(tmp_path: Path) -> None:
     video = raw / "datasets/ur5e_pair/videos/observation.images.head/chunk-000/file-000.mp4"
     content = video.read_bytes()
     video.write_bytes(content[: int(len(content) * 0.7)])
-    counts = curate(config(raw), {}, tmp_path / "out")
-    assert counts["reasons"] == {"truncated_video": counts["quarantined"]}
+    counts, curated = run(tmp_path, own(raw), **SMALL)
+    assert (counts["found"], counts["reasons"]) == (4, {"truncated_video": counts["quarantined"]})
     assert 1 <= counts["kept"] <= 2
-    assert counts["kept"] + counts["quarantined"] == counts["found"] == 4
-    (row, *_) = EpisodeSet.open(tmp_path / "out").quarantine()
+    (row, *_) = curated.quarantine()
     assert "file-000.mp4" in row.detail
     assert str(tmp_path) not in row.detail
     assert row.numbers["expected_frames"] == 40
@@ -136,61 +135,46 @@ def test_missing_columns_missing_files_and_robots_without_a_description(tmp_path
     data = raw / "datasets/xarm7_pair/data/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(data).drop_columns(["action"]), data)
     (raw / "datasets/none/videos/observation.images.left_wrist/chunk-000/file-000.mp4").unlink()
-    curate(config(raw), {}, tmp_path / "out")
-    curated = EpisodeSet.open(tmp_path / "out")
+    _, curated = run(tmp_path, own(raw), **SMALL)
     assert [(row.stage1_ok, row.stage2_reason) for row in curated.rows] == [(True, None), (True, "missing_kinematics")]
     rows = {row.episode_id: row for row in curated.quarantine()}
-    assert {name: row.reason for name, row in rows.items()} == {
+    assert reasons(curated) == {
         "episode-001": "missing_column", "episode-002": "missing_file", "episode-004": "unknown_embodiment",
     }  # fmt: skip
     assert "action" in rows["episode-001"].detail
     assert "did you mean 'ur5e_pair'?" in rows["episode-004"].detail
 
 
-def test_equal_content_is_kept_once(tmp_path: Path) -> None:
-    copy = make_sample(0)
-    raw = record(tmp_path / "raw", [make_sample(0), (replace(copy[0], episode_id="again"), *copy[1:]), make_sample(1)])
-    other = record(tmp_path / "other", [make_sample(1)])
-    counts = curate(config(raw, other), {}, tmp_path / "out")
-    assert (counts["found"], counts["kept"]) == (4, 2)
-    gone = reasons(EpisodeSet.open(tmp_path / "out"))
-    assert gone == {"episode-000": "duplicate", "episode-001#source.1": "duplicate_id"}
-
-
 def test_a_scene_in_training_and_in_test_is_an_error(tmp_path: Path) -> None:
     samples = [make_sample(0, scene="kitchen"), make_sample(1, scene="kitchen", split="test")]
     raw = record(tmp_path / "raw", samples)
     with pytest.raises(DataError, match=r"(?s)both in train and in test.*kitchen"):
-        curate(config(raw), {}, tmp_path / "out")
-    counts = curate(config(raw, splits={"kit*": "test"}), {}, tmp_path / "out2")
-    assert counts["splits"] == {"test": 2}
+        run(tmp_path, own(raw), **SMALL)
+    assert run(tmp_path / "second", own(raw), **SMALL, splits={"kit*": "test"})[0]["splits"] == {"test": 2}
 
 
 def test_a_multiple_of_the_rate_is_thinned(tmp_path: Path) -> None:
     episode, frames, masks = make_sample(0)
     doubled = replace(episode, fps=16.0, timestamps=episode.timestamps / 2)
     raw = record(tmp_path / "raw", [(doubled, frames, masks)])
-    curate(config(raw), {}, tmp_path / "out")
-    read = EpisodeSet.open(tmp_path / "out").episode(0)
+    _, curated = run(tmp_path, own(raw), **SMALL)
+    read = curated.episode(0)
     assert read.fps == 8.0
     assert np.array_equal(read.state, episode.state[::2])
     wrist = episode.cameras["left_wrist"].T_base_camera
     assert np.array_equal(read.cameras["left_wrist"].T_base_camera, wrist[::2])
-    assert EpisodeSet.open(tmp_path / "out").frames(0, "head").shape[0] == 5
+    assert curated.frames(0, "head").shape[0] == 5
 
 
 def test_views_and_calibration_can_be_demanded(tmp_path: Path) -> None:
     episode, *pictures = make_sample(2)
     uncalibrated = replace(episode, cameras={"head": episode.cameras["head"]})
     raw = record(tmp_path / "raw", [make_sample(0), make_sample(1, views=("head",)), (uncalibrated, *pictures)])
-    curate(config(raw, views=("head", "left_wrist"), require_calibration=True), {}, tmp_path / "out")
-    assert reasons(EpisodeSet.open(tmp_path / "out")) == {
-        "episode-001": "missing_view",
-        "episode-002": "missing_calibration",
-    }
-    assert EpisodeSet.open(tmp_path / "out").rows[0].views == ("head", "left_wrist")
-    curate(config(raw), {}, tmp_path / "all")
-    assert all(row.stage2_ok for row in EpisodeSet.open(tmp_path / "all").rows)  # any views, one camera at least
+    _, curated = run(tmp_path, own(raw), **SMALL, views=("head", "left_wrist"), require_calibration=True)
+    assert reasons(curated) == {"episode-001": "missing_view", "episode-002": "missing_calibration"}
+    assert curated.rows[0].views == ("head", "left_wrist")
+    # Any views, one camera at least.
+    assert all(row.stage2_ok for row in run(tmp_path / "all", own(raw), **SMALL)[1].rows)
 
 
 @pytest.mark.parametrize("index_too", [False, True])
@@ -202,7 +186,7 @@ def test_half_the_rate_in_the_metadata_of_a_set_is_a_wrong_rate(tmp_path: Path, 
     if index_too:
         write_index(raw, [replace(row, fps=4.0) for row in EpisodeSet.open(raw).rows])
     with pytest.raises(DataError, match="2 wrong_fps"):
-        curate(config(raw, fps=None), {}, tmp_path / "out")
+        run(tmp_path, own(raw), image_size=(16, 24))
     if not index_too:
         with pytest.raises(RejectedInputError, match="another frame rate"):
             EpisodeSet.open(raw).episode(0)
@@ -220,9 +204,8 @@ def test_states_and_videos_of_different_length(tmp_path: Path) -> None:
     assert (counts["kept"], counts["trimmed"], counts["reasons"]) == (2, 1, {"length_mismatch": 1})
     whole, cut = curated.episode(0), curated.episode(1)
     assert (whole.num_frames, cut.num_frames, "trimmed" in whole.conventions) == (NUM_FRAMES, NUM_FRAMES - 1, False)
-    assert (
-        cut.conventions["trimmed"] == f"the first {NUM_FRAMES - 1} frames of states {NUM_FRAMES - 1}, head {NUM_FRAMES}"
-    )
+    counted = f"states {NUM_FRAMES - 1}, head {NUM_FRAMES}"
+    assert cut.conventions["trimmed"] == f"the first {NUM_FRAMES - 1} frames of {counted}"
     assert whole.state[0, 7] == 0.0  # 1 is closed in the source, 0 here
     assert whole.conventions["gripper_overshoot"] == 1
     assert curated.rows[0].stage2_reason == "missing_calibration"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.data import published_robomind as robomind
+from tests.data import test_source_robomind as robomind
 from tests.data import test_source_robotwin as robotwin
 from tests.data import test_source_unitree_h5 as unitree
 from tests.data.curating import preset, run

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.data.curating import packets, plain_frames, write_video
+from tests.data.curating import packets, plain_frames, rejected, write_video
 from worldline_core.data.episodes.view_recording import VideoSettings, ViewImages, copy_clip, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import (
@@ -181,9 +181,8 @@ def test_frames_are_cut_off_and_a_wrong_count_is_refused(
         (VideoClip(source, 10, FPS, from_time=55 / FPS), "truncated_video"),
     ):
         assert copied(clip, tmp_path / "none.mp4") is None
-        with pytest.raises(RejectedInputError, match=f"expected: {clip.num_frames} frames") as caught:
+        with rejected(reason, f"expected: {clip.num_frames} frames"):
             shown(clip)
-        assert caught.value.reason == reason
     longer = VideoClip(source, 80, FPS, 0.0)
     assert len(list(decoder.frames(longer, range(55, 60)))) == 5
     with pytest.raises(RejectedInputError, match="truncated or undecodable"):
@@ -205,9 +204,8 @@ def test_a_gap_in_the_times_is_found_and_the_frames_around_it_are_exact(decoder:
         for index, frame in zip(indices, decoder.frames(clip, indices), strict=True):
             assert np.array_equal(frame, expected[index]), index
     for indices in ([21], [19, 20, 23]):
-        with pytest.raises(RejectedInputError, match=r"gap\.mp4") as caught:
+        with rejected("truncated_video", r"gap\.mp4"):
             list(decoder.frames(clip, indices))
-        assert caught.value.reason == "truncated_video"
     assert np.array_equal(next(iter(decoder.frames(clip, [7]))), expected[7])  # usable after a failure
 
 
@@ -220,13 +218,11 @@ def test_damaged_packets_are_not_copied_silently(recorded: Recorded, tmp_path: P
     content[position + 8 : position + len(damaged)] = bytes(len(damaged) - 8)
     source.write_bytes(content)
     clip = VideoClip.whole_file(source, COUNT, FPS)
-    with pytest.raises(RejectedInputError, match=r"damaged|truncated") as caught:
+    with rejected("truncated_video", r"damaged|truncated"):
         copied(clip, tmp_path / "copy.mp4")
-    assert caught.value.reason == "truncated_video"
     encoded = ViewImages(lambda: iter(()), COUNT, clip, image_size=(32, 48))
-    with pytest.raises(RejectedInputError, match=r"damaged|truncated") as caught:
+    with rejected("truncated_video", r"damaged|truncated"):
         store_view(encoded, tmp_path / "encoded.mp4", FPS, VideoSettings(preset="ultrafast"))
-    assert caught.value.reason == "truncated_video"
 
 
 def test_other_codecs_are_left_to_the_encoder(tmp_path: Path) -> None:
@@ -347,12 +343,7 @@ def test_colours_are_not_shifted(tmp_path: Path) -> None:
         assert np.abs(decode_video(tmp_path / "c.mp4")[2].astype(int) - colour).max() <= 3, colour
 
 
-def test_a_video_of_another_length_and_what_cannot_be_encoded_are_refused(tmp_path: Path) -> None:
-    encode_video(tmp_path / "v.mp4", picture(0), 8)
-    with pytest.raises(DataError, match=r"(?s)too many frames.*expected: 5 frames.*got: 12 frames"):
-        decode_video(tmp_path / "v.mp4", 5)
-    with pytest.raises(DataError, match="outside of the clip"):
-        decode_frames(VideoClip(tmp_path / "v.mp4", 12, 8.0, 0.0), [12])
+def test_what_cannot_be_encoded_is_refused(tmp_path: Path) -> None:
     small = np.zeros((2, 32, 48, 3), np.uint8)
     for frames, rate, message in (
         (small[:, :31], 8, "even image sides"),

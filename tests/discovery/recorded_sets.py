@@ -41,7 +41,7 @@ def pictures(states: np.ndarray, kind: str, seed: int = 0) -> np.ndarray:
 
 
 def write_video(path: Path, frames: np.ndarray, fps: int) -> None:
-    curating.write_video(path, frames, rate=fps, options={"crf": "18", "g": "8"})
+    curating.write_video(path, frames, rate=fps, options={"crf": "12", "g": "4", "preset": "ultrafast"})
 
 
 def write_lerobot(
@@ -52,26 +52,33 @@ def write_lerobot(
     version: str = "v3.0",
     fps: int = 30,
     robot: str | None = "so101_follower",
+    tasks: Sequence[str] = ("Pick the cube up.",),
 ) -> Path:
     """A dataset of these vectors (feature -> names, values by episode) and cameras (key -> frames by episode)."""
-    picture = {"dtype": "video", "shape": [HEIGHT, WIDTH, 3], "names": ["height", "width", "channels"]}
-    features: dict[str, Any] = {
-        **{name: {"dtype": "float32", "shape": [v[0].shape[1]], "names": names} for name, (names, v) in vectors.items()},
-        **dict.fromkeys(cameras, picture), "task_index": {"dtype": "int64", "shape": [1], "names": None},
-    }  # fmt: skip
     lengths = [len(values) for values in next(iter(vectors.values()))[1]]
     starts = [sum(lengths[:index]) for index in range(len(lengths))]
+    vectors = {"task_index": (None, [np.zeros(length, np.int64) for length in lengths]), **vectors}
+    features: dict[str, Any] = {
+        name: {"dtype": "float32" if v[0].dtype.kind == "f" else str(v[0].dtype), "shape": [v[0].size // len(v[0])], "names": names}
+        for name, (names, v) in vectors.items()
+    }  # fmt: skip
+    for key, frames in cameras.items():
+        features[key] = {"dtype": "video", "shape": [*frames[0].shape[1:]], "names": ["height", "width", "channels"]}
     tables = []
     for index, (start, length) in enumerate(zip(starts, lengths, strict=True)):
-        table: dict[str, Any] = {name: list(values[index].astype(np.float32)) for name, (_, values) in vectors.items()}
-        table |= {
+        values = {name: v[index] for name, (_, v) in vectors.items()}
+        table = {name: list(v.astype(features[name]["dtype"])) for name, v in values.items()} | {
             "timestamp": (np.arange(length) / fps).astype(np.float32), "frame_index": np.arange(length),
-            "episode_index": [index] * length, "index": start + np.arange(length), "task_index": [0] * length,
+            "episode_index": np.full(length, index), "index": start + np.arange(length),
         }  # fmt: skip
         tables.append(pa.table(table))
-    rows = [{"episode_index": i, "tasks": ["Pick the cube up."], "length": length} for i, length in enumerate(lengths)]
+    rows = [
+        {"episode_index": i, "tasks": [tasks[vectors["task_index"][1][i][0]]], "length": length}
+        for i, length in enumerate(lengths)
+    ]
     (root / "meta/episodes/chunk-000").mkdir(parents=True)
     (root / "data/chunk-000").mkdir(parents=True)
+    listed = {"task_index": range(len(tasks)), "task": tasks}
     if version == "v3.0":
         data = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
         video = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -83,14 +90,17 @@ def write_lerobot(
                 row |= {f"{key}/chunk_index": 0, f"{key}/file_index": 0}
                 row |= {f"{key}/from_timestamp": start / fps, f"{key}/to_timestamp": end / fps}
         pq.write_table(pa.Table.from_pylist(rows), root / "meta/episodes/chunk-000/file-000.parquet")
-        pq.write_table(pa.table({"task_index": [0], "task": ["Pick the cube up."]}), root / "meta/tasks.parquet")
+        pq.write_table(pa.table({name: list(v) for name, v in listed.items()}), root / "meta/tasks.parquet")
         for key, episodes in cameras.items():
             write_video(root / f"videos/{key}/chunk-000/file-000.mp4", np.concatenate(episodes), fps)
     else:
         data = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
         video = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
-        (root / "meta/episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-        (root / "meta/tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": "Pick the cube up."}) + "\n")
+        named = [dict(zip(listed, pair, strict=True)) for pair in zip(*listed.values(), strict=True)]
+        for name, lines in (("episodes", rows), ("tasks", named)):
+            (root / f"meta/{name}.jsonl").write_text(
+                "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines)
+            )
         for index, table in enumerate(tables):
             pq.write_table(table, root / f"data/chunk-000/episode_{index:06d}.parquet")
             for key, episodes in cameras.items():

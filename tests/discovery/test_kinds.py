@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from flows.command_line import main
-from tests.data.published_robomind import write_franka
-from tests.data.test_source_agibot_world import write_episode as write_agibot
-from tests.data.test_source_enerverse_ac import write_clip
+from tests.data.test_source_agibot import write_clip
+from tests.data.test_source_agibot import write_episode as write_agibot
+from tests.data.test_source_robomind import write_franka
 from tests.data.test_source_robotwin import write_episode as write_robotwin
 from tests.data.test_source_unitree_h5 import write_hdf5, write_transitions
 from tests.discovery.recorded_sets import motion, pictures, write_so101, write_video
@@ -23,8 +23,7 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import decode_video
 from worldline_core.discovery.cameras import name_views, watch
-from worldline_core.discovery.configuration import write_config
-from worldline_core.discovery.findings import Discovery
+from worldline_core.discovery.findings import Discovery, write_config
 from worldline_core.discovery.look import discover, look
 from worldline_core.errors import DataError
 from worldline_core.exports.export import export

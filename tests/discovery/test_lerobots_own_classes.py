@@ -13,7 +13,7 @@ from tests.discovery.recorded_sets import SO_JOINTS, SO_NAMES, pictures, so101_s
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.lerobot import LeRobotSourceConfig, state_columns
-from worldline_core.discovery.configuration import write_config
+from worldline_core.discovery.findings import write_config
 from worldline_core.discovery.look import look
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 

@@ -19,7 +19,7 @@ from worldline_core.calibration.estimate.estimate_config import EstimateConfig
 from worldline_core.config import read_config
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.sources.open import open_source
-from worldline_core.discovery.configuration import write_config
+from worldline_core.discovery.findings import write_config
 from worldline_core.discovery.look import discover
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rollout.worldline import WorldLine

@@ -10,7 +10,7 @@ from flows.command_line import main
 from tests.discovery.recorded_sets import so101_states, write_so101
 from tests.hub.conftest import Hub, Repository, files_of
 from worldline_core.data.curation.curate import curate
-from worldline_core.discovery.hub import fetch_sample, hub_id
+from worldline_core.discovery.look import fetch_sample, hub_id
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 

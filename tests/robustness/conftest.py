@@ -1,7 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,7 @@ import pytest
 from tools.corrupted import lerobot_v21
 from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.encoder import encode_video
-
-
-@contextmanager
-def rejected(reason: str, match: str) -> Iterator[None]:
-    with pytest.raises(RejectedInputError, match=match) as caught:
-        yield
-    assert caught.value.reason == reason
 
 
 @pytest.fixture(scope="session")

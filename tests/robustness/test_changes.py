@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from tests.robustness.conftest import rejected  # pyright: ignore[reportMissingImports]
+from tests.data.curating import rejected
 from tools.corrupted.content import FPS, pictures
 from worldline_core.data.curation import curate as curate_step
 from worldline_core.data.curation.curate import curate

@@ -59,7 +59,7 @@ def test_hostile_overrides_are_refused(value: str) -> None:
 
 
 def test_a_mistake_in_a_long_file_is_told_in_few_words(tmp_path: Path) -> None:
-    text = f"sources: [{', '.join(['{kind: nothing}'] * 2000)}]\nname: {'x' * 10**6}"
+    text = f"sources: [{', '.join(['{kind: nothing}'] * 400)}]\nname: {'x' * 10**6}"
     (tmp_path / "x.yaml").write_text(text)
     with pytest.raises(ConfigError, match=r"and \d+ more|characters") as caught:
         load_config(CurateConfig, path=tmp_path / "x.yaml")
@@ -87,7 +87,6 @@ URDF = {
     "half a character": chain(2).replace("l1", "\ud800"),
     "a link that is not there": chain(5000).replace("<parent link='l0'/>", "<parent link='z'/>"),
     "a name of a million letters": urdf(f"<joint name='{'x' * 10**6}' type='odd'><parent link='a'/><child link='b'/></joint>"),
-    "a circle": urdf("<joint name='j' type='fixed'><parent link='b'/><child link='b'/></joint>"),
 }  # fmt: skip
 MJCF = {
     "bodies within bodies": "<worldbody>" + "<body>" * 20_000 + "</body>" * 20_000 + "</worldbody>",

@@ -18,7 +18,7 @@ from PIL import Image
 
 h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
-from tests.robustness.conftest import rejected  # pyright: ignore[reportMissingImports]
+from tests.data.curating import rejected
 from tools.corrupted.attacks import ATTACKS, Attack, ending, jpeg_of_scans
 from worldline_core.data.episodes.source import GripperRange
 from worldline_core.data.guards.plain_files import (

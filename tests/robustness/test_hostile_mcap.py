@@ -14,7 +14,7 @@ from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from mcap.records import Channel, Schema
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from tests.robustness.conftest import rejected  # pyright: ignore[reportMissingImports]
+from tests.data.curating import rejected
 from tools.corrupted import mcap
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode

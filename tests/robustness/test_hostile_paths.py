@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.robustness.conftest import rejected  # pyright: ignore[reportMissingImports]
+from tests.data.curating import rejected
 from tools.corrupted import lerobot_v21
 from tools.corrupted.content import FPS, pictures
 from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine, write_index
+from worldline_core.data.episodes.source import check_id, storable
 from worldline_core.data.guards.source_paths import fill_template, inside, safe_stem
-from worldline_core.data.sources.episode_files import check_id, storable
 from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.robustness.conftest import rejected  # pyright: ignore[reportMissingImports]
+from tests.data.curating import rejected
 from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
 from worldline_core.data.guards.rejection import RejectedInputError, check_columns
 from worldline_core.errors import ConfigError

@@ -31,7 +31,7 @@ from worldline_core.calibration.camera_errors import corrected_camera
 from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, Explanation, SourceDiagnosis, diagnose_source
 from worldline_core.config import apply_overrides, load_config, read_config
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.curation.episode_checks import check_camera, check_times, check_values
+from worldline_core.data.curation.recorded_episode import check_camera, check_times, check_values
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     along_tool_z,
@@ -44,8 +44,7 @@ from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.reader_process import ReaderLimits
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.data.sources.guarded import GuardedSource
-from worldline_core.data.sources.open import SourceConfig
+from worldline_core.data.sources.open import GuardedSource, SourceConfig
 from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from worldline_core.discovery.columns import Side, side_of, words_of
+from worldline_core.discovery.arms import Side, side_of, words_of
 from worldline_core.discovery.findings import named
 
 _WRIST = {"wrist", "hand", "gripper", "inhand", "handeye", "eih", "eye", "palm", "endeffector", "ee"}

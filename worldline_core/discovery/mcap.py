@@ -16,11 +16,18 @@ from worldline_core.data.guards.source_paths import AnyPath, find_files
 from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
 from worldline_core.data.mcap.file import McapFile, Stream
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, schema_kind
+from worldline_core.discovery.arms import (
+    ArmColumns,
+    Column,
+    Side,
+    find_arms,
+    gripper_readings,
+    joint_order,
+    match_robot,
+    words_of,
+)
 from worldline_core.discovery.cameras import name_views
-from worldline_core.discovery.columns import ArmColumns, Column, Side, find_arms, words_of
 from worldline_core.discovery.findings import Discovery, Question, named, stated_licence
-from worldline_core.discovery.robots import joint_order, match_robot
-from worldline_core.discovery.units import gripper_readings
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import NO_EMBODIMENT
+from worldline_core.data.episodes.episode import NO_EMBODIMENT, VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.plain_files import expect_layout, read_json
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -17,14 +17,12 @@ from worldline_core.data.sources.hdf5 import Hdf5File, open_hdf5
 from worldline_core.data.sources.robomind import ROBOMIND_LAYOUTS, LayoutName
 from worldline_core.data.sources.unitree_h5 import ROBOTS, check_columns
 from worldline_core.data.video.clip import video_size
+from worldline_core.discovery.arms import Side, gripper_readings
 from worldline_core.discovery.cameras import name_views
-from worldline_core.discovery.columns import Side
 from worldline_core.discovery.findings import Discovery, Question, named, stated_licence
-from worldline_core.discovery.units import gripper_readings
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 
-_VIEWS = ("head", "left_wrist", "right_wrist")
 _FILES = 8
 
 
@@ -34,7 +32,7 @@ def discover_episode_set(root: AnyPath) -> Discovery:
     rows = opened.rows
     if not rows:
         raise DataError("The EpisodeSet is empty", where=root, next_step="give a set with episodes")
-    views = [view for view in _VIEWS if all(view in row.views for row in rows)] or list(rows[0].views)
+    views = [view for view in VIEWS if all(view in row.views for row in rows)] or list(rows[0].views)
     robots = sorted({row.embodiment for row in rows})
     about = f"EpisodeSet of {named(robots)}: {len(rows)} episodes at {rows[0].fps:g} fps"
     found = Discovery(
@@ -60,23 +58,17 @@ def _spread[T](items: Sequence[T], most: int) -> list[int]:
 def discover_videos(root: AnyPath) -> Discovery:
     """Plain videos: nothing but pictures."""
     videos = [path for path in find_files(root, "*") if path.suffix.lower() == ".mp4"]
-    rates = []
-    for i in _spread(videos, _FILES):
-        try:
-            rates.append(video_size(videos[i])[2])
-        except RejectedInputError:
-            continue
+    rates = [rate for i in _spread(videos, _FILES) if (rate := _rate(videos[i])) is not None]
     if not rates:
         raise DataError(
             "None of the videos can be read", where=root, got=f"{len(videos)} files", next_step="copy the files again"
         )
-    about = f"{len(videos)} videos" + (
-        f" at {rates[0]:g} fps" if len(set(rates)) == 1 else f" at {min(rates):g} to {max(rates):g} fps"
-    )
+    same = len(set(rates)) == 1
+    about = f"{len(videos)} videos at " + (f"{rates[0]:g} fps" if same else f"{min(rates):g} to {max(rates):g} fps")
     source = {"kind": "video_folder", "path": str(root)}
     found = Discovery("video_folder", about, source, views=["head"], episodes=len(videos))
     found.evidence["kind",] = "mp4 files, and nothing that a reader of robots' recordings knows"
-    found.fps = rates[0] if len(set(rates)) == 1 else None
+    found.fps = rates[0] if same else None
     captions = [path for path in find_files(root, "*.txt") if is_file(path.with_suffix(".mp4"))]
     tables = [path for pattern in ("*.jsonl", "*.csv") for path in find_files(root, pattern) if path.parent == root]
     if not captions and len(tables) == 1:
@@ -145,7 +137,7 @@ def discover_gesim(root: AnyPath) -> Discovery:
         root,
         "folders with actions.npy or state_joints_0.npy, and pictures",
     )
-    result.views = list(_VIEWS)
+    result.views = list(VIEWS)
     result.say(("fps",), 30, "no file states the rate; AgiBot World records 30 Hz")
     result.notes.append(
         "Bundles hold first frames alone: they are for looking at controls and for predictions, not for training."
@@ -163,10 +155,7 @@ def discover_agibot_world(root: AnyPath) -> Discovery:
         root,
         "proprio_stats/ and observations/ of AgiBot World",
     )
-    present = {path.name.removesuffix("_color.mp4") for path in find_files(root, "*_color.mp4")}
-    result.views = [
-        view for view, camera in zip(_VIEWS, ("head", "hand_left", "hand_right"), strict=True) if camera in present
-    ]
+    present, result.views = _agibot_views(root)
     if not result.views:
         raise DataError(
             "AgiBot World without videos of its cameras",
@@ -174,25 +163,30 @@ def discover_agibot_world(root: AnyPath) -> Discovery:
             expected="head_color.mp4, hand_left_color.mp4, hand_right_color.mp4",
             next_step="unpack observations/",
         )
-    result.say(("views",), result.views, f"videos of {named(sorted(present))}")
+    result.say(("views",), result.views, f"videos of {named(present)}")
     result.fps = 30
     return result
 
 
 def discover_enerverse(root: AnyPath) -> Discovery:
     """EnerVerse-AC's clips."""
-    videos = {path.name.removesuffix("_color.mp4") for path in find_files(root, "*_color.mp4")}
     clips = {path.parent for name in ("proprio_stats.h5", "action.npy") for path in find_files(root, name)}
     result = _agibot(
         "enerverse_ac", f"EnerVerse-AC: {len(clips)} clips", root, "clips with proprio_stats.h5 or action.npy"
     )
-    result.views = [
-        view for view, camera in zip(_VIEWS, ("head", "hand_left", "hand_right"), strict=True) if camera in videos
-    ] or ["head"]
-    result.say(("views",), result.views, f"videos of {named(sorted(videos)) or 'no camera: first frames of the head'}")
+    videos, views = _agibot_views(root)
+    result.views = views or ["head"]
+    result.say(("views",), result.views, f"videos of {named(videos) or 'no camera: first frames of the head'}")
     result.say(("fps",), 30, "no file states the rate; AgiBot World records 30 Hz, a clip cut with a stride has less")
     result.trains = bool(videos)
     return result
+
+
+def _agibot_views(root: AnyPath) -> tuple[list[str], list[str]]:
+    """AgiBot's cameras that have videos, and their views."""
+    cameras = sorted({path.name.removesuffix("_color.mp4") for path in find_files(root, "*_color.mp4")})
+    names = zip(VIEWS, ("head", "hand_left", "hand_right"), strict=True)
+    return cameras, [view for view, camera in names if camera in cameras]
 
 
 def _agibot(kind: str, about: str, root: AnyPath, why: str) -> Discovery:

@@ -15,6 +15,7 @@ from PIL import Image
 
 from worldline_core.data.curation.rules import CURATION_FILE
 from worldline_core.data.curation.source_table import WEIGHTS_FILE, SourceFacts, read_source_table
+from worldline_core.data.episodes.episode import mentions_outcome
 from worldline_core.data.episodes.episode_index import (
     INDEX_FILE,
     EpisodeRow,
@@ -23,7 +24,6 @@ from worldline_core.data.episodes.episode_index import (
     read_quarantine,
 )
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.episodes.instructions import mentions_outcome
 from worldline_core.errors import DataError
 from worldline_core.pages.page import Table, duration, render, words
 from worldline_core.pictures import SheetRow, contact_sheet, evenly_spaced

@@ -44,7 +44,7 @@ from worldline_core.calibration.estimate.verdict import (
 )
 from worldline_core.calibration.estimate.wrist_camera import estimate_wrist
 from worldline_core.calibration.observation import arms_of_embodiment
-from worldline_core.data.curation.episode_checks import check_values
+from worldline_core.data.curation.recorded_episode import check_values
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import safe_stem

@@ -13,18 +13,16 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits
-from worldline_core.data.curation.episode_checks import check_episode
-from worldline_core.data.curation.recorded_episode import TRIMMED, prepare_episode, trimmed
+from worldline_core.data.curation.recorded_episode import TRIMMED, check_episode, prepare_episode, trimmed
 from worldline_core.data.curation.rules import check_held_out, decided_rows, drawn_episodes
 from worldline_core.data.curation.source_table import write_source_table, write_source_weights
 from worldline_core.data.episodes.episode_index import QuarantineRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set_writer import EMBODIMENTS_FOLDER, VIDEOS_FILE, EpisodeSetWriter
-from worldline_core.data.episodes.source import EpisodeSource
+from worldline_core.data.episodes.source import EpisodeSource, check_id, unique_identity
 from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.reader_process import read_limited
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import parse_location, portable_text, unchanged_files
-from worldline_core.data.sources.episode_files import check_id, unique_identity
 from worldline_core.data.sources.open import open_source
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.embodiment import carry_embodiments

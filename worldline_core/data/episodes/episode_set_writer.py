@@ -60,9 +60,9 @@ from worldline_core.geometry.embodiment import load_embodiment, own_embodiment
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 VIDEOS_FILE = "videos.json"
+"""Counts of the set's videos that were copied as recorded and that were encoded, and their codecs."""
 EMBODIMENTS_FOLDER = "embodiments"
 """Robots of the recordings that do not ship with the project."""
-"""Counts of the set's videos that were copied as recorded and that were encoded, and their codecs."""
 
 
 def part_name(episode_id: str) -> str:

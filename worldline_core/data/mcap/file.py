@@ -44,7 +44,7 @@ from worldline_core.data.mcap.messages import (
     MessageDecoder,
     RawImage,
 )
-from worldline_core.data.video.picture import Picture
+from worldline_core.data.video.clip import Picture
 
 # What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
 _DAMAGE = (

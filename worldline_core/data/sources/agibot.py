@@ -32,16 +32,17 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
 from worldline_core.data.episodes.source import (
     EmbodimentName,
+    EpisodeFiles,
     ForeignSourceConfig,
     GripperRange,
     LoadedEpisode,
     joint_names,
     sorted_views,
+    timed_video_size,
 )
 from worldline_core.data.guards.plain_files import read_image, read_json, read_npy, read_text, validated
 from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_finite
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, inside_folder, is_file, relative_name
-from worldline_core.data.sources.episode_files import EpisodeFiles, timed_video_size
 from worldline_core.data.sources.hdf5 import ArmPlace, Columns, open_hdf5, require_h5py
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw

@@ -11,10 +11,11 @@ from typing import Any, Literal
 import numpy as np
 
 from worldline_core.data.episodes.conventions import along_tool_z
-from worldline_core.data.episodes.instructions import one_annotation
+from worldline_core.data.episodes.episode import one_annotation
 from worldline_core.data.episodes.source import (
     EVALUATION_LAYOUTS,
     EmbodimentName,
+    EpisodeFiles,
     EvaluationSourceConfig,
     GripperRange,
     LoadedEpisode,
@@ -24,7 +25,6 @@ from worldline_core.data.episodes.source import (
 from worldline_core.data.guards.plain_files import expect_layout, read_json
 from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_length, check_rate, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside
-from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 

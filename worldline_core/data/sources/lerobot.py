@@ -393,7 +393,8 @@ class LeRobotSource:
             check_files(root, list(config.views))
         self._dataset = LeRobotV21Dataset(root) if config.kind == "lerobot_v21" else LeRobotV3Dataset(root)
         features = self._dataset.features
-        self._evaluation_only = config.evaluation_only or _is_droid(config, root, self._dataset.info)
+        names = config.label, config.embodiment, root.name
+        self._evaluation_only = config.evaluation_only or is_droid(self._dataset.info, *names)
         if self._evaluation_only and config.split in TRAINING_SPLITS:
             raise ConfigError(
                 "DROID is for evaluation only",
@@ -528,10 +529,9 @@ class LeRobotSource:
         return "success" if bool(succeeded[-1]) else "failure"
 
 
-def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: DatasetInfo) -> bool:
-    """True if a dataset is DROID by its name, its robot's name or its cameras' names (its port calls the robot Franka)."""
-    names = (config.label, config.embodiment, root.name, str(info.robot_type), str(info.repo_id))
-    return says_droid(*names) or set(info.features) >= _DROID_VIDEOS
+def is_droid(info: DatasetInfo, *names: str) -> bool:
+    """True if a dataset is DROID by its names, its robot's name or its cameras' names (its port calls the robot Franka)."""
+    return says_droid(*names, str(info.robot_type), str(info.repo_id)) or set(info.features) >= _DROID_VIDEOS
 
 
 class LeRobotCollection:

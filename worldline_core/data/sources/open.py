@@ -1,15 +1,15 @@
-"""Open a configured source: the kinds there are, and the reader of each.
+"""Open a configured source: the kinds there are, and the reader of each, here or in a process with limits.
 
-What a reader loads is brought to the contract before anything else looks at its pixels: declared departures from the
+A loaded episode is brought to the contract before anything else looks at its pixels: declared departures from the
 conventions are repaired, and distorting lenses taken out.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +20,7 @@ from worldline_core.data.episodes.conventions import RecordedConventions, apply_
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as, with_rigid_poses
 from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode, Masks, SourceConfigBase
+from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
 from worldline_core.data.guards.rejection import RATE_TOLERANCE, RejectedInputError, check_length, check_rate
 from worldline_core.data.guards.source_paths import AnyPath, SourceFolder, exists
 from worldline_core.data.sources.agibot import (
@@ -290,3 +291,49 @@ def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
         distortions={},
         clips={view: clip for view, clip in loaded.clips.items() if view not in lenses},
     )
+
+
+class GuardedSource:
+    """A source of which this process reads what a reader process has read to its end."""
+
+    def __init__(self, config: SourceConfig, limits: ReaderLimits) -> None:
+        self.config, self.limits = config, limits
+        self._read_through: set[str] = set()
+
+    @cached_property
+    def _source(self) -> EpisodeSource:
+        return open_source(self.config, self.config.path)
+
+    def episode_ids(self) -> Sequence[str]:
+        """Raises: DataError, UnavailableError."""
+        return read_limited(self.limits, _episode_ids, self.config)
+
+    def load(self, episode_id: str) -> LoadedEpisode:
+        """Raises: RejectedInputError, DataError."""
+        if episode_id not in self._read_through:
+            read_limited(self.limits, _read_through, self.config, episode_id)
+            self._read_through.add(episode_id)
+        return self._source.load(episode_id)
+
+
+_opened: dict[str, EpisodeSource] = {}
+"""The source that a reader process read last, by its configuration."""
+
+
+def _open(config: SourceConfig) -> EpisodeSource:
+    key = config.model_dump_json()
+    if key not in _opened:
+        _opened.clear()
+        _opened[key] = open_source(config, config.path)
+    return _opened[key]
+
+
+def _episode_ids(config: SourceConfig) -> list[str]:
+    return list(_open(config).episode_ids())
+
+
+def _read_through(config: SourceConfig, episode_id: str) -> None:
+    loaded = _open(config).load(episode_id)
+    for view in loaded.views:
+        for _ in loaded.each_image(view):
+            pass

@@ -25,10 +25,15 @@ from pydantic import Field, model_validator
 
 from worldline_core.config import FrameRate
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
-from worldline_core.data.episodes.source import EmbodimentName, ForeignSourceConfig, GripperRange, LoadedEpisode
+from worldline_core.data.episodes.source import (
+    EmbodimentName,
+    EpisodeFiles,
+    ForeignSourceConfig,
+    GripperRange,
+    LoadedEpisode,
+)
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside
-from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.sources.hdf5 import (
     ArmPlace,
     Channels,

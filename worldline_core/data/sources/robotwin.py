@@ -22,6 +22,7 @@ from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_
 from worldline_core.data.episodes.source import (
     EVALUATION_LAYOUTS,
     EmbodimentName,
+    EpisodeFiles,
     EvaluationSourceConfig,
     GripperRange,
     LoadedEpisode,
@@ -29,7 +30,6 @@ from worldline_core.data.episodes.source import (
 from worldline_core.data.guards.plain_files import image_size, read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.sources.hdf5 import ArmPlace, Columns, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.geometry.transforms import pose_from_quaternion_wxyz
 

@@ -26,14 +26,15 @@ from pydantic import Field, model_validator
 from worldline_core.config import FrameRate
 from worldline_core.data.episodes.source import (
     EmbodimentName,
+    EpisodeFiles,
     ForeignSourceConfig,
     GripperRange,
     LoadedEpisode,
     sorted_views,
+    timed_video_size,
 )
 from worldline_core.data.guards.rejection import RejectedInputError, all_of
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.data.sources.episode_files import EpisodeFiles, timed_video_size
 from worldline_core.data.sources.hdf5 import ArmPlace, Channels, Columns, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.sources.video_folder import caption_table
 from worldline_core.data.video.clip import VideoClip

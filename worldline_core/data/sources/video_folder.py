@@ -19,11 +19,10 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.config import StrictModel
-from worldline_core.data.episodes.source import ForeignSourceConfig, LoadedEpisode
+from worldline_core.data.episodes.source import EpisodeFiles, ForeignSourceConfig, LoadedEpisode
 from worldline_core.data.guards.plain_files import read_text
 from worldline_core.data.guards.rejection import RejectedInputError, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, regular_file
-from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.errors import DataError
 from worldline_core.untrusted_text import printable

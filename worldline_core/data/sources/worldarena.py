@@ -31,15 +31,16 @@ from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.source import (
     EVALUATION_LAYOUTS,
     EmbodimentName,
+    EpisodeFiles,
     EvaluationSourceConfig,
     GripperRange,
     LoadedEpisode,
     joint_names,
+    timed_video_size,
 )
 from worldline_core.data.guards.plain_files import read_image, read_json, read_npy
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.data.sources.episode_files import EpisodeFiles, timed_video_size
 from worldline_core.data.sources.hdf5 import open_hdf5, require_h5py
 from worldline_core.data.video.clip import VideoClip, read_clip
 
