@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from tests.data import curating
@@ -78,6 +79,23 @@ def test_agibot_v2(tmp_path: Path, shared_data: Path) -> None:
 
 
 @pytest.mark.slow
+def test_droid(tmp_path: Path, shared_data: Path) -> None:
+    folder = shared_data / "droid_ctrl_world" / "droid_new_setup"
+    counts, curated = run(tmp_path, kind="droid_annotation", path=str(folder), name="droid")
+    assert (counts["found"], counts["reasons"]) == (6, {"length_mismatch": 2})
+    assert {row.episode_id: row.numbers for row in curated.quarantine()} == {
+        "droid-val-0003": {"frames": 206, "states": 205},
+        "droid-val-0006": {"frames": 42, "states": 41},
+    }
+    assert {row.stage2_reason for row in curated.rows} == {"missing_calibration"}
+    assert all(row.stage1_ok and row.fps == 4.0 for row in curated.rows)
+    uneven = {"kind": "droid_annotation", "name": "droid", "include": ["droid-val-0003", "droid-val-0006"]}
+    counts, trimmed = run(tmp_path / "trimmed", trim="common", path=str(folder), **uneven)
+    assert (counts["kept"], counts["trimmed"]) == (2, 2)
+    assert [trimmed.rows[trimmed.position(f"droid-val-{n}")].num_frames for n in ("0003", "0006")] == [205, 41]
+
+
+@pytest.mark.slow
 def test_droid_subset_with_its_kinematics(tmp_path: Path, shared_data: Path) -> None:
     """The other nine episodes all come through, and their joints and poses agree."""
     from worldline_core.geometry.embodiment import load_embodiment
@@ -94,6 +112,35 @@ def test_droid_subset_with_its_kinematics(tmp_path: Path, shared_data: Path) -> 
         tools = np.asarray(kinematics.tool_poses(episode.state.astype(np.float64)))
         assert np.abs(tools[..., :3, 3] - episode.T_base_ee[..., :3, 3]).max() < 2e-3, row.episode_id
         assert np.abs(tools[..., :3, 2] - episode.T_base_ee[..., :3, 2]).max() < 1e-2, row.episode_id
+
+
+@pytest.mark.slow
+def test_unitree_with_its_arms_named(tmp_path: Path, shared_data: Path) -> None:
+    root = shared_data / "lerobot_unitree_g1"
+    order = ("ShoulderPitch", "ShoulderRoll", "ShoulderYaw", "Elbow", "WristRoll", "WristPitch", "WristYaw")
+    arms = [
+        {"name": side} | {
+            track: {"joints": {"feature": feature, "columns": [f"k{side.title()}{joint}" for joint in order]}}
+            for track, feature in (("state", "observation.state"), ("action", "action"))
+        }
+        for side in ("left", "right")
+    ]  # fmt: skip
+    counts, curated = run(
+        tmp_path, kind="lerobot_v21", path=str(root), name="unitree", embodiment="none", angle_unit="rad",
+        views={"observation.images.cam_high": "head"}, arms=arms,
+    )  # fmt: skip
+    assert (counts["found"], counts["kept"], counts["reasons"]) == (100, 2, {"missing_file": 98})
+    assert [(row.num_frames, row.stage2_reason) for row in curated.rows] == [
+        (221, "missing_calibration"), (277, "missing_calibration"),
+    ]  # fmt: skip
+    first = curated.episode(0)
+    table = pq.read_table(root / "data/chunk-000/episode_000029.parquet", columns=["observation.state", "action"])
+    raw = np.asarray(table["observation.state"].to_pylist())
+    assert curated.rows[0].episode_id == "unitree-000029"
+    assert np.allclose(first.state, raw[:, :14], atol=1e-6)
+    assert curated.rows[0].instruction == "pick up the yellow bottle on the table"
+    # The commands lead the joints they are given to.
+    assert np.abs(first.action - first.state).mean() < np.abs(first.action - first.state[::-1]).mean()
 
 
 def test_droid_with_the_self_calibration(tmp_path: Path, shared_data: Path) -> None:
