@@ -15,12 +15,8 @@ from worldline_core.evaluation.policy import measured_judge
 from worldline_core.evaluation.policy.judge import establishes_success, route
 from worldline_core.evaluation.segmenters import coloured_things as things
 from worldline_core.evaluation.segmenters import learned
-from worldline_core.evaluation.segmenters.segmenter import (
-    ColourSegmenter,
-    Sam3Segmenter,
-    kinematic_masks,
-    open_segmenter,
-)
+from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
+from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter, Sam3Segmenter, open_segmenter
 from worldline_core.rehearsal.outside_models import write_sam3
 from worldline_core.store.artifact_files import digest_folder
 

@@ -243,7 +243,7 @@ def planner_of(world, start):
     return lambda **options: ClosedLoopPlanner(world, start.cameras, **usual | options)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def shipped(project_root):
     return project_root / "artifacts" / "shipped"
 

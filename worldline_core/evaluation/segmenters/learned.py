@@ -30,7 +30,7 @@ from worldline_core.evaluation.augmentation import change_colours, degrade, mix_
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frames_to_unit
 from worldline_core.evaluation.recordings import HEAD
-from worldline_core.evaluation.segmenters.segmenter import MaskStream, kinematic_masks
+from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
 from worldline_core.evaluation.small_network import WEIGHTS_FILE, load_network
 from worldline_core.geometry.cameras import ImageTransform
 from worldline_core.processor import bfloat16_by_default
@@ -134,14 +134,14 @@ class LearnedSegmenter:
         batch = _BATCH_ON_CPU if device.type == "cpu" else _BATCH
         masks = []
         for start in range(0, len(video), batch):
-            frames = torch.from_numpy(np.ascontiguousarray(video[start : start + batch])).to(device)
+            frames = torch.from_numpy(video[start : start + batch].copy()).to(device)
             frames = frames_to_unit(frames).contiguous(memory_format=torch.channels_last)
             with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16_by_default({"device": device.type})):
                 logits = self.network(frames)
             masks.append((torch.sigmoid(logits.float()) > self.threshold).cpu().numpy())
         return np.concatenate(masks) if masks else np.zeros(video.shape[:3], dtype=bool)
 
-    def stream(self) -> MaskStream:
+    def stream(self) -> Callable[[np.ndarray, np.ndarray | None], np.ndarray]:
         """Every frame is masked by itself."""
         return self.segment
 

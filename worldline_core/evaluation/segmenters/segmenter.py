@@ -1,4 +1,4 @@
-"""Robot segmenters: their protocol, how one is opened by name, SAM 3's video tracker, the classical one, and kinematic masks.
+"""Robot segmenters: their protocol, how one is opened by name, SAM 3's video tracker and the classical one.
 
 The classical one is independent of anything learned. What is unlike the table around the projected tool centres of the first frame
 says what the robot looks like; GrabCut (Rother et al. 2004) grows from there. Later frames start from the mask of the frame before, with
@@ -14,10 +14,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.robot_masks import project_capsules
 from worldline_core.errors import ArtifactError, UnavailableError
 from worldline_core.evaluation.evaluation_config import SegmenterName
 
@@ -297,54 +294,3 @@ def robot_likely(lab: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     """Pixels whose colour is more frequent inside the robot than outside (h, w)."""
     index = np.clip(lab.astype(np.int32) * _BINS // 256, 0, _BINS - 1)
     return ratio[index[..., 0], index[..., 1], index[..., 2]] > 0
-
-
-# Recordings without exact masks: the robot's capsules, cut out by the colours within them
-
-_ROUNDS = 3
-_ROWS = 192
-"""Small frames are enlarged to about this height: of a few hundred pixels GrabCut leaves nothing."""
-
-
-def kinematic_masks(
-    tracks: EpisodeTracks, view: str, index: NDArray[np.int64], frames: NDArray[np.uint8]
-) -> NDArray[np.bool_] | None:
-    """Masks (n, h, w) of the robot in recorded frames of one view; None without its camera.
-
-    Capsules are wider than most links. What lies outside of all of them is not robot; within, GrabCut (Rother et al. 2004) parts the
-    robot's colours from those of the surroundings, frame by frame.
-
-    Args:
-        index: numbers of the frames in the recording.
-        frames: (n, h, w, 3).
-    """
-    number = tracks.views.index(view)
-    if tracks.camera_motion[number] == "absent":
-        return None
-    capsules, radii, K, poses = (
-        torch.from_numpy(np.asarray(values, dtype=np.float64))[None]
-        for values in (
-            tracks.capsules[index], tracks.capsule_radii, tracks.K[[number]], tracks.T_base_camera[index][:, [number]]
-        )
-    )  # fmt: skip
-    factor = max(1, round(_ROWS / frames.shape[1]))
-    size = (factor * frames.shape[1], factor * frames.shape[2])
-    covered = project_capsules(capsules, radii, K, poses, tracks.image_size, size)[0, 0].numpy()
-    return np.stack([_cut_out(frame, mask) for frame, mask in zip(frames, covered, strict=True)])
-
-
-def _cut_out(frame: NDArray[np.uint8], covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask of a frame, at its size, from the capsules in it, at theirs."""
-    rows, columns = covered.shape
-    if covered.any() and not covered.all():
-        covered = _robot_colours(cv2.resize(frame, (columns, rows), interpolation=cv2.INTER_CUBIC), covered)
-    shares = cv2.resize(covered.astype(np.float32), (frame.shape[1], frame.shape[0]), interpolation=cv2.INTER_AREA)
-    return shares > 0.5
-
-
-def _robot_colours(frame: np.ndarray, covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    labels = np.where(covered, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
-    cv2.setRNGSeed(0)  # its colour models begin with random clusters
-    colours = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(frame, labels, (0, 0, 1, 1), *colours, _ROUNDS, cv2.GC_INIT_WITH_MASK)
-    return labels == cv2.GC_PR_FGD

@@ -41,7 +41,8 @@ from worldline_core.evaluation.segmenters.coloured_things import (
     own_colour,
     thing_share,
 )
-from worldline_core.evaluation.segmenters.segmenter import Segmenter, kinematic_masks
+from worldline_core.evaluation.segmenters.kinematic_masks import kinematic_masks
+from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.model.lpips import LPIPS
 from worldline_core.rollout.rollout_set import RolloutSet
 
