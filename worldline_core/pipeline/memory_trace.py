@@ -149,9 +149,9 @@ def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> 
     return Held(forward, tracker.most, tracker.operations)
 
 
-def extrapolated(trace: Callable[[int], Held], layers: int) -> Held:
-    """``trace(layers)``; of deep models by a straight line through two shallow ones, for layers are equal."""
+def extrapolated(trace: Callable[[int], Held], layers: int, shallow: tuple[int, int] = SHALLOW) -> Held:
+    """``trace(layers)``; of deep models by a straight line through two shallow ones of adjacent depths, for layers are equal."""
     if layers <= WHOLE:
         return trace(layers)
-    first, second = (trace(depth) for depth in SHALLOW)
-    return Held(*(a + (b - a) * (layers - SHALLOW[0]) for a, b in zip(first, second, strict=True)))
+    first, second = (trace(depth) for depth in shallow)
+    return Held(*(a + (b - a) * (layers - shallow[0]) for a, b in zip(first, second, strict=True)))

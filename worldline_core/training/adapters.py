@@ -63,8 +63,7 @@ class AdapterInfo(StrictModel):
 
 
 def add_adapters(model: WorldModel, config: LoRAConfig, seed: int) -> None:
-    """Give every layer's attention and feed-forward an adapter, which starts without effect. Those are trained, and in full what a
-    pretrained model knows nothing of: the action branches and the view embedding.
+    """Give every layer's attention and feed-forward an adapter, which starts without effect, and train those (`train_adapters`).
 
     Raises:
         UnavailableError: peft is not installed.
@@ -73,6 +72,11 @@ def add_adapters(model: WorldModel, config: LoRAConfig, seed: int) -> None:
     with torch.random.fork_rng([]):
         torch.manual_seed(seed)
         peft.inject_adapter_in_model(peft.LoraConfig(**_peft_settings(model, config)), model)
+    train_adapters(model)
+
+
+def train_adapters(model: WorldModel) -> None:
+    """Train the adapters, and in full what a pretrained model knows nothing of: the action branches and the view embedding."""
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(_MARK in name or is_action_parameter(name) or name == "view_embedding")
 
