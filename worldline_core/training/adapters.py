@@ -10,7 +10,6 @@ import hashlib
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import torch
@@ -68,7 +67,8 @@ def add_adapters(model: WorldModel, config: LoRAConfig, seed: int) -> None:
     Raises:
         UnavailableError: peft is not installed.
     """
-    peft = load_peft()
+    with needing("one-gpu", "peft", where="lora"):
+        import peft
     with torch.random.fork_rng([]):
         torch.manual_seed(seed)
         peft.inject_adapter_in_model(peft.LoraConfig(**_peft_settings(model, config)), model)
@@ -79,13 +79,6 @@ def train_adapters(model: WorldModel) -> None:
     """Train the adapters, and in full what a pretrained model knows nothing of: the action branches and the view embedding."""
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(_MARK in name or is_action_parameter(name) or name == "view_embedding")
-
-
-def load_peft() -> ModuleType:
-    """The library, which takes seconds the first time. Raises: UnavailableError: it is not installed."""
-    with needing("one-gpu", "peft", where="lora"):
-        import peft
-    return peft
 
 
 def _peft_settings(model: WorldModel, config: LoRAConfig) -> dict[str, Any]:
