@@ -23,12 +23,10 @@ WHOLE = 8
 SHALLOW = (4, 5)
 """Depths that the line of a deeper model goes through: with fewer layers its worst moment can be another one."""
 _ATEN: Any = torch.ops.aten
-_COUNTS: dict[Any, Callable[..., int]] = {
-    **flop_registry,
-    _ATEN._scaled_dot_product_flash_attention_for_cpu: flop_registry[_ATEN._scaled_dot_product_flash_attention],
-    _ATEN._scaled_dot_product_flash_attention_for_cpu_backward: flop_registry[
-        _ATEN._scaled_dot_product_flash_attention_backward
-    ],
+_DEVICE: Any = torch.ops.prim.device.default
+_FLASH = "_scaled_dot_product_flash_attention"
+_COUNTS: dict[Any, Callable[..., int]] = flop_registry | {
+    getattr(_ATEN, f"{_FLASH}_for_cpu{way}"): flop_registry[getattr(_ATEN, _FLASH + way)] for way in ("", "_backward")
 }
 
 
@@ -64,7 +62,7 @@ class _Tracker(TorchDispatchMode):
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        if func is torch.ops.prim.device.default:
+        if func is _DEVICE:  # more than half of all calls
             return args[0].fake_device
         if func is _ATEN._local_scalar_dense.default:
             return True if args[0].dtype == torch.bool else 0.5 if args[0].is_floating_point() else 1
@@ -93,7 +91,7 @@ class _Tracker(TorchDispatchMode):
         storage = value.untyped_storage()._cdata
         shared = next((n for n, one in enumerate(given) if one.untyped_storage()._cdata == storage), None)
         if shared is None:
-            self._follow(value)
+            self._hold(value.untyped_storage())
         shape, stride, offset, dtype = value.shape, value.stride(), value.storage_offset(), value.dtype
         device = value.fake_device
 
@@ -107,20 +105,18 @@ class _Tracker(TorchDispatchMode):
                 )
             vars(made).update(tracker._fields(device))
             if shared is None:
-                tracker._follow(made)
+                tracker._hold(made.untyped_storage())
             return made
 
         return make
 
-    def _follow(self, tensor: FakeTensor) -> None:
-        storage = tensor.untyped_storage()
-        size = storage.nbytes()
+    def _hold(self, storage: torch.UntypedStorage) -> None:
+        self._add(storage.nbytes())
+        weakref.finalize(storage, self._add, -storage.nbytes())
+
+    def _add(self, size: int) -> None:
         self.live += size
         self.most = max(self.most, self.live)
-        weakref.finalize(storage, self._free, size)
-
-    def _free(self, size: int) -> None:
-        self.live -= size
 
 
 def _described(value: Any, given: list[FakeTensor]) -> Any:
@@ -149,9 +145,9 @@ def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> 
     return Held(forward, tracker.most, tracker.operations)
 
 
-def extrapolated(trace: Callable[[int], Held], layers: int) -> Held:
-    """``trace(layers)``; of deep models by a straight line through two shallow ones, for layers are equal."""
+def extrapolated(trace: Callable[[int], Held], layers: int, shallow: tuple[int, int] = SHALLOW) -> Held:
+    """``trace(layers)``; of deep models by a straight line through two shallow ones of adjacent depths, for layers are equal."""
     if layers <= WHOLE:
         return trace(layers)
-    first, second = (trace(depth) for depth in SHALLOW)
-    return Held(*(a + (b - a) * (layers - SHALLOW[0]) for a, b in zip(first, second, strict=True)))
+    first, second = (trace(depth) for depth in shallow)
+    return Held(*(a + (b - a) * (layers - shallow[0]) for a, b in zip(first, second, strict=True)))
