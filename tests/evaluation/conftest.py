@@ -144,7 +144,7 @@ def bank(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def evaluated(recordings, tmp_path_factory):
-    """Every metric of videos that nothing disturbed; `copy` stands for a model that ignores changed controls."""
+    """Every metric of videos that nothing disturbed; `copy` plays a model that ignores changed controls."""
     folder = tmp_path_factory.mktemp("evaluated")
     assert evaluate_video(EVERY, recordings.inputs, folder)["methods"] == ["copy", "good"]
     return folder

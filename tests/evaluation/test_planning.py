@@ -144,9 +144,9 @@ RISEN = near((0, 0, 0.2))
 
 def test_the_medoid_is_the_sequence_most_like_the_others_shown():
     targets = near((0.3, 0, 0), (0, 0, 0), (0.02, 0, 0), (-0.02, 0, 0), (-0.4, 0, 0))
-    bracket.choose = shortcuts.medoid(facts("lift the red cube", targets, targets + np.array([0, 0, 0.2])))
-    assert bracket.choose(range(5)) == 1
-    assert bracket.choose([0, 1, 2]) == 2
+    chosen = shortcuts.medoid(facts("lift the red cube", targets, targets + np.array([0, 0, 0.2])))
+    assert chosen(range(5)) == 1
+    assert chosen([0, 1, 2]) == 2
 
 
 @pytest.mark.parametrize(

@@ -139,6 +139,9 @@ def test_a_figure_within_chance_is_neutral_on_the_page(tmp_path: Path) -> None:
     assert "better than copying the first frame: 0.50, within chance" in page
     assert [page.count(f'class="tile {verdict}"') for verdict in ("better", "worse", "unclear")] == [0, 0, 2]
     assert Figure("right", {"mean": 0.7}, "recordings", "chance", 0.5, None, "").verdict == "unclear"
+    page = first_page(context_of(tmp_path / "worse", iou=0.4, over_copy=(-0.2, -0.05)), [])
+    assert page.count('class="tile worse"') == 1
+    assert "worse than copying the first frame: 0.50" in page
 
 
 def artifact(store: Path, step: str, key: str, seconds: float, finished: str = "2026-01-01", **metrics: object) -> Path:

@@ -150,6 +150,7 @@ def test_what_does_not_fit_is_refused(observed, causal, models, tmp_path):
     )  # fmt: skip
     for changes, error, message in (
         ({"controls": controls[:16]}, DataError, r"1 \+ k \* 16 rows.*got: 16"),
+        ({"controls": controls[:17, :7]}, DataError, r"where: controls, .*got: \(17, 7\)"),
         ({"images": {"left_wrist": images["left_wrist"]}}, DataError, "not trained on these views together"),
         ({"images": images | {"head": images["head"][:8]}}, DataError, "RGB and of one size"),
         ({"images": images | {"head": images["head"] / 255}}, DataError, "arrays of uint8"),

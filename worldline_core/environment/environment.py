@@ -38,7 +38,7 @@ from worldline_core.evaluation.recordings import Trajectory, shown_points, simul
 from worldline_core.evaluation.segmenters.segmenter import Segmenter, open_segmenter
 from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, Embodiment, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.rollout.observation import project_controls
+from worldline_core.rollout.observation import project_controls, require_drivable
 from worldline_core.rollout.recorded_starts import RecordedStart, RecordedStarts
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Simulation
 from worldline_core.rollout.worldline import WorldLine
@@ -360,7 +360,9 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         self._random = [np.random.default_rng() for _ in range(num_envs)]
         self._episodes: list[RunningEpisode] = []
         self._running: CommandedSimulation
-        self._chosen([0], each_start(None, self._usual_start, 1))  # refuses what is not there before an episode begins
+        # Refuses before an episode begins what is not there, or what the model cannot be driven at.
+        (first,) = self._chosen([0], each_start(None, self._usual_start, 1))
+        require_drivable(self.world.info, self.views, first.cameras, self.kinematics.embodiment.name)
         self.frames_per_step = self.world.unit(USUAL_CLIP_FRAMES)
         self.observe_every = observe_every or self.frames_per_step
         if self.observe_every < 1 or self.frames_per_step % self.observe_every:

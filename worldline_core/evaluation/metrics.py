@@ -1,4 +1,4 @@
-"""Formulas of the metrics of predicted videos, frame by frame or over a path; means over time are taken by the caller, per trajectory and view.
+"""Formulas of the metrics of predicted videos, by frame or over a path. The caller takes means over time, per trajectory and view.
 
 Full frame: PSNR and SSIM (appendix "Full-frame metrics" of the paper). The conditioning frame counts like every other.
 

@@ -250,7 +250,7 @@ class Embodiment(StrictModel):
         if not np.isfinite(state).all():
             row, column = np.argwhere(~np.isfinite(state))[0]
             raise DataError(
-                "Joint positions are not finite",
+                "Joint positions or gripper openings are not finite",
                 where=f"{where}, frame {row}, {self.state_names[column]}",
                 expected="finite numbers",
                 got=float(state[row, column]),

@@ -1,5 +1,6 @@
-"""Pages of what was measured and made: "Predicted videos", "Video quality", "Policy and planning", "Training", "Provenance" with the models' cards.
+"""Pages of what was measured and made.
 
+They are "Predicted videos", "Video quality", "Policy and planning", "Training", and "Provenance" with the models' cards.
 Episodes are never picked by hand: shown are the best, the median and the worst by a stated score.
 """
 

@@ -261,7 +261,7 @@ SPEED_RAD_S, SPEED_M_S, GRIPPER_TRAVEL_S = math.pi, 1.0, 0.4
 
 
 class CommandedRobot:
-    """Where robots of one embodiment are that follow commands within their limits, one for each clip.
+    """Robots of one embodiment that follow commands within their limits, one for each clip: what is executed, and their places.
 
     A joint's command is clipped to its position limits and to what pi rad/s or 1 m/s reaches in a frame from the command
     before; a gripper's to its range. These are the *executed* commands. Joints are at every frame where that frame's command

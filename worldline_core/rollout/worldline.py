@@ -15,6 +15,7 @@ from torch import Tensor
 from worldline_core.actions.action_maps import ControlDrawing
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, drawn_size
 from worldline_core.errors import CheckpointError, DataError
+from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
 from worldline_core.model.pretrained import load_model_tokenizer, pretrained_folder
@@ -171,9 +172,10 @@ class WorldLine:
                 "The model predicts one observed frame and whole units", expected=f"1 + k * {unit} rows of controls",
                 got=len(rows), next_step=f"give {1 + max(1, (len(rows) - 1) // unit) * unit} rows",
             )  # fmt: skip
-        starts = Starts(images, cameras, embodiment, rows[0], seed)
-        require_drivable(self.info, views, cameras, starts.kinematics.embodiment.name)
-        check_controls(starts.kinematics, rows, "controls")
+        kinematics = ArmKinematics(load_embodiment(embodiment))
+        require_drivable(self.info, views, cameras, kinematics.embodiment.name)
+        check_controls(kinematics, rows, "controls")
+        starts = Starts(images, cameras, kinematics, rows[0], seed)
         tracks, first = starts.project(0, rows, self.contract.fps), starts.pictures(views, self.image_size)
         pieces = [clips[0] for clips in self.stream(first, [tracks], len(rows), starts.seeds, views=views)]
         return {view: np.concatenate([piece[view] for piece in pieces]) for view in views}

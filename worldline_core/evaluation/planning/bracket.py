@@ -60,7 +60,7 @@ class CandidateVideo:
 
 
 class Selector(Protocol):
-    """Ranks candidates of one scene; with each answer, False where it could not be read."""
+    """Ranks candidates of one scene; every answer comes with whether it could be read."""
 
     @property
     def name(self) -> str: ...

@@ -153,7 +153,7 @@ def overturns(done: Fact, evidence: Evidence) -> bool:
 class Judge(Protocol):
     """Extracts evidence; three questions in the paper's order.
 
-    Each gives evidence, and False where the answer could not be read (then every fact is null).
+    Each returns evidence and whether the answer could be read; if not, every fact is null.
     """
 
     @property

@@ -208,8 +208,8 @@ class PressMeasurement:
 
 
 MeasuredEffect = LiftMeasurement | PlaceMeasurement | PushMeasurement | PressMeasurement
-"""``score``: likelihood that the task is done, 0..1: the facts with soft thresholds, multiplied; of a fact not visible, ``unseen``.
-``evidence``: the facts about the things of these names."""
+"""Each has ``score``, the likelihood 0..1 that the task is done (facts with soft thresholds, multiplied; a fact that is not visible
+counts ``unseen``), and ``evidence``, the facts about the things of these names."""
 
 
 def sight(frames: np.ndarray, thing: ColouredThing) -> Sighting:
