@@ -156,7 +156,7 @@ def _check_may_publish(folder: Path, *, public: bool) -> None:
     for recordings meant for evaluation only.
     """
     sources, rows = read_source_table(folder), EpisodeSet.open(folder).rows
-    unknown = [source.label for source in sources if source.redistribution == "unknown"] if sources else ["all"]
+    unknown = [f"{s.label} ({s.license})" for s in sources if s.redistribution == "unknown"] if sources else ["all"]
     refused = {
         "Sources forbid redistribution": [f"{s.label} ({s.license})" for s in sources if s.redistribution == "no"],
         "Sources are for evaluation only": sorted(

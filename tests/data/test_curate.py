@@ -56,9 +56,11 @@ def test_kept_episodes_are_resized_and_calibration_follows(tmp_path: Path) -> No
     assert (counts["found"], counts["kept"], counts["quarantined"], counts["reasons"]) == (2, 2, 0, {})
     episode = curated.episode(0)
     assert curated.frames(0, "left_wrist").shape == (9, 16, 24, 3)
-    expected = samples[0][0].cameras["left_wrist"].resized(24, 16)
-    assert np.allclose(episode.cameras["left_wrist"].K, expected.K)
-    assert np.array_equal(episode.cameras["left_wrist"].T_base_camera, expected.T_base_camera)
+    recorded, (height, width) = samples[0][0].cameras["left_wrist"], samples[0][2]["head"].shape[1:]
+    a, b = 24 / width, 16 / height
+    to_small = np.array([[a, 0, (a - 1) / 2], [0, b, (b - 1) / 2], [0, 0, 1]])  # pixel centres are whole numbers
+    assert np.allclose(episode.cameras["left_wrist"].K, to_small @ recorded.K)
+    assert np.array_equal(episode.cameras["left_wrist"].T_base_camera, recorded.T_base_camera)
     mask = curated.robot_masks(0, "head")
     assert mask is not None
     head = samples[0][2]["head"]

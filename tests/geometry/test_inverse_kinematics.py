@@ -38,7 +38,9 @@ def test_jacobians_agree_with_finite_differences(name: str) -> None:
             assert np.allclose(jacobian[:, d], expected, atol=1e-5), arm.joints[d]
 
 
-@pytest.mark.parametrize("name", ["ur5e_pair", "xarm7_pair", "aloha_viperx", "kinova_gen3"])
+@pytest.mark.parametrize(
+    "name", ["ur5e_pair", "xarm7_pair", "aloha_viperx", "kinova_gen3", "panda_pair", "yam_station"]
+)
 def test_reachable_poses_are_reached_within_the_limits(name: str) -> None:
     inverse = solver(name)
     embodiment = inverse.kinematics.embodiment

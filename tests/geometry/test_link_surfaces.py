@@ -17,7 +17,7 @@ from worldline_core.geometry.link_surfaces import COARSE, FINE, Sampling, link_s
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=np.float32)
 MJCF = """<mujoco><compiler angle="degree" meshdir="meshes"/>
-<default><default class="seen"><geom type="mesh" contype="0"/><mesh scale=".1 .1 .1"/></default></default>
+<default><default class="seen"><geom type="mesh" contype="0" quat="0 1 0 0"/><mesh scale=".1 .1 .1"/></default></default>
 <asset><mesh class="seen" name="m" file="part.{form}"/></asset>
 <worldbody><body name="arm" childclass="seen"><joint name="j"/>
 <geom mesh="m" pos="0 0 1" euler="0 0 90"/></body>
@@ -124,9 +124,10 @@ def test_spheres_are_thinned_and_grow_to_cover_what_they_stand_for(tmp_path: Pat
     assert len(points) == 41 and radii == pytest.approx(0.002)
 
 
-def test_shipped_spheres_lie_on_the_links() -> None:
+@pytest.mark.parametrize("name", ["viperx_graphite", "ur5e_silver", "xarm7_single", "panda_ivory"])
+def test_shipped_spheres_lie_on_the_links(name: str) -> None:
     """Each link's points in MuJoCo's reading of the file, against those by our kinematics."""
-    kinematics = ArmKinematics(load_embodiment("xarm7_single"))
+    kinematics = ArmKinematics(load_embodiment(name))
     model = mujoco.MjModel.from_xml_path(str(kinematics.embodiment.description_path))
     for link, (points, radii) in kinematics.surfaces.items():
         geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body(link).id]

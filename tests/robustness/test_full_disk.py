@@ -119,7 +119,7 @@ def test_what_is_written_is_whole_or_one_message(disk: Path, project_root: Path,
     assert (ended.returncode, "Traceback" in ended.stderr) == (1, False), ended.stderr
     said = [line for line in ended.stderr.splitlines() if line.startswith("error:")]
     assert said == ["error: The store did not finish the push" if command[0] == "push" else "error: No space left"]
-    stays = "--preset" in command  # what a step has begun
+    stays = "--preset" in command  # a step keeps what it has begun
     assert ("the same command continues" if stays else "No space left on device") in ended.stderr
     names = ["manifest.json"] if stays else ["manifest.json", "*.rrd", "*.mcap", "info.json"]
     assert not [path for name in names for path in disk.rglob(name)]

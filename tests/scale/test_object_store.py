@@ -50,7 +50,7 @@ def curated_digest(path: object, output: Path) -> str:
 
 @pytest.fixture(scope="module")
 def digest(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The curated recordings', read from their folder."""
+    """Digest of the curated recordings, read from their folder."""
     return curated_digest(recordings, tmp_path_factory.mktemp("local"))
 
 

@@ -14,6 +14,7 @@ has moved most stands for the tool.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import cv2
 import numpy as np
@@ -74,8 +75,8 @@ def normalised_correlation(region: np.ndarray, patch: np.ndarray) -> np.ndarray:
     rows, columns = region.shape[0] - patch.shape[0] + 1, region.shape[1] - patch.shape[1] + 1
     template = patch - patch.mean(axis=(0, 1))
     size = [next_fast_len(side, real=True) for side in region.shape[:2]]
-    spectra = rfft2(region, size, axes=(0, 1)) * rfft2(template, size, axes=(0, 1)).conj()
-    product = irfft2(spectra.sum(axis=2), size)[:rows, :columns]
+    spectrum, own = (cast("np.ndarray", rfft2(values, size, axes=(0, 1))) for values in (region, template))
+    product = cast("np.ndarray", irfft2((spectrum * own.conj()).sum(axis=2), size))[:rows, :columns]
 
     sums, squares = (
         table[-rows:, -columns:] - table[:rows, -columns:] - table[-rows:, :columns] + table[:rows, :columns]

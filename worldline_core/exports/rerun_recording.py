@@ -60,7 +60,7 @@ class RecordingContent:
     Attributes:
         true_frames: by view.
         predicted_frames: by view.
-        method: that predicted them.
+        method: name of the method that predicted them; empty without predictions.
         sigma_px_ref: width of the heat, pixels on the 384 x 512 reference canvas.
     """
 

@@ -132,7 +132,7 @@ class Window:
 
 @dataclass(frozen=True)
 class ImageTransform:
-    """A chain of resizes, crops and pads, begun with `of` and built by its own methods; sizes are (height, width).
+    """A chain of resizes, crops and letterboxes, begun with `of` and built by its own methods; sizes are (height, width).
 
     >>> ImageTransform.of((480, 640)).letterbox((256, 256)).image_size
     (256, 256)
@@ -191,7 +191,7 @@ class ImageTransform:
                 "Crop leaves the image",
                 expected=f"a window inside {self.image_size}",
                 got=f"{size} at row {top}, column {left}",
-                next_step="use a smaller window, or pad first",
+                next_step="use a smaller window",
             )
         return self if size == self.image_size else self._then(Window(top, left, size))
 

@@ -80,8 +80,8 @@ def _mjcf_shapes(root: ET.Element, folder: Path) -> Iterator[tuple[str, np.ndarr
     for contacts, and not seen.
     """
     compiler = {key: value for each in root.findall("compiler") for key, value in each.attrib.items()}
-    folder = folder / compiler.get("meshdir", compiler.get("assetdir", ""))
     defaults = mjcf_defaults(root, ("geom", "mesh"), folder)
+    folder = folder / compiler.get("meshdir", compiler.get("assetdir", ""))
     files = {}
     for mesh in root.iterfind("asset/mesh"):
         values = {**defaults.get(mesh.get("class", "main"), {}).get("mesh", {}), **mesh.attrib}

@@ -316,12 +316,14 @@ def plan_waypoints(
         mistakes: the share of plans that go wrong; by default each task's own.
         acting: waypoints of the arms that act, where they are already planned.
     """
-    planned = dict(enumerate(_carry(robot, layout, random, mistakes))) if layout.family == "carry" else acting or {}
+    planned: Mapping[int, list[Waypoint]] = acting or {}
+    if acting is None and layout.family == "carry":
+        planned = dict(enumerate(_carry(robot, layout, random, mistakes)))
     plans = []
     for arm in range(len(robot.arms)):
         if arm in planned:
             plans.append(planned[arm])
-        elif arm == layout.arm:
+        elif acting is None and arm == layout.arm:
             plans.append(_TASKS[layout.family](robot, layout, random, mistakes))
         else:
             plans.append(_idle(robot, layout, arm, random, duration))

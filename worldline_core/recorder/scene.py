@@ -471,7 +471,7 @@ def apply_layout(scene: SceneModel, data: Any, layout: Layout) -> None:
 def thing_labels(scene: SceneModel, layout: Layout) -> np.ndarray:
     """uint8 (number of geoms,): 1 for those of the target, 2 of the goal, 3.. of the others, 0 for the rest.
 
-    Of a drawer only what slides belongs to it; all of any other thing does, also a button's plate, because it lights up.
+    A drawer has only what slides; any other thing has all of its geoms, also a button's plate, because it lights up.
     """
     labels = np.zeros(scene.model.ngeom, np.uint8)
     others = 3

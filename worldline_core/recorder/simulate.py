@@ -61,10 +61,10 @@ _TASK_FAMILIES = {
 }
 # Share of the training episodes in which a body's links have drawn colours instead of its own.
 REPAINTED = 0.4
-# What counts as done, beside LIFTED.
+# Thresholds of success, beside LIFTED.
 ON_PAD = 0.05
 DRAWER_OPEN = 0.25
-# An opening at which nothing is held any more.
+# A gripper that is open by more than this holds nothing.
 RELEASED = 0.88
 
 

@@ -23,7 +23,7 @@ from fsspec.asyn import AsyncFileSystem
 from upath import UPath
 from upath.implementations.local import FilePath
 
-from worldline_core.errors import ArtifactError, ConfigError, UnavailableError, needing
+from worldline_core.errors import ArtifactError, ConfigError, UnavailableError, installing
 from worldline_core.store.artifact_files import digest_value
 from worldline_core.untrusted_text import carries_credentials
 
@@ -117,8 +117,11 @@ def file_system(path: AnyPath) -> Any:
 
     Raises: UnavailableError where the store's library is not installed.
     """
-    with needing("s3", "The store's library", where=str(path), otherwise="install the fsspec library of that store"):
+    try:
         return cast("UPath", path).fs
+    except ImportError as error:
+        step = f"for s3:// {installing('s3')}; otherwise install the fsspec library of that store"
+        raise UnavailableError("A store's library is not installed", where=path, got=error, next_step=step) from error
 
 
 def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
@@ -132,7 +135,7 @@ def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
     own: Any = type(fs)._find if isinstance(fs, AsyncFileSystem) else type(fs).find
     with _answering(root):
         if own in (AsyncFileSystem._find, AbstractFileSystem.find):
-            # This walk silently omits folders that it could not list: `on_error` does not reach folders further down.
+            # fsspec's own walk silently omits folders that it could not list: `on_error` does not reach further down.
             found, folders = {}, [base] if fs.exists(base) else []
             for folder in folders:
                 listed = {about["name"].rstrip("/"): about for about in fs.ls(folder, detail=True)}
@@ -149,8 +152,10 @@ def remote_kind(path: AnyPath) -> str | None:
     Raises: PermissionError where the store refuses; UnreachableInputError when it does not answer, for which fsspec's
         `isfile` returns False.
     """
-    with _answering(path), suppress(FileNotFoundError):
-        return file_system(path).info(str(path))["type"]
+    with _answering(path):
+        fs = file_system(path)
+        with suppress(FileNotFoundError):
+            return fs.info(str(path))["type"]
     return None
 
 

@@ -9,7 +9,7 @@ blocky, and shows faint copies of a moving arm. Masks follow the geometry only.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, cast
