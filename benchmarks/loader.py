@@ -31,7 +31,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput
 from worldline_core.training.clip_loader import ClipLoader, read_ahead
 from worldline_core.training.clip_sampler import Clip, ClipSampler
-from worldline_core.training.clip_source import FrameSource, LatentStore, ResidentLatents, decoder
+from worldline_core.training.clip_source import FrameSource, LatentStore, ResidentLatents
 from worldline_core.training.encode_latents import encode_latents
 
 TICK = os.sysconf("SC_CLK_TCK")
@@ -84,7 +84,7 @@ def decode_raw(source: FrameSource, clips: Sequence[Clip]) -> None:
     for clip in clips:
         position = source.episodes.position(clip.episode_id)
         for view in VIEWS:
-            for _ in decoder().frames(source.episodes.clip(position, view), clip.frames):
+            for _ in source.decoder.frames(source.episodes.clip(position, view), clip.frames):
                 pass
 
 
@@ -120,7 +120,7 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, processes: int) -> tuple
             if turn:  # the first round opens files and touches memory for the first time
                 times[name].append(processor_seconds(everyone) - before)
     raw, loaded = (frames / statistics.median(spent) for spent in times.values())
-    return decoder().name, raw, loaded, loaded / raw
+    return source.decoder.name, raw, loaded, loaded / raw
 
 
 def latent_batches(root: Path) -> Iterator[tuple[str, float]]:

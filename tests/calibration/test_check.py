@@ -16,6 +16,7 @@ from flows.command_line import main
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.calibration import check
+from worldline_core.calibration.camera_errors import CameraError
 from worldline_core.calibration.check import ListedEpisode, check_calibration, repairing_lines
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SourceDiagnosis
 from worldline_core.data.episodes.conventions import RecordedConventions
@@ -71,7 +72,6 @@ def test_an_episode_that_ends_in_a_bug_does_not_cost_the_others_their_reports(
     found = check_calibration([listed(episode, images, name) for name in names], tmp_path)
     assert [episode.episode_id for episode in found.episodes] == names
     assert [episode.reason for episode in found.episodes] == ["crashed", None]
-    assert not found.consistent  # the command's exit status
     stored = json.loads((tmp_path / "diagnoses.json").read_text())["episodes"]
     pictures = [entry["picture"] and (tmp_path / entry["picture"]).is_file() for entry in stored]
     assert pictures == [None, True]
@@ -121,6 +121,15 @@ def test_recordings_are_read_in_a_process_with_limits_first(project_root: Path) 
     with pytest.raises(RejectedInputError) as caught:
         GuardedSource(config, ReaderLimits(memory_gb=0.01)).load(first)
     assert caught.value.reason == "out_of_memory"
+
+
+def test_one_episode_that_cannot_be_judged_makes_the_check_inconsistent() -> None:
+    error = CameraError("head", np.zeros(8), np.eye(8), 0.0)
+    fine = check.EpisodeCheck("a", "s", Diagnosis(episode_id="a", verdict="consistent", camera_errors=(error,)))
+    healthy = check.CalibrationCheck((fine,), (), Path("out"))
+    assert healthy.consistent  # the command's exit status
+    crashed = check.EpisodeCheck("b", "s", None, "crashed", "a stride is negative")
+    assert not replace(healthy, episodes=(fine, crashed)).consistent
 
 
 def made_up() -> check.CalibrationCheck:

@@ -416,6 +416,7 @@ def test_subsets_of_complete_recordings_are_distilled_and_known(mixed, tmp_path)
     assert read_checkpoint_info(tmp_path / "out").view_sets == sets
     store = TrajectoryStore.open(tmp_path / "out" / "run" / "trajectories")
     assert len(set(store.views)) > 2
+    assert {clip.episode_id[:3] for clip in store.clips(range(len(store)))} == {"thr"}  # the training split
     with pytest.raises(DataError, match=r"(?s)not trained on these views together.*expected: head \+ left_wrist \+"):
         distill(views_config("latents", ["train"], view_weights=weights), mixed, tmp_path / "refused")
 

@@ -44,6 +44,19 @@ def test_every_preset_is_valid_and_every_input_comes_before_its_use(preset: str)
     assert {"curate", "filter", "train_stage1", "train_stage2", "distill", "evaluate_video", "report"} <= seen
 
 
+def test_full_size_stages_encode_on_the_fly_and_small_ones_read_latents(calls: dict[str, TaskCall]) -> None:
+    config = PipelineConfig.load("cosmos3-nano")
+    full_size = outline(chain, config)
+    for name in ("train_stage1", "train_stage2"):
+        assert full_size[name].inputs["tokenizer"] == Path.cwd() / str(config.models.tokenizer)
+        assert "latents" not in full_size[name].inputs
+        assert calls[name].inputs["latents"] is calls["encode_latents"]
+        lengths = getattr(config, name).clips.lengths
+        assert (lengths[0], lengths[-1]) == (33, 129)
+    # Stage I spans longer motion, Stage II is denser (method.md section 1).
+    assert min(config.train_stage1.clips.strides) > max(config.train_stage2.clips.strides)
+
+
 def test_the_chain_is_the_one_that_the_readme_draws(calls: dict[str, TaskCall]) -> None:
     order = ["curate", "filter", "render_actions", "train_stage2", "distill", "rollout.causal"]
     arrows = {(source.name, call.name) for call in calls.values() for source in call.upstream}

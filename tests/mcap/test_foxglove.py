@@ -233,10 +233,11 @@ def test_pictures_are_decoded_and_ordered_by_their_stamps(
     packets, shown = (annex_b(codec), None) if b_frames is None else with_b_frames(codec, b_frames)
     write(tmp_path / "a.mcap", packets, format_name=name, shown=shown)
     found = shades(load(declared(tmp_path)))
-    assert np.abs(found - np.arange(len(found))).max() < 0.5 and len(found) > 58
+    assert np.abs(found - np.arange(60)).max() < 0.5
     if b_frames != "bframes=2:open-gop=1":  # x264 writes its one IDR picture at the beginning then
         late = shades(load(declared(tmp_path, episodes=LATE), "toy-a-late"))
-        assert late[0] == pytest.approx(39, abs=1.7)  # not a key frame: decoding began at an earlier one
+        # Not a key frame: decoding began at an earlier one.
+        assert round(late[0]) in (39, 40) if b_frames is None else late[0] == pytest.approx(39, abs=1.7)
         assert np.abs(late - round(late[0]) - np.arange(len(late))).max() < 0.5
     if b_frames is None:
         return

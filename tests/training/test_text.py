@@ -26,6 +26,10 @@ def test_stage1_feeds_the_chat_prompt_of_each_clip(world, tmp_path, seen):
     train_stage1(config, world.inputs, tmp_path / "out")
     text = Cosmos3Text(tmp_path / "tokenizer")
     assert len(seen) == 2
+    assert not {clip.episode_id for batch in seen for clip in batch.clips} & {
+        "episode-000",
+        "episode-001",
+    }  # validation
     for batch in seen:
         for clip, ids, mask in zip(batch.clips, batch.text_ids, batch.text_mask, strict=True):
             instruction = f"move {int(clip.episode_id.removeprefix('episode-'))}"

@@ -294,9 +294,10 @@ def check_command(
     episodes: Sequence[str] = (),
     output: Path | None = None,
 ) -> CalibrationCheck:
-    """Check the sources of a configuration file (`overrides`: `a.b=value`), or an EpisodeSet; of `episodes`, or of all.
+    """Check some `episodes` (none: all) of a configuration file's sources or of an EpisodeSet; `overrides` (`a.b=value`) change
+    the file.
 
-    Writes into `artifacts/calibration/<name of the file or folder>` without `output`.
+    Writes into `output`, by default `artifacts/calibration/<name of the file or folder>`.
 
     Raises:
         ConfigError: neither or both of file and folder are given, or the file has a mistake.

@@ -1,5 +1,5 @@
-"""The verdict from the scores of an episode's readings, and over a source, whose episodes were written the same way: their
-scores are added up.
+"""Diagnoses decide by the scores of an episode's readings. The episodes of a source were written the same way, so their scores
+are added up.
 """
 
 from __future__ import annotations
@@ -59,8 +59,9 @@ class Explanation:
     """One reading of the recording.
 
     Attributes:
-        score: log-likelihood of all evidence; 0 is as in a healthy recording, lower is worse.
-        evidence: the terms of an episode's score by name ("hand-eye left_wrist", ...).
+        score: log-likelihood of all evidence; 0 is as in a healthy recording, lower is worse. Differences between readings
+            of one episode are meaningful, and add up over episodes.
+        evidence: the terms of an episode's score by name ("hand-eye left_wrist", ...); each at most 0.
         other: a mistake without a convention: ("embodiment", robot), ("wrist_extrinsics" or "wrist_videos", "exchanged").
     """
 

@@ -1,6 +1,6 @@
 """Arms of recorded vectors: their columns of joints and grippers, the units of these, and the described robot that has them.
 
-By names, counts, usual layouts, ranges, steps of the encoders, and the limits of the robots.
+They are recognised by names, counts, usual layouts, ranges, steps of the encoders, and the limits of the robots.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Kind of a folder of recordings, a look at it in a process with limits (the files are those of others), and samples of the
-hub.
+hub's datasets.
 """
 
 from __future__ import annotations

@@ -245,6 +245,7 @@ class DistillationRun:
         return ClipSampler(
             rows, clips, views=self.config.views, start_step=self.source.start_step,
             batch_size=trainer.batch_size, seed=trainer.seed, plan=plan, vector_share=self.vector_share,
+            where=f"clips of the splits {list(self.config.splits)}",
         )  # fmt: skip
 
     def _work(self, step: str) -> Path:

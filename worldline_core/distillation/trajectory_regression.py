@@ -8,8 +8,8 @@ nodes is taken in expectation (times K); all blocks are trained in one teacher-f
 
 Trajectories of the frozen causal teacher are made once and read at random.
 
-For every block, explicit Euler integration from noise along the nodes of the sampler (the paper's: sigma = 1, 15/16,
-5/6, 5/8, 0), keeping the state at each of them. Between two nodes the ODE may take several sub-steps: with one sub-step
+Every block is integrated from noise along the nodes of the sampler by explicit Euler steps (the paper's: sigma = 1, 15/16,
+5/6, 5/8, 0), and the state at each node is kept. Between two nodes the ODE may take several sub-steps: with one sub-step
 everywhere the teacher is exactly its own few-step sampler, and only the terminal objective teaches anything; finer
 sub-steps make the nodes those of the teacher's many-step solution, which the student then reaches in few.
 

@@ -151,7 +151,7 @@ class ClipLoader:
         """Latents of a batch's clips, with the conditions that this loader adds. Raises: ArtifactError: the tracks lack an episode."""
         clips, views = batch.clips, batch.views
         ids = mask = fps = weights = None
-        facts = [self.clip_facts(clip) for clip in clips] if self.frame_rates else []
+        facts = [self.clip_facts(clip) for clip in clips] if self.frame_rates or self.text is not None else []
         if self.text is not None:
             texts = [self.source.row(clip.episode_id).instruction for clip in clips]
             ids, mask = (on_device(values, self.device) for values in self.text(texts, facts))

@@ -102,6 +102,7 @@ class ClipSampler:
         views: the model's slots.
         start_step: clips start at multiples of it.
         vector_share: how often a view of a clip takes the control vector, whether its camera is known or not.
+        where: names these clips in the error.
 
     Raises: DataError: no episode is long enough for any clip.
     """
@@ -117,6 +118,7 @@ class ClipSampler:
         seed: int,
         plan: BatchPlan = ALONE,
         vector_share: float = 0.0,
+        where: str = "clips",
     ) -> None:
         self.vector_share, self.single_view_factor = vector_share, config.single_view_factor
         self.views, self.start_step, self.batch_size, self.seed, self.plan = views, start_step, batch_size, seed, plan
@@ -139,7 +141,7 @@ class ClipSampler:
         if not self._kinds:
             longest = max((row.num_frames for row in rows), default=0)
             raise DataError(
-                "No episode is long enough for any clip length.", where="clips and splits of the step",
+                "No episode is long enough for any clip length.", where=where,
                 expected=f"clips of {config.lengths} frames at strides {config.strides}",
                 got=f"{len(rows)} episodes, the longest with {longest} frames",
             )  # fmt: skip

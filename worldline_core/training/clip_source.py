@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -47,7 +47,7 @@ INDEX, DESCRIPTION = "index.parquet", "store.json"
 _VIEWS_LEFT_OUT = "views without a camera, which take train_stage2.native_size, in"
 
 
-class ClipSource(Dataset[Tensor | WorldLineError]):
+class ClipSource(Dataset[Tensor | WorldLineError], ABC):
     """Episodes whose clips can be read, in any process (an item of this dataset is a batch), and made into latents where a model is.
 
     Attributes:
@@ -96,9 +96,10 @@ class ClipSource(Dataset[Tensor | WorldLineError]):
         except WorldLineError as error:
             return error
 
+    @abstractmethod
     def read(self, clip: Clip, views: tuple[str, ...]) -> Shaped[Tensor, "v ..."]:
-        """Some views of a clip. Raises: DataError: the clip is damaged; ArtifactError: it does not belong to this source."""
-        raise NotImplementedError
+        """Some views of a clip. Raises: ArtifactError: it does not belong to this source; DataError: it is damaged (the message
+        names it, and of frames also the view and the file)."""
 
     def recorded_views(self, batch: ClipBatch) -> list[tuple[str, ...]]:
         """The recorded views that fill each clip's slots: the task-facing one has a name of its own."""
@@ -256,12 +257,6 @@ class ResidentLatents(LatentStore):
         return place + first, frames
 
 
-@cache
-def decoder() -> FrameDecoder:
-    """This process's decoder of clips, which keeps files open."""
-    return FrameDecoder()
-
-
 class FrameSource(ClipSource):
     """Frames of an EpisodeSet, decoded and encoded when they are needed.
 
@@ -280,6 +275,7 @@ class FrameSource(ClipSource):
             )  # fmt: skip
         self.root, self.episodes, self.start_step = episodes.root, episodes, config.start_step
         self.latent_shape = (self._tokenizer.latent_channels, height // space, width // space)
+        self.decoder = FrameDecoder()
         fingerprint = tokenizer_fingerprint(self._tokenizer, tokenizer)
         self.description = {"tokenizer": fingerprint, "decoder": FrameDecoder.name}
 
@@ -294,7 +290,7 @@ class FrameSource(ClipSource):
         for pictures, view in zip(frames, views, strict=True):
             try:
                 video = self.episodes.clip(position, view)
-                for target, picture in zip(pictures, decoder().frames(video, clip.frames), strict=True):
+                for target, picture in zip(pictures, self.decoder.frames(video, clip.frames), strict=True):
                     resize_frame(picture, self.image_size, out=target)
             except DataError as error:
                 raise DataError(

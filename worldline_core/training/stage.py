@@ -128,6 +128,7 @@ class Stage:
             batch_size=trainer.batch_size,
             seed=trainer.seed,
             plan=self.plan,
+            where=f"clips of the splits {list(self.config.splits)}",
             vector_share=self.vector_share,
         )
 
@@ -302,7 +303,7 @@ class HeldOutClips:
             clips = clips.model_copy(update={"view_weights": None})
         sampler = ClipSampler(
             held_out, clips, views=self.loader.views, start_step=self.loader.source.start_step,
-            batch_size=size, seed=VALIDATION_SEED, vector_share=self.vector_share,
+            batch_size=size, seed=VALIDATION_SEED, vector_share=self.vector_share, where=f"clips of the splits {list(splits)}",
         )  # fmt: skip
         load = self.loader.batches(sampler)
         return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)

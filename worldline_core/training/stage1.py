@@ -27,7 +27,7 @@ from worldline_core.training.trainer import ParameterGroup, autocast, trained_gr
 from worldline_core.training.training_config import Stage1Config
 
 MOST_BYTES = 2**32
-"""Of the machine's memory, for the keys and values of all prompts."""
+"""Most bytes of the machine's memory that the keys and values of all prompts may take."""
 
 
 def is_trained(name: str) -> bool:
@@ -147,7 +147,7 @@ class StoredText:
         self._layers = [(torch.cat(keys), torch.cat(values)) for keys, values in layers]
 
     def __call__(self, text_ids: Int[Tensor, "b m"], text_mask: Bool[Tensor, "b m"] | None = None) -> TextContext:
-        """What the layers read of right-padded texts, each among the prompts."""
+        """Return the keys and values that the layers read of right-padded texts; each must be among the prompts."""
         mask = torch.ones_like(text_ids, dtype=torch.bool) if text_mask is None else text_mask
         texts = [_key(ids[real]) for ids, real in zip(text_ids, mask, strict=True)]
         rows = torch.tensor([self._numbers[text] for text in texts])

@@ -146,9 +146,10 @@ class McapFile:
     def first_log_ns(self) -> int:
         """Log time of the first message; a file without messages is rejected (missing_topic)."""
         statistics = self._summary.statistics if self._summary is not None else None
-        if statistics is not None and statistics.message_count:
-            return statistics.message_start_time
-        first = min((record.log_time for _, _, record in self._records(None)), default=None)
+        if statistics is None:
+            first = min((record.log_time for _, _, record in self._records(None)), default=None)
+        else:
+            first = statistics.message_start_time if statistics.message_count else None
         if first is None:
             raise RejectedInputError("missing_topic", "MCAP file holds no messages", where=self.path)
         return first

@@ -37,9 +37,9 @@ MAX_DISORDER_S = 1.0
 def times_by_topic(
     config: McapTopicsSourceConfig, streams: Mapping[str, Stream], where: object
 ) -> tuple[dict[str, np.ndarray], int]:
-    """Times (n,) of each topic's messages [ns] on the configured clock, and what leads from a log time to it.
+    """Return the times (n,) of each topic's messages [ns] on the configured clock, and the delay that is subtracted from a log time.
 
-    The latter is subtracted: the least delay (log time minus header time) of the joints' topic, which commands must fit; where
+    It is the least delay (log time minus header time) of the joints' topic, which commands must fit; where
     the joints have no header, the least of all topics.
 
     Raises: RejectedInputError (clock_skew) where header times count, and disagree by more than allowed or are not set.

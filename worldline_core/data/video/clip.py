@@ -471,6 +471,10 @@ class FrameDecoder:
         self._open: OrderedDict[str, tuple[InputContainer, VideoStream, ExitStack]] = OrderedDict()
         self._reformatter = VideoReformatter()  # one for all frames: setting one up costs as much as a small frame
 
+    def __reduce__(self) -> tuple[type[FrameDecoder], tuple[int]]:
+        # Another process opens files itself.
+        return FrameDecoder, (self._limit,)
+
     def frames(self, clip: VideoClip, indices: Sequence[int]) -> Iterator[np.ndarray]:
         """uint8 (H, W, 3) RGB of the clip's frames ``indices`` (increasing), one after the other.
 
