@@ -52,7 +52,7 @@ def write_galaxea(root: Path) -> dict[str, np.ndarray]:
     vectors |= {name: (None, [np.array(values)]) for name, values in indices.items()}  # type: ignore[dict-item]
     tasks = ["擦镜子@Clean the mirror", "拿起抹布@Pick up the cloth", "擦@Wipe", "qualified"]
     cameras = videos(("head_rgb", "head_right_rgb", "left_wrist_rgb", "right_wrist_rgb"), 1)
-    write_lerobot(root, vectors, cameras, version="v2.1", fps=15, robot="r1lite", tasks=tasks)
+    write_lerobot(root, vectors, cameras, version="v2.1", fps=15, robot="r1lite", tasks=tasks, floats="float64")
     return columns
 
 

@@ -277,6 +277,8 @@ FAULTS: dict[str, tuple[Damage, str]] = {
     "damaged chunk": (damage_chunk, "unreadable"),
     "truncated json": (lambda path: cut(extrinsics(path)), "unreadable"),
     "truncated video": (lambda path: cut(video(path)), "truncated_video"),
+    "no video": (lambda path: video(path, "hand_left").unlink(), "missing_file"),
+    "video of another rate": (lambda path: black_video(video(path), LENGTH, 15.0), "wrong_fps"),
     "missing key": (without("action/joint/position"), "missing_column"),
     "a group for a dataset": (
         edit(lambda file: (file.__delitem__("timestamp"), file.create_group("timestamp"))), "missing_column",

@@ -53,13 +53,14 @@ def write_lerobot(
     fps: int = 30,
     robot: str | None = "so101_follower",
     tasks: Sequence[str] = ("Pick the cube up.",),
+    floats: str = "float32",
 ) -> Path:
     """A dataset of these vectors (feature -> names, values by episode) and cameras (key -> frames by episode)."""
     lengths = [len(values) for values in next(iter(vectors.values()))[1]]
     starts = [sum(lengths[:index]) for index in range(len(lengths))]
     vectors = {"task_index": (None, [np.zeros(length, np.int64) for length in lengths]), **vectors}
     features: dict[str, Any] = {
-        name: {"dtype": "float32" if v[0].dtype.kind == "f" else str(v[0].dtype), "shape": [v[0].size // len(v[0])], "names": names}
+        name: {"dtype": floats if v[0].dtype.kind == "f" else str(v[0].dtype), "shape": [v[0].size // len(v[0])], "names": names}
         for name, (names, v) in vectors.items()
     }  # fmt: skip
     for key, frames in cameras.items():

@@ -21,6 +21,7 @@ from tests.mcap.conftest import robot
 from worldline_core.calibration.check import episodes_of_config
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.rejection import unreadable
 from worldline_core.data.video.clip import decode_video
 from worldline_core.discovery.cameras import name_views, watch
 from worldline_core.discovery.findings import Discovery, write_config
@@ -176,6 +177,24 @@ def test_wrong_and_empty_folders_are_one_clear_error(tmp_path: Path, files: dict
         return
     with pytest.raises(DataError, match=said):
         discover(tmp_path / "raw")
+
+
+def test_a_network_failure_is_raised_and_not_taken_for_a_damaged_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in "ab":
+        (tmp_path / f"{name}.mcap").write_bytes(b"x")
+    opened = []
+
+    def unreachable(path: Path) -> None:
+        opened.append(path.name)
+        with unreadable("No MCAP file", path, (ConnectionError,)):
+            raise ConnectionError("reset by peer")
+
+    monkeypatch.setattr("worldline_core.discovery.mcap.McapFile", unreachable)
+    with pytest.raises(DataError, match="reset by peer"):
+        look(tmp_path)
+    assert opened == ["a.mcap"]
 
 
 def test_what_is_no_folder(tmp_path: Path) -> None:

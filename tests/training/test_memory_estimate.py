@@ -122,7 +122,9 @@ def test_an_outline_has_and_computes_what_peft_adds(config):
 @pytest.mark.slow
 def test_a_deep_model_holds_what_two_shallow_ones_predict(monkeypatch):
     # The backward pass of deep models holds most where shallow ones do before it.
-    assert memory_trace.extrapolated(lambda layers: Held(10 + layers, 2 * layers, 3 + layers), 36) == (46, 72, 39)
+    for depths in (memory_trace.SHALLOW, (1, 2)):
+        held = memory_trace.extrapolated(lambda layers: Held(10 + layers, 2 * layers, 3 + layers), 36, depths)
+        assert held == (46, 72, 39)
     config = MixtureConfig(towers="generation", num_layers=10)
     line = training_of(config, sharding=BLOCK)._held(sharded=False)
     monkeypatch.setattr(memory_estimate, "extrapolated", lambda trace, layers: trace(layers))

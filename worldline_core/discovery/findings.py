@@ -1,4 +1,4 @@
-"""Findings about a folder of recordings with their evidence, and open questions: as text, as JSON, and as a configuration file.
+"""Findings about a folder of recordings with their evidence, open questions and the stated licence: as text, JSON and a configuration file.
 
 The file extends a preset, and its comments say why each value is there.
 """

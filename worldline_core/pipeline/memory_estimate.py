@@ -171,7 +171,7 @@ class Work(NamedTuple):
 
 
 class _Adapted(nn.Module):
-    """A linear layer with an adapter, computed as peft does, whose import and injection take longer than a trace."""
+    """A linear layer with an adapter, computed as peft does. (Importing peft and injecting its layers takes longer than a trace.)"""
 
     def __init__(self, base_layer: nn.Linear, lora: LoRAConfig) -> None:
         super().__init__()

@@ -146,7 +146,8 @@ def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> 
 
 
 def extrapolated(trace: Callable[[int], Held], layers: int, shallow: tuple[int, int] = SHALLOW) -> Held:
-    """``trace(layers)``; of deep models by a straight line through two shallow ones of adjacent depths, for layers are equal."""
+    """Return ``trace(layers)``. A deep model is extrapolated by a straight line through two adjacent shallow depths, because its
+    layers are equal."""
     if layers <= WHOLE:
         return trace(layers)
     first, second = (trace(depth) for depth in shallow)

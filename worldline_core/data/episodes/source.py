@@ -1,5 +1,5 @@
-"""Interface of all sources of episodes, the common part of their configurations, and of readers whose episodes are files below a
-folder, under ids that are unique and storable.
+"""Define the interface of all sources of episodes, the part that their configurations share, and the base of readers whose
+episodes are files below a folder, under ids that are unique and storable.
 """
 
 from __future__ import annotations
