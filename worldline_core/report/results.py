@@ -1,8 +1,5 @@
-"""Pages of what was measured and made.
-
-They are "Predicted videos", "Video quality", "Policy and planning", "Training", and "Provenance" with the models' cards.
-Episodes are never picked by hand: shown are the best, the median and the worst by a stated score.
-"""
+"""Pages of predicted videos, of their quality, policy and planning, training, and provenance with the models' cards. Episodes are
+not picked by hand: the best, the median and the worst by a stated score are shown."""
 
 from __future__ import annotations
 
@@ -55,7 +52,6 @@ from worldline_core.training.training_state import PROBE_LOG
 ALL = "all"
 
 # Predicted videos: truth and predictions side by side, in each view
-
 VIDEOS = "Predicted videos"
 MOST_COLUMNS, IN_A_LINE = 6, 3
 """Width of one video: a phone shows three columns beside each other."""
