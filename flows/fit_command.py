@@ -96,16 +96,13 @@ def check_sources(config: PipelineConfig, recordings: Path, file: Path) -> None:
 
 
 def check_card(config: PipelineConfig, file: Path, memory: str) -> None:
-    """Raises: UnavailableError: there is no GPU, or no library that the training takes. ConfigError: a training does not fit so much memory."""
-    from worldline_core.errors import ConfigError, needing
+    """Raises: UnavailableError: there is no GPU. ConfigError: a training does not fit so much memory."""
+    from worldline_core.errors import ConfigError
     from worldline_core.model.tokenizers import require_device
     from worldline_core.pipeline.cards import card_memory
     from worldline_core.pipeline.size_sheet import SizeSheet
 
     require_device("cuda")
-    if any(stage is not None and stage.lora for stage in (config.train_stage2, config.distill)):
-        with needing("one-gpu", "peft", where="lora"):
-            import peft  # noqa: F401
     card = {"config": config, "project": Path.cwd(), "memory": card_memory(memory)}
     sheet = SizeSheet.model_validate(card)
     if too_large := [row.title for row in sheet.rows() if not row.fits(sheet.bytes)]:

@@ -104,21 +104,6 @@ def test_estimated_memory_is_what_the_allocator_hands_out(size, values, tmp_path
     assert -0.02 * taken < estimated.total + host - taken < 0.02 * taken + over
 
 
-@pytest.mark.parametrize("config", [TWO_LAYERS, SIZES[3][0]])
-def test_an_outline_has_and_computes_what_peft_adds(config):
-    lora, model = LoRAConfig(rank=4), build_world_model(config)
-    add_adapters(model, lora, 0)
-    for value in model.parameters():
-        torch.nn.init.normal_(value, std=0.1)
-    own, theirs = outlined(config, lora), {n.replace(".default.", "."): v for n, v in model.named_parameters()}
-    own.load_state_dict({name.replace(".default.", "."): value for name, value in model.state_dict().items()})
-    trained = {name: value.requires_grad for name, value in own.named_parameters()}
-    assert trained == {name: value.requires_grad for name, value in theirs.items()}
-    latents = torch.randn(1, 1, config.latent_channels, 3, 4, 4)
-    found, expected = (one(latents, torch.tensor([0.5]), views=config.views[:1]).velocity for one in (own, model))
-    assert torch.equal(found, expected)
-
-
 @pytest.mark.slow
 def test_a_deep_model_holds_what_two_shallow_ones_predict(monkeypatch):
     # The backward pass of deep models holds most where shallow ones do before it.

@@ -62,7 +62,7 @@ def first_stage(recorded, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def inputs(world, first_stage):
-    """What Stage II needs, with a Stage I checkpoint of a few steps."""
+    """Inputs of Stage II, with a Stage I checkpoint of a few steps."""
     return {**world.inputs, "stage1": first_stage}
 
 

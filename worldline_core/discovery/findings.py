@@ -288,7 +288,7 @@ def _splits(found: Discovery) -> list[str]:
         return []
     if found.episodes == 2:
         return [
-            "  # Of two episodes one is held out; no loss is measured while a model trains.",
+            "  # There are two episodes and one is held out, so no loss is measured while a model trains.",
             "  splits: {validation: 0}",
         ]
     return ["  # One episode: nothing is held out, so nothing can be measured.", "  splits: {test: 0, validation: 0}"]

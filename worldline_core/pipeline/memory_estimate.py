@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -16,7 +15,7 @@ from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
-from torch._subclasses.fake_tensor import FakeTensorMode
+from torch._subclasses.fake_tensor import FakeTensorMode, unset_fake_temporarily
 
 from worldline_core.actions.action_maps import latent_frame_indices
 from worldline_core.actions.episode_tracks import ActionTracks
@@ -36,7 +35,7 @@ from worldline_core.model.tokenizers import spatial_compression, tokenizer_outli
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WanConfig, WorldModelConfig
 from worldline_core.pipeline.memory_trace import Held, extrapolated, traced
-from worldline_core.training.adapters import share_frozen, train_adapters
+from worldline_core.training.adapters import add_adapters, share_frozen
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_sampler import Clip
@@ -170,30 +169,14 @@ class Work(NamedTuple):
     before: Sequence[Before] = ()
 
 
-class _Adapted(nn.Module):
-    """A linear layer with an adapter, computed as peft does. (Importing peft and injecting its layers takes longer than a trace.)"""
-
-    def __init__(self, base_layer: nn.Linear, lora: LoRAConfig) -> None:
-        super().__init__()
-        self.base_layer, self.scale = base_layer, lora.scale
-        self.lora_A = nn.Linear(base_layer.in_features, lora.rank, bias=False)
-        self.lora_B = nn.Linear(lora.rank, base_layer.out_features, bias=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        result = self.base_layer(x)
-        x = x.to(self.lora_A.weight.dtype)
-        return (result + self.lora_B(self.lora_A(x)) * self.scale).to(result.dtype)
-
-
 def outlined(config: WorldModelConfig, lora: LoRAConfig | None) -> WorldModel:
     """A model without values, with adapters where they are asked for; call it as `Training.outline`."""
-    model = build_world_model(config)
-    if lora is not None:
-        for name, module in list(model.named_modules()):
-            if isinstance(module, nn.Linear) and re.fullmatch(model.adapted, name):
-                model.set_submodule(name, _Adapted(module, lora))
-        train_adapters(model)
-    return model
+    if lora is None:
+        return build_world_model(config)
+    with unset_fake_temporarily(), torch.device("meta"):  # peft moves adapters from device to device
+        model = build_world_model(config)
+        add_adapters(model, lora, 0)
+    return model._apply(lambda one: torch.empty(one.shape, dtype=one.dtype))
 
 
 def _weight_bytes(models: Sequence[nn.Module]) -> int:

@@ -22,6 +22,7 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.rollout_speed import BlockCost, block_costs
 from worldline_core.progress import Progress
 from worldline_core.shipped import project_path
+from worldline_core.training.adapters import load_peft
 from worldline_core.training.clip_config import FrameInput
 from worldline_core.training.stage2 import stage2_model_config
 
@@ -143,6 +144,8 @@ class SizeSheet(StrictModel):
     def _processes(self) -> Executor:
         """Processes that find imported what all of them need, and never search it for garbage."""
         FakeTensorMode()  # imports half of torch
+        if any(stage is not None and stage.lora for stage in (self.config.train_stage2, self.config.distill)):
+            load_peft()
         context = multiprocessing.get_context("fork")
         return ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=gc.freeze)
 

@@ -10,6 +10,7 @@ import hashlib
 import logging
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 import torch
@@ -62,23 +63,25 @@ class AdapterInfo(StrictModel):
 
 
 def add_adapters(model: WorldModel, config: LoRAConfig, seed: int) -> None:
-    """Give every layer's attention and feed-forward an adapter, which starts without effect, and train those (`train_adapters`).
+    """Give every layer's attention and feed-forward an adapter, which starts without effect. Those are trained, and in full what a
+    pretrained model knows nothing of: the action branches and the view embedding.
 
     Raises:
         UnavailableError: peft is not installed.
     """
-    with needing("one-gpu", "peft", where="lora"):
-        import peft
+    peft = load_peft()
     with torch.random.fork_rng([]):
         torch.manual_seed(seed)
         peft.inject_adapter_in_model(peft.LoraConfig(**_peft_settings(model, config)), model)
-    train_adapters(model)
-
-
-def train_adapters(model: WorldModel) -> None:
-    """Train the adapters, and in full what a pretrained model knows nothing of: the action branches and the view embedding."""
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(_MARK in name or is_action_parameter(name) or name == "view_embedding")
+
+
+def load_peft() -> ModuleType:
+    """The library, which takes seconds the first time. Raises: UnavailableError: it is not installed."""
+    with needing("one-gpu", "peft", where="lora"):
+        import peft
+    return peft
 
 
 def _peft_settings(model: WorldModel, config: LoRAConfig) -> dict[str, Any]:
