@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from worldline_core.model.world_model_config import ActionContract, CausalSpec
 
 CHECKED_PACKAGES = ("geometry", "actions", "model", "training", "distillation", "rollout")
-"""Of the core: their functions are called with shapes and types checked against the annotations, in tests only."""
+"""Packages of the core whose functions check shapes and types against their annotations, in tests only."""
 check_shapes_of([f"worldline_core.{name}" for name in CHECKED_PACKAGES])
 
 IDLE_SERVICES = ("SCHEDULER", "LATE_RUNS", "CANCELLATION_CLEANUP", "PAUSE_EXPIRATIONS", "FOREMAN", "TRIGGERS")
-"""Of Prefect's server: for schedules, workers and automations."""
+"""Services that only schedules, workers and automations need; tests start the server without them."""
 
 HEAVY_IMPORTS = tuple(
     f"tests/{name}"

@@ -84,7 +84,7 @@ def kinematics_of(tmp_path_factory, agibot: ArmKinematics) -> Callable[[Episode]
     toy = ArmKinematics(load_embodiment(folder / "toy.yaml"))
 
     def of(episode: Episode) -> ArmKinematics:
-        """Of a robot that nobody describes: of one with as many joints."""
+        """For a robot without a description: one with as many joints."""
         if episode.embodiment == NO_EMBODIMENT:
             return {3: toy, 7: ArmKinematics(load_embodiment("ur5e"))}[episode.state.shape[1]]
         return agibot if episode.embodiment == "agibot_g1" else ArmKinematics(load_embodiment(episode.embodiment))

@@ -1,4 +1,4 @@
-"""What the documents tell a user to type exists: commands, options, files, configuration keys."""
+"""Commands, options, files and configuration keys that the documents name exist."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ COMMAND = re.compile(r"(?:[A-Z_]+=\S+ +)*(?:uv run +)?(worldline|python(?: -m)?)
 
 
 def quoted(text: str) -> list[str]:
-    """What stands between backticks in the text itself."""
+    """Return the code between backticks in the text itself."""
     return [part.replace("\n", " ") for part in re.findall(r"`([^`]+)`", FENCED.sub("", text))]
 
 

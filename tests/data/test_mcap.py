@@ -154,7 +154,7 @@ LENSES = {
 
 
 def scene(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """What lies at depth 1: smooth colours, float (..., 3) in 0..255."""
+    """Picture at depth 1: smooth colours, float (..., 3) in 0..255."""
     return 127 + 90 * np.stack([np.sin(6 * x + 1), np.cos(5 * y), np.sin(4 * x + 3 * y)], axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""What distillation is tested on: clips for very small models, and the artifacts of a very small run."""
+"""Clips for very small models, and the artifacts of a very small run."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def driven(physics, number, commands):
 
 @pytest.mark.slow
 def test_recorded_commands_lead_where_they_led(physics, shipped):
-    """Of every task: the recorded first picture, the same states, the same end; twice, because a start leaves nothing behind."""
+    """Every task starts with the recorded picture, goes through the same states and ends the same, twice: a start leaves nothing behind."""
     recordings = EpisodeSet.open(shipped / "recordings")
     for number in [*range(len(physics.starts)), 0]:
         row, start = physics.starts.rows[number], physics.starts[number]

@@ -25,7 +25,7 @@ FORM = {"embodiment": "ur5e_silver", "flat_observation": True, "normalised_actio
 
 @pytest.fixture
 def calls(monkeypatch):
-    """How many environments each call of the model stepped."""
+    """Number of environments that each call of the model stepped."""
     counts = []
     original = Session.step
     monkeypatch.setattr(Session, "step", lambda one, maps: counts.append(len(maps)) or original(one, maps))

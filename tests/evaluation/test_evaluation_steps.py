@@ -221,7 +221,7 @@ def test_policy_accuracy_against_recorded_outcomes(recordings, tmp_path):
     ("changes", "counts"), [({}, (4, 4)), ({"balanced": False}, (5, 4)), ({"max_per_group": 1}, (1, 1))]
 )
 def test_as_many_successes_as_failures_are_judged(recordings, changes, counts):
-    """Of nine attempts five succeed."""
+    """Five of nine attempts succeed."""
     row = EpisodeSet.open(recordings.inputs["episodes"]).rows[0]
     rows = [replace(row, episode_id=f"{n}", outcome=("failure", "success")[n < 5]) for n in range(9)]
     chosen = choose_trajectories(POLICY.model_copy(update=changes), rows, Counter())

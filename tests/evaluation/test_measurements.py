@@ -1,4 +1,4 @@
-"""What is found in pictures: coloured things, in crisp and in faded ones, and the robot by each segmenter."""
+"""Detection in pictures: coloured things, in crisp and in faded ones, and the robot by each segmenter."""
 
 from types import SimpleNamespace
 

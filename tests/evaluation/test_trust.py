@@ -1,4 +1,4 @@
-"""How far verdicts can be trusted, and whether policies rank as they do in reality."""
+"""Trust in verdicts, and the ranking of policies beside the real one."""
 
 import json
 
@@ -255,7 +255,7 @@ def test_policies_that_are_predicted_rightly_agree_and_reversed_ones_do_not(pair
 
 
 def test_nothing_but_chance_is_told_by_the_interval():
-    """Of 40 simulators that know nothing, few have an interval above zero."""
+    """Few of 40 simulators that know nothing have an interval above zero."""
     random = np.random.default_rng(5)
     above = 0
     for seed in range(40):

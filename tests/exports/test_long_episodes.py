@@ -1,4 +1,4 @@
-"""What reads a whole episode holds a few of its frames: three times the frames take no more memory."""
+"""Readers of a whole episode hold a few of its frames: three times the frames take no more memory."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_memory_does_not_grow_with_the_frames(
 
 
 def test_packed_masks_are_those_of_one_piece_and_read_in_pieces() -> None:
-    """Of any size: the bits of eight images end with a byte, those of one need not."""
+    """Pictures of any size: the bits of eight images end with a byte, those of one need not."""
     import zlib
 
     random = np.random.default_rng(0)

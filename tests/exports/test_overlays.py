@@ -1,4 +1,4 @@
-"""What is drawn: overlays, their places and colours; sheets and side-by-side videos."""
+"""Drawings: overlays, their places and colours; sheets and side-by-side videos."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def _started(environment: dict[str, str], cwd: Path, log: Path, *arguments: str)
 def worker_log(
     environment: dict[str, str], project_root: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Path]:
-    """What a worker says that serves all deployments."""
+    """Output of a worker that serves all deployments."""
     for command in ("work-pool create worldline --type process", "--no-prompt deploy --all"):
         done = subprocess.run(
             [*PREFECT, *command.split()], env=environment, cwd=project_root, capture_output=True, text=True, timeout=200, check=False

@@ -81,7 +81,7 @@ def test_poses_out_of_reach_end_at_a_steady_near_one(name: str) -> None:
 
 
 def test_a_straight_drive_follows_in_few_iterations() -> None:
-    """What a person at a gamepad asks for: centimetres a frame, from where the arm is."""
+    """Targets as from a gamepad: centimetres a frame, from where the arm is."""
     inverse = solver("ur5e_pair")
     state = np.array([0.2, -1.2, 1.6, -1.9, -1.57, 0.0, 0.5, 0.2, -1.2, 1.6, -1.9, -1.57, 0.0, 0.5])
     wanted = tools(inverse, state)

@@ -64,7 +64,7 @@ def name_of(content: bytes, lfs: bool) -> str:
 
 
 def files_of(folder: Path, *, lfs: bool = False) -> dict[str, tuple[bytes, bool]]:
-    """What a repository holds of a folder."""
+    """Return the files of a folder as a repository keeps them."""
     return {p.relative_to(folder).as_posix(): (p.read_bytes(), lfs) for p in folder.rglob("*") if p.is_file()}
 
 

@@ -80,7 +80,7 @@ def picture(number: int) -> np.ndarray:
 
 
 def number_of(frames: np.ndarray) -> np.ndarray:
-    """Which pictures these are."""
+    """Return the numbers that the pictures show."""
     return frames[:, 0, 0, 0].astype(int) + 256 * frames[:, 0, 0, 1].astype(int)
 
 

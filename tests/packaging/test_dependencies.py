@@ -1,4 +1,4 @@
-"""What an installation without extras and groups has is what the project needs: no more, no less."""
+"""An installation without extras and groups has what the project needs: no more, no less."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def closure(requirements: Iterable[str]) -> set[str]:
 
 
 def modules(package: str) -> set[str]:
-    """What an installed package is imported as; `packages_distributions` reads the file lists of all of them."""
+    """Return the names that an installed package is imported by; `packages_distributions` reads the file lists of all of them."""
     try:
         found = distribution(package)
     except PackageNotFoundError:

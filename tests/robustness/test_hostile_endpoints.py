@@ -67,7 +67,7 @@ def serve(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Callable[[socke
 
 
 def ask(endpoint: Endpoint) -> str:
-    """What the user is told, within a few seconds."""
+    """Return the error message, which comes within a few seconds."""
     config = VLMConfig(url=endpoint.url, timeout_s=0.3, attempts=1, api_key_variable="JUDGE")
     began = time.monotonic()
     with pytest.raises(UnavailableError) as caught:

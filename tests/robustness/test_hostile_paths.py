@@ -30,7 +30,7 @@ Make = Callable[[int], tuple[Path, CurateConfig]]
 
 
 def curated(source: CurateConfig | dict[str, Any] | list[Any], output: Path) -> tuple[int, list[str], dict[str, str]]:
-    """How many were found, which are kept, and why the others are not."""
+    """Return the number of recordings, the kept ones, and the reasons against the others."""
     if not isinstance(source, CurateConfig):
         source = CurateConfig.model_validate({"sources": source if isinstance(source, list) else [source]})
     counts = curate(source, {}, output)

@@ -1,4 +1,4 @@
-"""What one recording may cost: its reader's process, never the run."""
+"""One bad recording costs its reader's process, never the run."""
 
 from __future__ import annotations
 

@@ -59,5 +59,5 @@ class NumberFileWork(NumberWork):
 
 
 def attempts(folder: Path, value: int) -> int:
-    """How often a number was begun."""
+    """Return how often a number was begun."""
     return [line.split()[0] for line in (folder / "log.txt").read_text().splitlines()].count(str(value))

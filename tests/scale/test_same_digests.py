@@ -54,7 +54,7 @@ def config(recordings: Path, *names: str) -> CurateConfig:
 
 
 def both_digests(recordings: Path, output: Path, mapper: Any) -> tuple[str, str]:
-    """Of the curated set and of its filtered index."""
+    """Return the digests of the curated set and of its filtered index."""
     curate(config(recordings), {}, output / "set", mapper)
     # Calibration is not what is tested here: at one frame in four seconds there is too little to search it for mistakes.
     strict = FilterConfig.model_validate({"min_segment_frames": 2, "doctor": {"rate_hz": 0.25}})

@@ -1,4 +1,4 @@
-"""What becomes of episodes that fail, flicker or kill their worker: tried again, quarantined, and nothing lost from the account."""
+"""Episodes that fail, flicker or kill their worker are tried again or quarantined, and all are accounted for."""
 
 from __future__ import annotations
 

@@ -269,7 +269,7 @@ class Trap:
 
 
 def _records(trap: Path, elsewhere: Path) -> dict[str, Callable[[dict[str, Any]], dict[str, Any]]]:
-    """What somebody may have written in the place of a record."""
+    """Contents that may have been written in the place of a record."""
     pickled = base64.b64encode(pickle.dumps(Trap(trap))).decode()
     lie = json.dumps({"step": "write_one", "path": str(elsewhere), "digest": "0" * 64})
 

@@ -1,4 +1,4 @@
-"""What a person sees of a long loop: a bar on a terminal, a line a minute in a log, each line once."""
+"""Progress of a long loop: a bar on a terminal, a line a minute in a log, each line once."""
 
 from __future__ import annotations
 

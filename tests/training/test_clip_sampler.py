@@ -1,4 +1,4 @@
-"""Which clips are drawn: a pure function of seed and step; in batches of one set of views, and a checkpoint that says what it saw."""
+"""Clips are a pure function of seed and step, come in batches of one set of views, and a checkpoint names what it saw."""
 
 import dataclasses
 from collections import Counter

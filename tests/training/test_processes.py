@@ -94,7 +94,7 @@ def stage1(output, inputs, name):
 
 @dataclass(frozen=True)
 class Runs:
-    """What was trained: the folder of each run, and what the processes wrote to the terminal."""
+    """Folder of all runs, and output and exit codes of their processes."""
 
     folder: Path
     log: str

@@ -1,4 +1,4 @@
-"""What saves memory: weights in parts, blocks that are computed again, compiled blocks. The same numbers come out."""
+"""Sharded weights, checkpointed blocks and compiled blocks save memory or time and give the same numbers."""
 
 from collections.abc import Callable
 from functools import partial

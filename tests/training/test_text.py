@@ -1,4 +1,4 @@
-"""What the text tower is fed: bytes for the embedded default, the backbone's own chat prompt at full size."""
+"""Input of the text tower: bytes for the embedded default, the backbone's own chat prompt at full size."""
 
 import json
 from types import SimpleNamespace

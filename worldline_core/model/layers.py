@@ -110,8 +110,7 @@ def grouped_attention(queries: Tensor, keys: Tensor, values: Tensor, mask: Tenso
 
 @dataclass(frozen=True)
 class TextContext:
-    """What each layer reads of a text: its keys and values there, or its tokens (Wan). They depend on neither the video nor sigma:
-    compute them once.
+    """A text as each layer reads it: keys and values, or tokens (Wan). It depends on neither the video nor sigma: compute it once.
 
     ``ignored``: the video does not see the text. Only the way back passes through the text tower, with zero gradients,
     because processes that share its weights must gather them together.

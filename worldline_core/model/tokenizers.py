@@ -184,7 +184,7 @@ class Refinement(nn.Module):
         self.leave.bias = nn.Parameter(bias.flatten())
 
     def still(self, first: Float[Tensor, "b h w 12"], reference: Tensor, known: bool) -> Float[Tensor, "b width h w"]:
-        """What every group of a clip is given: features of its coarse first frame and of ``reference``.
+        """Input that all groups of a clip share: features of its coarse first frame and of ``reference``.
 
         Args:
             known: ``reference`` is the observed frame, no substitute.

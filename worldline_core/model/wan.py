@@ -81,7 +81,7 @@ class WanAttention(nn.Module):
 
 
 class Condition(NamedTuple):
-    """What every layer takes besides tokens: ``drive`` ``(b t 6 d)`` of the latent frames' times, and the tokens of a text."""
+    """Input of every layer besides tokens: ``drive`` ``(b t 6 d)`` of the latent frames' times, and the tokens of a text."""
 
     drive: Tensor
     text: Tensor

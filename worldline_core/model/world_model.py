@@ -160,8 +160,8 @@ class WorldModel(nn.Module, ABC):
         return ((name, parameter) for name, parameter in self.named_parameters() if is_action_parameter(name))
 
     def encode_text(self, text_ids: Tensor, text_mask: Tensor | None = None) -> TextContext:
-        """What the layers read of right-padded texts: token ids ``(b m)`` or embeddings ``(b m s)``, as the model's `TextEncoder`
-        gives them.
+        """Encode right-padded texts for the layers: token ids ``(b m)`` or embeddings ``(b m s)``, as the model's `TextEncoder`
+        returns them.
 
         Raises:
             ConfigError: the model was built or loaded without its understanding tower.

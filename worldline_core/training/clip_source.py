@@ -221,7 +221,7 @@ class ResidentLatents(LatentStore):
         places = self.stored_bytes // (2 * math.prod(self.latent_shape))
         self._frames = torch.empty(places, *self.latent_shape, dtype=torch.float16, device=device)
         self._first: dict[str, tuple[int, int]] = {}
-        """Of each tensor the place of its first frame, and how many it has."""
+        """Place of each tensor's first frame, and its number of frames."""
         place = 0
         for file in with_progress(sorted({row.shard for row in self.rows}), "reading latents", "shard"):
             with self._shard(file) as shard:

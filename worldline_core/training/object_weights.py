@@ -22,7 +22,7 @@ from worldline_core.training.clip_sampler import Clip, ClipRow
 from worldline_core.training.resident import frame_numbers, on_device
 
 _FULL = np.zeros((256, 2), np.uint8)
-"""Of each label what a pixel shows: what the task moves (1), another thing (2..)."""
+"""Share of (what the task moves, other things) in a pixel of each label: 1 is what the task moves, 2 and more are other things."""
 _FULL[1, 0] = _FULL[2:, 1] = 255
 
 

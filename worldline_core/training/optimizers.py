@@ -96,7 +96,7 @@ def _codes_of_halves(signed: bool) -> Tensor:
 
 
 def empty_moments(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> dict[str, Tensor]:
-    """What an optimiser keeps of a parameter, to be filled from a saved state."""
+    """Return an optimiser's empty state of a parameter, to be filled from a saved one."""
     if isinstance(optimizer, torch.optim.AdamW):  # moments have the memory layout of their parameter
         zeros = {key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}
         return {"step": torch.zeros((), device=parameter.device), **zeros}

@@ -1,4 +1,4 @@
-"""What stays on the training device beside resident latents: a batch is a few gathers there, whatever the number of its clips."""
+"""Tracks and shares of things on the training device, beside resident latents: a batch of any size is a few gathers."""
 
 from __future__ import annotations
 

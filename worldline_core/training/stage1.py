@@ -36,7 +36,7 @@ def is_trained(name: str) -> bool:
 
 
 def stage1_groups(model: WorldModel) -> list[ParameterGroup]:
-    """What is trained of both towers; the action branch is untouched, so it is still zero when Stage II begins."""
+    """Group the trained parameters of both towers; the action branch is untouched, so it is still zero when Stage II begins."""
     generation = ParameterGroup("generation", dict(model.generation_parameters()))
     return trained_groups(generation, ParameterGroup("text", dict(model.text_parameters())))
 

@@ -71,7 +71,7 @@ class ShardingConfig(StrictModel):
 
 
 class SavingConfig(StrictModel):
-    """When states are saved besides ``save_every_steps``, and which stay.
+    """Schedule of saved states besides ``save_every_steps``, and the ones that stay.
 
     Attributes:
         share: of the run's time that saving may take at most: after a save of 30 s the next begins 10 minutes later at
