@@ -111,7 +111,7 @@ def pull(where: str, folder: Path) -> FileList:
             wrong = [name for name, file in contents.files.items() if present.get(name) != file.size]
             if not wrong:
                 missing = _keep_listed(unfinished, contents)  # an interrupted pull may have left some
-                _fetch(location, unfinished, missing, others=present.keys() - contents.files.keys())
+                _fetch(location, unfinished, missing)
                 if (unfinished / _HUB_NOTES).exists():
                     shutil.rmtree(unfinished / _HUB_NOTES)
                 wrong = _keep_listed(unfinished, contents)
@@ -219,12 +219,13 @@ def _keep_listed(folder: Path, contents: FileList) -> list[str]:
     return [name for name in contents.files if not (folder / name).is_file()]
 
 
-def _fetch(location: UPath, folder: Path, names: Iterable[str], *, others: Iterable[str]) -> None:
-    """Fetch files into a folder; the hub's client does without ``others`` and what it has brought there before."""
+def _fetch(location: UPath, folder: Path, names: Iterable[str]) -> None:
+    """Fetch files into a folder."""
     if str(location).startswith("hf://"):
         _, repository, commit = _hub(str(location))
-        ignored = [glob.escape(name) for name in others]
-        snapshot_download(**repository, revision=commit, local_dir=folder, ignore_patterns=ignored, **hub_access())
+        # The client lists the repository again, and only these names were checked.
+        wanted = [glob.escape(name) for name in names]
+        snapshot_download(**repository, revision=commit, local_dir=folder, allow_patterns=wanted, **hub_access())
     else:
         location.fs.get([str(location / name) for name in names], [str(folder / name) for name in names])
 
@@ -276,9 +277,10 @@ def _prepare_repository(where: str, *, public: bool) -> None:
         raise UnavailableError("Pushing to the hub needs a token", where=where, next_step=step)
     api.create_repo(**repository, private=not public, exist_ok=True)
     if bool(api.repo_info(**repository).private) == public:
+        expected, got = ("public", "private") if public else ("private", "public")
+        step = "push to another repository, or " + ("leave out --public" if public else "add --public")
         raise ArtifactError(
-            "Repository has another visibility than asked for", where=where, expected="public" if public else "private",
-            got="private" if public else "public", next_step="push to another repository, or add or leave out --public",
-        )  # fmt: skip
+            "Repository has another visibility than asked for", where=where, expected=expected, got=got, next_step=step
+        )
     if revision is not None:
         api.create_branch(**repository, branch=revision, exist_ok=True)
