@@ -6,17 +6,16 @@ one commit; elsewhere the list is written last. Credentials come from the enviro
 
 from __future__ import annotations
 
+import glob
 import json
 import re
+import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, cast
 
-import httpx
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, snapshot_download
 from pydantic import ValidationError
 from upath import UPath
 
@@ -24,7 +23,7 @@ from worldline_core.config import StrictModel
 from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import for_evaluation_only
-from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
+from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError, WorldLineError
 from worldline_core.http_exchange import hub_access
 from worldline_core.report.data import write_card
 from worldline_core.store.artifact_files import (
@@ -36,13 +35,14 @@ from worldline_core.store.artifact_files import (
     shortened,
     verify_artifact,
 )
-from worldline_core.store.remote import AnyPath, file_system, first_line, list_files, parse_location
+from worldline_core.store.remote import AnyPath, first_line, list_files, parse_location
 from worldline_core.store.store import folder_lock
 
 FILE_LIST = "worldline_files.json"
 MAX_LIST_BYTES = 64 << 20
-_FILES_AT_ONCE = 8
-_PIECE_BYTES = 1 << 20
+_HUB_NOTES = ".cache"
+"""Folder in which the hub's client notes how far a download has come."""
+_TAKEN = (FILE_LIST, VOLATILE_FOLDER, _HUB_NOTES)
 _HUB_LOCATION = re.compile(r"hf://datasets/(?P<id>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?/?")
 
 
@@ -81,16 +81,14 @@ def push(folder: Path, where: str, *, public: bool = False, allow_restricted: bo
     with _client_errors(where, "push"):
         if where.startswith("hf://"):
             _prepare_repository(where, public=public)
-        location = _location(where)
-        present = _sizes(location)
-        foreign = sorted(present.keys() - sending.keys() - {".gitattributes"})
-        if FILE_LIST not in present and foreign:
+        location, present, earlier = _published(where)
+        foreign = present.keys() - sending.keys() - {".gitattributes"}
+        if earlier is None and foreign:
             raise ArtifactError(
-                "The location holds files that are not of this set", where=where, got=shortened(foreign),
+                "The location holds files that are not of this set", where=where, got=shortened(sorted(foreign)),
                 expected="an empty location, or an earlier push", next_step="push to a location of its own",
             )  # fmt: skip
-        earlier = _read_list(location, present).files if FILE_LIST in present else {}
-        gone = sorted((earlier.keys() - sending.keys()) & present.keys())
+        gone = sorted(foreign & earlier.files.keys()) if earlier else []
         _send(where, location, sending, gone, contents.model_dump_json(indent=1).encode())
     return contents
 
@@ -106,19 +104,17 @@ def pull(where: str, folder: Path) -> FileList:
     with folder_lock(unfinished):
         _check_new(folder)  # another command may have finished meanwhile
         with _client_errors(where, "pull"):
-            location = _location(where)
-            present = _sizes(location)
-            if FILE_LIST not in present:
+            location, present, contents = _published(where)
+            if contents is None:
                 raise ArtifactError("No finished EpisodeSet is published here", where=where, expected=FILE_LIST)
-            contents = _read_list(location, present)
             _check_names(contents.files, where)
             wrong = [name for name, file in contents.files.items() if present.get(name) != file.size]
             if not wrong:
-                for name, path in folder_files(unfinished, everything=True).items():  # of an earlier, interrupted pull
-                    if name not in contents.files and not name.startswith(f"{VOLATILE_FOLDER}/"):
-                        path.unlink()
-                with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-                    wrong = list(filter(None, pool.map(partial(_fetch, location, unfinished), contents.files.items())))
+                missing = _keep_listed(unfinished, contents)  # an interrupted pull may have left some
+                _fetch(location, unfinished, missing)
+                if (unfinished / _HUB_NOTES).exists():
+                    shutil.rmtree(unfinished / _HUB_NOTES)
+                wrong = _keep_listed(unfinished, contents)
         if wrong:
             raise ArtifactError(
                 "Published files are not those of the set", where=where, got=shortened(wrong),
@@ -177,7 +173,7 @@ def _check_names(names: Mapping[str, object], where: object) -> None:
     for name in names:
         path = PurePosixPath(name)
         plain = name.isprintable() and "\\" not in name and path.as_posix() == name and not path.is_absolute()
-        taken = path.parts[:1] in ((), (VOLATILE_FOLDER,), (FILE_LIST,)) or any(str(p) in names for p in path.parents)
+        taken = not path.parts or path.parts[0] in _TAKEN or any(str(p) in names for p in path.parents)
         if not plain or taken or ".." in path.parts:
             what, expected = "A file name of the set is unsafe or taken", "relative names of printable characters"
             raise ArtifactError(what, where=where, expected=expected, got=repr(name))
@@ -188,55 +184,53 @@ def _client_errors(where: str, verb: str) -> Iterator[None]:
     """Turn errors of a store's client, also those by odd answers of a server, into one that names the next step."""
     try:
         yield
-    except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, httpx.HTTPError) as error:
+    except (WorldLineError, MemoryError):
+        raise
+    except Exception as error:
         raise ArtifactError(
             f"The store did not finish the {verb}", where=where, got=first_line(error)[:300],
             next_step="check the name, the room and the rights (of HF_TOKEN), then run the same command again",
         ) from error  # fmt: skip
 
 
-def _sizes(location: AnyPath) -> dict[str, int]:
-    """Size of every regular file at a location by its relative name."""
-    file_system(location).invalidate_cache()
-    listed = list_files(location).items()
-    return {name: about["size"] for name, about in listed if about["type"] == "file" and not about.get("islink")}
-
-
-def _read_list(location: AnyPath, present: Mapping[str, int]) -> FileList:
-    source = location / FILE_LIST
+def _published(where: str) -> tuple[UPath, dict[str, int], FileList | None]:
+    """A location, the size of every regular file there by its relative name, and the list of what was pushed there."""
+    location = _location(where)
+    location.fs.invalidate_cache()
+    listed, source = list_files(cast("AnyPath", location)).items(), location / FILE_LIST
+    present = {name: about["size"] for name, about in listed if about["type"] == "file" and not about.get("islink")}
+    if FILE_LIST not in present:
+        return location, present, None
     if present[FILE_LIST] > MAX_LIST_BYTES:
         raise ArtifactError("List of files is too large", where=source, expected=f"at most {MAX_LIST_BYTES} bytes")
     try:
-        return FileList.model_validate_json(b"".join(_pieces(source, present[FILE_LIST])))
+        return location, present, FileList.model_validate_json(source.read_bytes())
     except ValidationError as error:
         got = error.errors(include_url=False)[0]["msg"]
         raise ArtifactError("List of files is damaged or of another version", where=source, got=got) from error
 
 
-def _pieces(source: AnyPath, size: int) -> Iterator[bytes]:
-    """The content of a file, until one byte more than it should have: a server may send without end."""
-    # Of the hub's files only block size 0 is read as a stream; others are requested by range, which a server may ignore.
-    options = {"block_size": 0} if str(source).startswith("hf://") else {}
-    left = size + 1
-    with file_system(source).open(str(source), "rb", **options) as stream:
-        while left and (piece := stream.read(min(_PIECE_BYTES, left))):
-            left -= len(piece)
-            yield piece
+def _keep_listed(folder: Path, contents: FileList) -> list[str]:
+    """Remove files that are not as listed; returns the names of those that are missing then."""
+    for name, path in folder_files(folder, everything=True).items():
+        ours = name.startswith((f"{VOLATILE_FOLDER}/", f"{_HUB_NOTES}/"))
+        if not ours and not (path.is_file() and describe_file(path) == contents.files.get(name)):
+            path.unlink()
+    return [name for name in contents.files if not (folder / name).is_file()]
 
 
-def _fetch(location: AnyPath, folder: Path, listed: tuple[str, ListedFile]) -> str | None:
-    """Fetch a file that is not there yet; returns its name where it is not the listed one."""
-    name, file = listed
-    path = folder / name
-    if path.is_file() and describe_file(path) == file:
-        return None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("wb") as stream:
-        stream.writelines(_pieces(location / name, file.size))
-    return None if describe_file(path) == file else name
+def _fetch(location: UPath, folder: Path, names: Iterable[str]) -> None:
+    """Fetch files into a folder."""
+    if str(location).startswith("hf://"):
+        _, repository, commit = _hub(str(location))
+        # The client lists the repository again, and only these names were checked.
+        wanted = [glob.escape(name) for name in names]
+        snapshot_download(**repository, revision=commit, local_dir=folder, allow_patterns=wanted, **hub_access())
+    else:
+        location.fs.get([str(location / name) for name in names], [str(folder / name) for name in names])
 
 
-def _location(where: str) -> AnyPath:
+def _location(where: str) -> UPath:
     """A folder, an object store, or the newest commit of a hub's repository, as fsspec addresses it."""
     if where.startswith("hf://"):
         api, repository, revision = _hub(where)
@@ -244,14 +238,13 @@ def _location(where: str) -> AnyPath:
         if not re.fullmatch("[0-9a-f]{40}", commit):
             raise ValueError(f"the repository's commit is {commit!r}")
         name = f"hf://datasets/{repository['repo_id']}@{commit}"
-        return cast("AnyPath", UPath(name, **hub_access(), skip_instance_cache=True))
+        return UPath(name, **hub_access(), skip_instance_cache=True)
     location = parse_location(where)
-    if isinstance(location, Path):
-        return cast("AnyPath", UPath(location.absolute(), protocol="file", auto_mkdir=True))
-    return location
+    local = isinstance(location, Path)
+    return UPath(location.absolute(), protocol="file", auto_mkdir=True) if local else cast("UPath", location)
 
 
-def _send(where: str, location: AnyPath, files: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
+def _send(where: str, location: UPath, files: Mapping[str, Path], gone: Iterable[str], listed: bytes) -> None:
     """Send files, remove those that are gone, and write the list of what is there: in one commit, or last."""
     if where.startswith("hf://"):
         api, repository, revision = _hub(where)
@@ -259,11 +252,10 @@ def _send(where: str, location: AnyPath, files: Mapping[str, Path], gone: Iterab
         changes = [*map(CommitOperationDelete, gone), *added]
         api.create_commit(**repository, revision=revision, operations=changes, commit_message="Upload EpisodeSet")
         return
-    fs = file_system(location)
-    fs.put([str(path) for path in files.values()], [str(location / name) for name in files])
+    location.fs.put([str(path) for path in files.values()], [str(location / name) for name in files])
     for name in gone:
-        fs.rm_file(str(location / name))
-    fs.pipe_file(str(location / FILE_LIST), listed)
+        location.fs.rm_file(str(location / name))
+    location.fs.pipe_file(str(location / FILE_LIST), listed)
 
 
 def _hub(where: str) -> tuple[HfApi, dict[str, Any], str | None]:

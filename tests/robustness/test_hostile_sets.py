@@ -48,7 +48,7 @@ def change_list(place: Path, name: str, content: bytes, **changes: int) -> None:
     [
         "../x", "/etc/x", "a/../../x", "a\\..\\..\\x", "\\\\host\\x", "x\0y", "a\nb", "", ".", "./x", "a//b", "a/./b", "run/x",
         "manifest.JSON/../x", "..\\..\\x", "a/..", "a\u202eb", "a\u200fb", "a/", FILE_LIST,
-        "index.parquet/x",
+        "index.parquet/x", ".cache/huggingface/x",
     ],
 )  # fmt: skip
 def test_names_that_lead_out_of_the_folder(name: str, place: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import stat
 from collections import Counter
 from pathlib import Path
 from typing import Any, ClassVar
+from unittest.mock import Mock
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -110,6 +111,9 @@ def test_a_folder_that_could_not_be_listed_is_not_left_out(monkeypatch: pytest.M
     with pytest.raises(UnreachableInputError, match="could not be reached"):  # every attempt in the second folder
         list_files(location)
     monkeypatch.setattr(Forgetful, "ls", MemoryFileSystem.ls)
+    with monkeypatch.context() as patch, pytest.raises(UnreachableInputError, match="could not be reached"):
+        patch.setattr(fs, "info", Mock(side_effect=TimeoutError))  # for which fsspec says that nothing is there
+        list_files(location)
     assert list(list_files(location)) == ["a.txt", "one/b.txt"]
     assert list_files(location / "none") == {}
 

@@ -32,12 +32,10 @@ _TRANSIENT_ERRNOS = frozenset(
     for name in ("EIO", "EREMOTEIO", "ESTALE", "EAGAIN", "EBUSY", "ETIMEDOUT", "ENETDOWN", "ENETUNREACH", "ENETRESET",
                  "EHOSTDOWN", "EHOSTUNREACH")
 )  # fmt: skip
-_TRANSIENT_CLASSES = frozenset(  # of botocore, aiohttp, http.client and httpx, which need not be installed
-    {
-        "HTTPClientError", "ResponseStreamingError", "IncompleteReadError", "ResponseParserError", "ClientConnectionError",
-        "ClientPayloadError", "IncompleteRead", "TransportError",
-    }
-)  # fmt: skip
+_TRANSIENT_CLASSES = frozenset((  # of Python, and of botocore, aiohttp, http.client and httpx, which need not be installed
+    "ConnectionError", "TimeoutError", "UnreachableInputError", "HTTPClientError", "ResponseStreamingError",
+    "IncompleteReadError", "ResponseParserError", "ClientConnectionError", "ClientPayloadError", "IncompleteRead", "TransportError",
+))  # fmt: skip
 
 
 class UnreachableInputError(UnavailableError):
@@ -47,9 +45,7 @@ class UnreachableInputError(UnavailableError):
 def is_transient(error: BaseException | None) -> bool:
     """Returns whether another attempt may help: the error, or one of its causes, comes from a network or a busy store."""
     while error is not None:
-        if isinstance(error, ConnectionError | TimeoutError | UnreachableInputError):
-            return True
-        if isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS:
+        if getattr(error, "errno", None) in _TRANSIENT_ERRNOS:
             return True
         if any(kind.__name__ in _TRANSIENT_CLASSES for kind in type(error).__mro__):
             return True
@@ -61,15 +57,20 @@ def is_transient(error: BaseException | None) -> bool:
 
 
 @contextmanager
-def _answering(path: AnyPath) -> Iterator[None]:
-    """Around requests to a store, which its own library repeats. Raises: UnreachableInputError when it does not answer."""
+def _requests_to(path: AnyPath) -> Iterator[Any]:
+    """The fsspec file system of a location, around requests, which the store's own library repeats.
+
+    Raises: UnavailableError where that library is not installed; UnreachableInputError when the store does not answer.
+    """
     try:
-        yield
+        yield cast("UPath", path).fs
+    except ImportError as error:
+        step = f"for s3:// {installing('s3')}; otherwise install the fsspec library of that store"
+        raise UnavailableError("A store's library is not installed", where=path, got=error, next_step=step) from error
     except Exception as error:
-        if not is_transient(error):
+        if isinstance(error, UnreachableInputError) or not is_transient(error):
             raise
-        step = "run the same command again when the store answers; finished work is kept"
-        got = first_line(error)
+        step, got = "run the same command again when the store answers; finished work is kept", first_line(error)
         raise UnreachableInputError("A store could not be reached", where=path, got=got, next_step=step) from error
 
 
@@ -112,31 +113,18 @@ def is_remote(path: AnyPath) -> bool:
     return not isinstance(path, Path)
 
 
-def file_system(path: AnyPath) -> Any:
-    """The fsspec file system of a location.
-
-    Raises: UnavailableError where the store's library is not installed.
-    """
-    try:
-        return cast("UPath", path).fs
-    except ImportError as error:
-        step = f"for s3:// {installing('s3')}; otherwise install the fsspec library of that store"
-        raise UnavailableError("A store's library is not installed", where=path, got=error, next_step=step) from error
-
-
 def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
     """The store's description of every file below `root` by relative name, sorted.
 
     Raises: UnreachableInputError when the store does not answer.
     """
-    fs = file_system(root)
-    base = fs._strip_protocol(str(root)).rstrip("/")
     found: dict[str, Any]
-    own: Any = type(fs)._find if isinstance(fs, AsyncFileSystem) else type(fs).find
-    with _answering(root):
+    with _requests_to(root) as fs:
+        base = fs._strip_protocol(str(root)).rstrip("/")
+        own: Any = type(fs)._find if isinstance(fs, AsyncFileSystem) else type(fs).find
         if own in (AsyncFileSystem._find, AbstractFileSystem.find):
             # fsspec's own walk silently omits folders that it could not list: `on_error` does not reach further down.
-            found, folders = {}, [base] if fs.exists(base) else []
+            found, folders = {}, [base] if remote_kind(root) else []
             for folder in folders:
                 listed = {about["name"].rstrip("/"): about for about in fs.ls(folder, detail=True)}
                 found |= {name: about for name, about in listed.items() if about["type"] != "directory"}
@@ -152,10 +140,8 @@ def remote_kind(path: AnyPath) -> str | None:
     Raises: PermissionError where the store refuses; UnreachableInputError when it does not answer, for which fsspec's
         `isfile` returns False.
     """
-    with _answering(path):
-        fs = file_system(path)
-        with suppress(FileNotFoundError):
-            return fs.info(str(path))["type"]
+    with _requests_to(path) as fs, suppress(FileNotFoundError):
+        return fs.info(str(path))["type"]
     return None
 
 
@@ -164,12 +150,12 @@ def remote_digest(root: AnyPath) -> str:
 
     Raises: ArtifactError when nothing is there; UnreachableInputError when the store does not answer.
     """
-    files, fs = list_files(root), file_system(root)
+    files = list_files(root)
     if not files:
         raise ArtifactError("There is nothing at an input's location", where=root, next_step="check the URL")
-    return digest_value(
-        [[name, about["size"], about.get("ETag") or fs.ukey(about["name"])] for name, about in files.items()]
-    )
+    with _requests_to(root) as fs:
+        states = {name: about.get("ETag") or fs.ukey(about["name"]) for name, about in files.items()}
+    return digest_value([[name, about["size"], states[name]] for name, about in files.items()])
 
 
 class RemoteCache:
@@ -181,15 +167,13 @@ class RemoteCache:
     def __init__(self, max_bytes: int = 8 << 30) -> None:
         # Of mode 0700; multiprocessing removes what is there when its first process ends.
         self.folder = Path(tempfile.mkdtemp(prefix="worldline-remote-", dir=get_temp_dir()))
-        self.max_bytes = max_bytes
-        self._sizes: dict[Path, int] = {}
-        self._lock = threading.Lock()
+        self.max_bytes, self._sizes, self._lock = max_bytes, dict[Path, int](), threading.Lock()
 
     def place(self, path: AnyPath) -> Path:
         """The path of a remote file's copy, which repeats the store's own names, so that messages can be made portable."""
-        parts = PurePosixPath(file_system(path)._strip_protocol(str(path))).parts
-        kept = (part for part in parts if part not in ("/", "..", "."))
-        return self.folder.joinpath(cast("UPath", path).protocol, *kept)
+        where = cast("UPath", path)
+        kept = (part for part in PurePosixPath(where.path).parts if part not in ("/", "..", "."))
+        return self.folder.joinpath(where.protocol, *kept)
 
     def fetch(self, path: AnyPath) -> Path:
         """A copy of the file on this machine.
@@ -201,8 +185,8 @@ class RemoteCache:
             size = self._sizes.pop(copy, None)
             if size is None:
                 copy.parent.mkdir(parents=True, exist_ok=True)
-                with _answering(path):
-                    file_system(path).get_file(str(path), str(copy))
+                with _requests_to(path) as fs:
+                    fs.get_file(str(path), str(copy))
                 size = copy.stat().st_size
             self._sizes[copy] = size
             while len(self._sizes) > 1 and sum(self._sizes.values()) > self.max_bytes:
