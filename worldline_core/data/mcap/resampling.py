@@ -54,7 +54,9 @@ def times_by_topic(
         got = ", ".join(f"0 in {count} of {len(log_ns[topic])}" for topic, count in unset.items())
         what, next_step = "Messages have no header time", "set time: log"
         raise RejectedInputError("clock_skew", what, where=where, got=got, next_step=next_step)
-    headed = [topic for topic, stream in streams.items() if stream.has_header and stream.kind != "calibration"]
+    headed = [
+        topic for topic, stream in streams.items() if stream.stamps_ns[0] is not None and stream.kind != "calibration"
+    ]
     stamps_ns = {topic: np.array(streams[topic].stamps_ns, np.int64) + config.offset_ns(topic) for topic in headed}
     least_ms = {topic: float((log_ns[topic] - times).min()) / 1e6 for topic, times in stamps_ns.items()}
     least, skew_ms = min(least_ms.values(), default=0.0), np.ptp(list(least_ms.values()) or [0.0])
