@@ -136,24 +136,22 @@ class _Messages:
             self.writer.start(profile="", library="worldline")
 
     def add(self, topic: str, schema: _Schema, message: Message) -> None:
-        seconds, nanoseconds = divmod(self.time_ns, 10**9)
-        if isinstance(self.writer, Ros2Writer):
+        writer, (seconds, nanoseconds) = self.writer, divmod(self.time_ns, 10**9)
+        if isinstance(writer, Ros2Writer):
             name, converted = _ROS2[schema]
             if schema not in self._schemas:
-                self._schemas[schema] = self.writer.register_msgdef(name.replace("/", "/msg/"), _definition(name))
-            header = {
-                "stamp": {"sec": seconds, "nanosec": nanoseconds},
-                "frame_id": message.get("frame_id", message.get("parent_frame_id", "")),
-            }
-            self.writer.write_message(topic, self._schemas[schema], converted(message, header), self.time_ns)
+                self._schemas[schema] = writer.register_msgdef(name.replace("/", "/msg/"), _definition(name))
+            stamp = {"sec": seconds, "nanosec": nanoseconds}
+            header = {"stamp": stamp, "frame_id": message.get("frame_id", message.get("parent_frame_id", ""))}
+            writer.write_message(topic, self._schemas[schema], converted(message, header), self.time_ns)
             return
         kind = _PROTOBUF[schema]
         if schema not in self._schemas:
-            self._schemas[schema] = register_schema(self.writer, kind)
+            self._schemas[schema] = register_schema(writer, kind)
         if topic not in self._channels:
-            self._channels[topic] = self.writer.register_channel(topic, "protobuf", self._schemas[schema])
+            self._channels[topic] = writer.register_channel(topic, "protobuf", self._schemas[schema])
         data = kind(timestamp={"seconds": seconds, "nanos": nanoseconds}, **message).SerializeToString()
-        self.writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns)
+        writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns)
 
     def add_poses(self, index: int, cameras: Mapping[str, CameraTrack], T_base_ee: np.ndarray | None) -> None:
         """Calibrations and fixed cameras with the first frame; moving cameras and tools with every frame."""
@@ -245,40 +243,30 @@ _ROS2: dict[_Schema, tuple[str, Callable[[Message, Message], Message]]] = {
     "JointStates": ("sensor_msgs/JointState", _joint_state),
 }
 # Fields as ROS 2's common_interfaces and geometry2 define them, without their comments.
-_ROS2_FIELDS: dict[str, tuple[str, ...]] = {
-    "builtin_interfaces/Time": ("int32 sec", "uint32 nanosec"),
-    "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
-    "geometry_msgs/Vector3": ("float64 x", "float64 y", "float64 z"),
-    "geometry_msgs/Quaternion": ("float64 x 0", "float64 y 0", "float64 z 0", "float64 w 1"),
-    "geometry_msgs/Transform": ("geometry_msgs/Vector3 translation", "geometry_msgs/Quaternion rotation"),
-    "geometry_msgs/TransformStamped": (
-        "std_msgs/Header header", "string child_frame_id", "geometry_msgs/Transform transform",
-    ),
-    "sensor_msgs/RegionOfInterest": (
-        "uint32 x_offset", "uint32 y_offset", "uint32 height", "uint32 width", "bool do_rectify",
-    ),
-    "sensor_msgs/CompressedImage": ("std_msgs/Header header", "string format", "uint8[] data"),
-    "sensor_msgs/CameraInfo": (
-        "std_msgs/Header header", "uint32 height", "uint32 width", "string distortion_model", "float64[] d",
-        "float64[9] k", "float64[9] r", "float64[12] p", "uint32 binning_x", "uint32 binning_y",
-        "sensor_msgs/RegionOfInterest roi",
-    ),
-    "sensor_msgs/JointState": (
-        "std_msgs/Header header", "string[] name", "float64[] position", "float64[] velocity", "float64[] effort",
-    ),
-    "tf2_msgs/TFMessage": ("geometry_msgs/TransformStamped[] transforms",),
-}  # fmt: skip
+_ROS2_FIELDS = {
+    "builtin_interfaces/Time": "int32 sec, uint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp, string frame_id",
+    "geometry_msgs/Vector3": "float64 x, float64 y, float64 z",
+    "geometry_msgs/Quaternion": "float64 x 0, float64 y 0, float64 z 0, float64 w 1",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation, geometry_msgs/Quaternion rotation",
+    "geometry_msgs/TransformStamped": "std_msgs/Header header, string child_frame_id, geometry_msgs/Transform transform",
+    "sensor_msgs/RegionOfInterest": "uint32 x_offset, uint32 y_offset, uint32 height, uint32 width, bool do_rectify",
+    "sensor_msgs/CompressedImage": "std_msgs/Header header, string format, uint8[] data",
+    "sensor_msgs/CameraInfo": "std_msgs/Header header, uint32 height, uint32 width, string distortion_model, float64[] d, "
+    "float64[9] k, float64[9] r, float64[12] p, uint32 binning_x, uint32 binning_y, sensor_msgs/RegionOfInterest roi",
+    "sensor_msgs/JointState": "std_msgs/Header header, string[] name, float64[] position, float64[] velocity, float64[] effort",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+}
 
 
 def _definition(name: str) -> str:
     """Text of a message type: its own fields, then those of every type in them."""
     types = [name]
     for kind in types:  # grows
-        inner = [field.split()[0].split("[")[0] for field in _ROS2_FIELDS[kind]]
+        inner = [field.split()[0].removesuffix("[]") for field in _ROS2_FIELDS[kind].split(", ")]
         types += [found for found in dict.fromkeys(inner) if found in _ROS2_FIELDS and found not in types]
-    fields = ["\n".join(_ROS2_FIELDS[kind]) for kind in types]
-    others = zip(types[1:], fields[1:], strict=True)
-    return fields[0] + "".join(f"\n{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in others)
+    own, *others = (_ROS2_FIELDS[kind].replace(", ", "\n") for kind in types)
+    return own + "".join(f"\n{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in zip(types[1:], others, strict=True))
 
 
 def exported_episode_id(file: McapFile) -> str:
@@ -315,15 +303,20 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
     num_frames = int(about["num_frames"])
     video_frames = num_frames if about["video_frames"] is None else int(about["video_frames"])
     roles: dict[str, tuple[Kind, ...]] = {
-        "/joint_states": ("joints",),
-        "/joint_commands": ("joints",),
+        **dict.fromkeys(("/joint_states", "/joint_commands"), ("joints",)),
         **dict.fromkeys(("/tf", STATIC_TRANSFORMS), ("transforms",)),
         **dict.fromkeys((f"/{view}/calibration" for view in moving), ("calibration",)),
         **dict.fromkeys((f"/{view}/{kind}" for view in views for kind in ("image", "robot_mask")), IMAGE_KINDS),
     }
     streams = file.streams(roles)
-    joints = {name: _all_of(streams, f"/joint_{name}s", num_frames, file) for name in ("state", "command")}
-    images = {view: _all_of(streams, f"/{view}/image", video_frames, file) for view in views}
+
+    def all_of(topic: str, count: int) -> Stream:
+        found = len(streams[topic].log_ns) if topic in streams else 0
+        check_length("Messages", f"{file.path}, topic {topic}", states=max(count, 1), unit="messages", found=found)
+        return streams[topic]
+
+    joints = [all_of(topic, num_frames) for topic in ("/joint_states", "/joint_commands")]
+    images = {view: all_of(f"/{view}/image", video_frames) for view in views}
     masks = {view: _track(file, streams[topic]) for view in views if (topic := f"/{view}/robot_mask") in streams}
     poses: dict[str, list[tuple[float, ...]]] = {}
     for stream in (streams[topic] for topic in ("/tf", STATIC_TRANSFORMS) if topic in streams):
@@ -333,19 +326,16 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
     cameras = RecordedCameras()
     for view in moving:
         topic = f"/{view}/calibration"
-        (calibration,) = _all_of(streams, topic, 1, file).values
+        (calibration,) = all_of(topic, 1).values
         camera_poses = _poses(poses, f"{view}_camera", num_frames if moving[view] else 1, file)
         add_camera(cameras, view, calibration, camera_poses, f"{file.path}, topic {topic}")
     tools = [_poses(poses, frame, num_frames, file) for frame in _tool_frames(int(about["num_arms"]))]
-    state, action = (
-        np.array([value.position for value in joints[name].values], dtype=ARRAYS["state"].dtype)
-        for name in ("state", "command")
-    )
+    state, action = (np.array([each.position for each in stream.values], ARRAYS["state"].dtype) for stream in joints)
     episode = Episode(
         **EpisodeDescription.arguments(about),
         state=state,
         action=action,
-        timestamps=np.array(joints["state"].log_ns, dtype=np.float64) / 1e9,
+        timestamps=np.array(joints[0].log_ns, dtype=np.float64) / 1e9,
         cameras=cameras.tracks,
         T_base_ee=np.stack(tools, axis=1) if tools else None,
         gripper=None if about["gripper"] is None else np.array(about["gripper"], dtype=ARRAYS["gripper"].dtype),
@@ -366,12 +356,6 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
 def _tool_frames(num_arms: int) -> tuple[str, ...]:
     """Names of the tools' frames in the order of the arms; a single arm is the right one."""
     return ("left_tool", "right_tool")[-num_arms:] if num_arms else ()
-
-
-def _all_of(streams: Mapping[str, Stream], topic: str, count: int, file: McapFile) -> Stream:
-    found = len(streams[topic].log_ns) if topic in streams else 0
-    check_length("Messages", f"{file.path}, topic {topic}", states=max(count, 1), unit="messages", found=found)
-    return streams[topic]
 
 
 def _track(file: McapFile, stream: Stream, camera: CameraTrack | None = None) -> ImageTrack:
