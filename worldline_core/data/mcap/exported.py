@@ -39,7 +39,6 @@ from worldline_core.store.atomic import atomic_path
 
 Encoding = Literal["protobuf", "ros2"]
 Message = Mapping[str, Any]
-_Schema = Literal["CompressedImage", "CameraCalibration", "FrameTransform", "JointStates"]
 EPISODE_METADATA = "worldline.episode"
 FORMAT_VERSION = 3
 STATIC_TRANSFORMS = "/tf_static"
@@ -72,7 +71,7 @@ def write_episode_mcap(
             messages.time_ns = round(float(time) * 1e9)
             for topic, values in (("/joint_states", episode.state), ("/joint_commands", episode.action)):
                 joints = [{"name": n, "position": v} for n, v in zip(names, values[index].tolist(), strict=True)]
-                messages.add(topic, "JointStates", {"joints": joints})
+                messages.add(topic, JointStates, {"joints": joints})
             messages.add_poses(index, episode.cameras, episode.T_base_ee)
             messages.add_images(next(pictures, {}), "png")
 
@@ -126,7 +125,7 @@ class _Messages:
     def __init__(self, stream: BinaryIO, encoding: Encoding) -> None:
         self.time_ns = 0
         self.writer: Writer | Ros2Writer
-        self._schemas: dict[str, Any] = {}
+        self._schemas: dict[type, Any] = {}
         self._channels: dict[str, int] = {}
         self._static_transforms = STATIC_TRANSFORMS if encoding == "ros2" else "/tf"
         if encoding == "ros2":
@@ -135,7 +134,8 @@ class _Messages:
             self.writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
             self.writer.start(profile="", library="worldline")
 
-    def add(self, topic: str, schema: _Schema, message: Message) -> None:
+    def add(self, topic: str, schema: Any, message: Message) -> None:
+        """Adds a message of one of Foxglove's classes."""
         writer, (seconds, nanoseconds) = self.writer, divmod(self.time_ns, 10**9)
         if isinstance(writer, Ros2Writer):
             name, converted = _ROS2[schema]
@@ -145,26 +145,25 @@ class _Messages:
             header = {"stamp": stamp, "frame_id": message.get("frame_id", message.get("parent_frame_id", ""))}
             writer.write_message(topic, self._schemas[schema], converted(message, header), self.time_ns)
             return
-        kind = _PROTOBUF[schema]
         if schema not in self._schemas:
-            self._schemas[schema] = register_schema(writer, kind)
+            self._schemas[schema] = register_schema(writer, schema)
         if topic not in self._channels:
             self._channels[topic] = writer.register_channel(topic, "protobuf", self._schemas[schema])
-        data = kind(timestamp={"seconds": seconds, "nanos": nanoseconds}, **message).SerializeToString()
+        data = schema(timestamp={"seconds": seconds, "nanos": nanoseconds}, **message).SerializeToString()
         writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns)
 
     def add_poses(self, index: int, cameras: Mapping[str, CameraTrack], T_base_ee: np.ndarray | None) -> None:
         """Calibrations and fixed cameras with the first frame; moving cameras and tools with every frame."""
         for view, camera in cameras.items():
             if index == 0:
-                self.add(f"/{view}/calibration", "CameraCalibration", _calibration(camera))
+                self.add(f"/{view}/calibration", CameraCalibration, _calibration(camera))
             if index == 0 or camera.moving:
                 pose = camera.T_base_camera[index if camera.moving else 0]
                 topic = "/tf" if camera.moving else self._static_transforms
-                self.add(topic, "FrameTransform", _transform(f"{view}_camera", pose))
+                self.add(topic, FrameTransform, _transform(f"{view}_camera", pose))
         poses = () if T_base_ee is None else T_base_ee[index]
         for frame, pose in zip(_tool_frames(len(poses)), poses, strict=True):
-            self.add("/tf", "FrameTransform", _transform(frame, pose))
+            self.add("/tf", FrameTransform, _transform(frame, pose))
 
     def add_images(self, images: Mapping[tuple[str, str], np.ndarray], image_format: Literal["png", "jpeg"]) -> None:
         """By kind (image, robot_mask) and view."""
@@ -174,12 +173,7 @@ class _Messages:
             pixels = image.astype(np.uint8) * 255 if image.dtype == bool else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
             _, encoded = cv2.imencode(f".{image_format}", pixels, settings)
             message = {"frame_id": f"{view}_camera", "data": encoded.tobytes(), "format": image_format}
-            self.add(f"/{view}/{kind}", "CompressedImage", message)
-
-
-_PROTOBUF: dict[str, Any] = {
-    kind.DESCRIPTOR.name: kind for kind in (CompressedImage, CameraCalibration, FrameTransform, JointStates)
-}
+            self.add(f"/{view}/{kind}", CompressedImage, message)
 
 
 def _metadata(episode: Episode, views: list[str]) -> dict[str, str]:
@@ -236,11 +230,11 @@ def _joint_state(message: Message, header: Message) -> Message:
     return {"header": header, "name": names, "position": positions, "velocity": [], "effort": []}
 
 
-_ROS2: dict[_Schema, tuple[str, Callable[[Message, Message], Message]]] = {
-    "CompressedImage": ("sensor_msgs/CompressedImage", lambda message, header: {"header": header, **message}),
-    "CameraCalibration": ("sensor_msgs/CameraInfo", _camera_info),
-    "FrameTransform": ("tf2_msgs/TFMessage", _tf_message),
-    "JointStates": ("sensor_msgs/JointState", _joint_state),
+_ROS2: dict[type, tuple[str, Callable[[Message, Message], Message]]] = {
+    CompressedImage: ("sensor_msgs/CompressedImage", lambda message, header: {"header": header, **message}),
+    CameraCalibration: ("sensor_msgs/CameraInfo", _camera_info),
+    FrameTransform: ("tf2_msgs/TFMessage", _tf_message),
+    JointStates: ("sensor_msgs/JointState", _joint_state),
 }
 # Fields as ROS 2's common_interfaces and geometry2 define them, without their comments.
 _ROS2_FIELDS = {
@@ -316,7 +310,6 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         return streams[topic]
 
     joints = [all_of(topic, num_frames) for topic in ("/joint_states", "/joint_commands")]
-    images = {view: all_of(f"/{view}/image", video_frames) for view in views}
     masks = {view: _track(file, streams[topic]) for view in views if (topic := f"/{view}/robot_mask") in streams}
     poses: dict[str, list[tuple[float, ...]]] = {}
     for stream in (streams[topic] for topic in ("/tf", STATIC_TRANSFORMS) if topic in streams):
@@ -341,7 +334,8 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         gripper=None if about["gripper"] is None else np.array(about["gripper"], dtype=ARRAYS["gripper"].dtype),
         video_frames=about["video_frames"],
     )
-    tracks = {view: _track(file, images[view], cameras.tracks.get(view)) for view in views}
+    images = {view: all_of(f"/{view}/image", video_frames) for view in views}
+    tracks = {view: _track(file, stream, cameras.tracks.get(view)) for view, stream in images.items()}
 
     def robot_masks(view: str) -> MadeFrames | None:
         if view not in masks:

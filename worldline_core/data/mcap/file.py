@@ -235,12 +235,8 @@ class SplitMcap(McapFile):
     """
 
     def __init__(self, folder: AnyPath, parts: Sequence[AnyPath]) -> None:
-        self.parts = [McapFile(part) for part in parts]
-        super().__init__(folder)
-
-    @property
-    def _summary(self) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """None: every part has its own."""
+        self.path, self._decoder = folder, MessageDecoder(folder)
+        self.parts = [McapFile(part) for part in parts]  # each with its own summary
 
     @cached_property
     def topics(self) -> dict[str, str]:

@@ -33,35 +33,25 @@ _EMPTY_ARRAY = re.compile(rb"\[\s*0+\s*\]")
 Kind = Literal["image", "video", "raw_image", "calibration", "joints", "numbers", "transforms", "pose", "marker"]
 IMAGE_KINDS: tuple[Kind, ...] = ("image", "video", "raw_image")
 
-SCHEMA_KINDS: dict[str, Kind] = {
-    "sensor_msgs/CompressedImage": "image",
-    "sensor_msgs/Image": "raw_image",
-    "sensor_msgs/CameraInfo": "calibration",
-    "sensor_msgs/JointState": "joints",
-    "tf2_msgs/TFMessage": "transforms",
-    "geometry_msgs/TransformStamped": "transforms",
-    "geometry_msgs/PoseStamped": "pose",
-    "std_msgs/Float64MultiArray": "numbers",
-    "std_msgs/Float32MultiArray": "numbers",
-    "std_msgs/Float64": "numbers",
-    "std_msgs/Float32": "numbers",
-    "std_msgs/String": "marker",
-    "std_msgs/Bool": "marker",
-    "foxglove.CompressedImage": "image",
-    "foxglove.CompressedVideo": "video",
-    "foxglove.RawImage": "raw_image",
-    "foxglove.CameraCalibration": "calibration",
-    "foxglove.FrameTransform": "transforms",
-    "foxglove.FrameTransforms": "transforms",
-    "foxglove.PoseInFrame": "pose",
-    "foxglove.JointStates": "joints",
-}
-"""Schemas that can be read, by the names that `schema_kind` compares."""
+_SCHEMAS: dict[Kind, tuple[str, ...]] = {
+    "image": ("sensor_msgs/CompressedImage", "foxglove.CompressedImage"),
+    "video": ("foxglove.CompressedVideo",),
+    "raw_image": ("sensor_msgs/Image", "foxglove.RawImage"),
+    "calibration": ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"),
+    "joints": ("sensor_msgs/JointState", "foxglove.JointStates"),
+    "numbers": ("std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray", "std_msgs/Float64", "std_msgs/Float32"),
+    "transforms": (
+        "tf2_msgs/TFMessage", "geometry_msgs/TransformStamped", "foxglove.FrameTransform", "foxglove.FrameTransforms",
+    ),
+    "pose": ("geometry_msgs/PoseStamped", "foxglove.PoseInFrame"),
+    "marker": ("std_msgs/String", "std_msgs/Bool"),
+}  # fmt: skip
+_KINDS = {schema: kind for kind, schemas in _SCHEMAS.items() for schema in schemas}
 
 
 def schema_kind(name: str) -> Kind | None:
     """Kind of the messages of `sensor_msgs/msg/Image`, `foxglove_msgs/msg/RawImage`, ...; None for a schema that is not read."""
-    return SCHEMA_KINDS.get(name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove."))
+    return _KINDS.get(name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove."))
 
 
 VIDEO_CODECS = {"h264": "h264", "h265": "hevc"}
@@ -298,7 +288,7 @@ def _decoder(encoding: str, schema: Schema | None, where: str) -> tuple[Kind, Ca
             return kind, decode
     raise refused(
         "Messages of this schema are not understood",
-        expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(SCHEMA_KINDS),
+        expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(_KINDS),
         got="no schema" if schema is None else f"{schema.name} ({encoding}, {schema.encoding})",
         next_step="name another topic, or convert the recording",
     )

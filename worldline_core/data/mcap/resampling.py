@@ -376,8 +376,6 @@ def _intrinsics(calibration: Calibration, *, rectified: bool, where: str) -> tup
         if x + region_width > width or y + region_height > height:
             raise refused(f"Region of interest leaves the image of {width}x{height}", got=calibration.roi)
         transform = transform.crop(y, x, (region_height, region_width))
-    across, down = (max(each, 1) for each in calibration.binning)
-    if (across, down) != (1, 1):
-        height, width = transform.image_size
-        transform = transform.resize((height // down, width // across))
+    (height, width), (across, down) = transform.image_size, (max(each, 1) for each in calibration.binning)
+    transform = transform.resize((height // down, width // across))
     return transform.intrinsics(K), transform.image_size
