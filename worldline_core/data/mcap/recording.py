@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import REPEATS_STATE, CameraTrack, Episode, Outcome
+from worldline_core.data.episodes.episode import REPEATS_STATE, Episode, Outcome
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -187,10 +187,9 @@ class _Recording:
         """
         config = self.config
 
-        def read_static(topics: Iterable[str], stop_ns: int | None) -> TransformTree:
+        def read_static(topics: Collection[str], stop_ns: int | None) -> TransformTree:
             tree = TransformTree(self.file.path, config.max_gap_s)
-            present = [topic for topic in topics if topic in self.file.topics]
-            for _, _, log_ns, _, transforms in self.file.messages(present, None, stop_ns) if present else ():
+            for _, _, log_ns, _, transforms in self.file.messages(topics, None, stop_ns):
                 tree.add(transforms, [log_ns] * len(transforms), static=True)
             return tree
 
@@ -209,7 +208,7 @@ class _Recording:
     def grid(self) -> np.ndarray:
         """(t,) instants [ns]: from the first image of the primary view after all topics have begun, until the first ends."""
         config = self.config
-        # Gaps between images are judged in `chosen_images`, by the distance of instants from the nearest image.
+        # Gaps between images are judged in `track`, by the distance of instants from the nearest image.
         topics = [(config.views[view].image, times, float("inf")) for view, (times, _) in self.images.items()]
         topics += [(readings.topic, times, config.max_gap_s) for readings, (times, _) in self.signals.items()]
         topics += [(topic, times, config.max_gap_s) for topic, ((times, _), _) in self.tools.items()]
@@ -231,11 +230,12 @@ class _Recording:
             raise RejectedInputError("too_short", what, where=self.file.path, got=got, next_step=next_step)
         return grid
 
-    def chosen_images(self, view: str, grid: np.ndarray) -> np.ndarray:
-        """(t,) the nearest image of each instant."""
-        config, (times, _) = self.config, self.images[view]
-        where, fps = self.at(config.views[view].image), config.fps
-        if (step_ns := median_step_ns(times)) * fps > 1.25e9:
+    def track(self, view: str, grid: np.ndarray) -> ImageTrack:
+        """The nearest image of each instant, none of which is a video frame that depends on a lost message."""
+        config, (times, order) = self.config, self.images[view]
+        stream, fps, step_ns = self.streams[config.views[view].image], config.fps, median_step_ns(times)
+        where = self.at(stream.topic)
+        if step_ns * fps > 1.25e9:
             raise RejectedInputError(
                 "wrong_fps", "Camera is slower than the wanted rate", where=where, expected=f"{fps} fps",
                 got=f"{1e9 / step_ns:.2f} fps", next_step="lower the source's fps",
@@ -250,19 +250,14 @@ class _Recording:
                 expected=f"an image within {config.max_image_distance_frames} frames of every instant",
                 evidence={"gap_s": 2 * furthest / fps},
             )  # fmt: skip
-        return chosen
-
-    def track(self, view: str, chosen: np.ndarray, camera: CameraTrack | None) -> ImageTrack:
-        """The chosen images, none of which is a video frame that depends on a lost message."""
-        stream, (times, order) = self.streams[self.config.views[view].image], self.images[view]
-        track = ImageTrack(self.file, stream, order, chosen, self.around_ns, camera)
+        track = ImageTrack(self.file, stream, order, chosen, self.around_ns)
         if stream.kind == "video":
-            spoiled = frames_after_loss(times, median_step_ns(times), track.key_frames, track.log_ns)[chosen]
+            spoiled = frames_after_loss(times, step_ns, track.key_frames, track.log_ns)[chosen]
             if spoiled.any():
                 first, count = int(np.argmax(spoiled)), int(spoiled.sum())
                 raise RejectedInputError(
                     "truncated_video", "Video frames depend on a message that is missing",
-                    where=f"{track.where}, frame {first}", next_step="cut the recording at the gap",
+                    where=f"{where}, frame {first}", next_step="cut the recording at the gap",
                     got=f"{count} of {len(chosen)} frames after a gap, before the next key frame",
                     evidence={"first_frame": first, "frames": count},
                 )  # fmt: skip
@@ -327,7 +322,7 @@ def read_topics_episode(
     recording = _Recording(config, file, segment)
     config, unknown = recording.config, recording.uncalibrated
     grid = recording.grid()
-    chosen = {view: recording.chosen_images(view, grid) for view in config.views}
+    tracks = {view: recording.track(view, grid) for view in config.views}
     cameras = RecordedCameras()
     for view, frame in recording.camera_frames.items():
         topics = config.views[view]
@@ -372,8 +367,6 @@ def read_topics_episode(
             **cameras.notes(),
         },
     )
-    tracks = {view: recording.track(view, chosen[view], cameras.tracks.get(view)) for view in config.views}
-    views, lenses = tuple(config.views), cameras.lenses
-    return LoadedEpisode(
-        episode, views, lambda view: tracks[view].frames(), distortions=lenses, absent=recording.absent
-    )
+    tracks = {view: replace(track, camera=cameras.tracks.get(view)) for view, track in tracks.items()}
+    views, lenses, absent = tuple(tracks), cameras.lenses, recording.absent
+    return LoadedEpisode(episode, views, lambda view: tracks[view].frames(), distortions=lenses, absent=absent)
