@@ -36,14 +36,7 @@ from worldline_core.data.guards.rejection import (
     unreadable,
 )
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
-from worldline_core.data.mcap.messages import (
-    IMAGE_KINDS,
-    VIDEO_CODECS,
-    EncodedImage,
-    Kind,
-    MessageDecoder,
-    RawImage,
-)
+from worldline_core.data.mcap.messages import IMAGE_KINDS, VIDEO_CODECS, EncodedImage, Kind, RawImage, decode
 from worldline_core.data.video.clip import Picture
 
 # What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
@@ -92,7 +85,6 @@ class McapFile:
 
     def __init__(self, path: AnyPath) -> None:
         self.path = path
-        self._decoder = MessageDecoder(path)
         _ = self._summary
 
     @cached_property
@@ -165,9 +157,10 @@ class McapFile:
         """
         held: dict[str, list[bytes]] = {}
         for schema, channel, record in self._records(topics, start_ns, stop_ns):
-            kind, stamp_ns, value = self._decoder.decode(channel, schema, record.data)
+            where = f"{self.path}, topic {channel.topic}"
+            kind, stamp_ns, value = decode(channel, schema, record.data, where)
             if kind == "video":
-                value.check_video(f"{self.path}, topic {channel.topic}")
+                value.check_video(where)
                 sets = held.setdefault(channel.topic, [])
                 if value.picture is None:
                     sets += value.parameter_sets()
@@ -235,7 +228,7 @@ class SplitMcap(McapFile):
     """
 
     def __init__(self, folder: AnyPath, parts: Sequence[AnyPath]) -> None:
-        self.path, self._decoder = folder, MessageDecoder(folder)
+        self.path = folder
         self.parts = [McapFile(part) for part in parts]  # each with its own summary
 
     @cached_property
@@ -366,7 +359,7 @@ class ImageTrack:
         decoder.thread_type = "NONE"
         sets = b"" if first.parameter_sets() else self._parameter_sets(int(self.log_ns[numbers[0]]))
 
-        def decode() -> Iterator[av.VideoFrame]:
+        def shown() -> Iterator[av.VideoFrame]:
             for place, (number, image) in enumerate(zip(numbers.tolist(), chain([first], messages), strict=True)):
                 packet = av.Packet(image.data if place else sets + image.data)
                 packet.pts, packet.dts = number, place
@@ -374,7 +367,7 @@ class ImageTrack:
             yield from decoder.decode(None)
 
         try:
-            for frame in decode():
+            for frame in shown():
                 check_image_size(frame.width, frame.height, self.where)
                 if frame.is_corrupt or frame.pts is None:
                     return

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from io import StringIO
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -240,55 +240,50 @@ _FAULTS = (
 )  # fmt: skip
 
 
-class MessageDecoder:
-    """Decodes the messages of one file's channels."""
+def decode(channel: Channel, schema: Schema | None, data: bytes, where: str) -> tuple[Kind, int | None, Any]:
+    """Kind of a message, its header time [ns] (None where the schema has none), and its content.
 
-    def __init__(self, where: object) -> None:
-        self._where = where
-        self._decoders: dict[tuple[object, ...], tuple[Kind, Callable[[bytes], Any]]] = {}
-
-    def decode(self, channel: Channel, schema: Schema | None, data: bytes) -> tuple[Kind, int | None, Any]:
-        """Kind of a message, its header time [ns] (None where the schema has none), and its content."""
-        where = f"{self._where}, topic {channel.topic}"
-        # Numbers of channels and schemas mean something within one file of a split recording only.
-        key = channel.topic, channel.message_encoding, *(() if schema is None else (schema.name, schema.data))
-        if key not in self._decoders:
-            self._decoders[key] = _decoder(channel.message_encoding, schema, where)
-        kind, decode = self._decoders[key]
-        try:
-            raw = decode(data)
-            stamp_ns, value = _header_time(raw), _READERS[kind](raw)
-        except _FAULTS as error:
-            what = "Message cannot be decoded"
-            raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200]) from error
-        if kind in ("joints", "numbers"):
-            check_columns(len(value.names if isinstance(value, Joints) else value), where)
-        return kind, stamp_ns, value
+    Raises: RejectedInputError: unknown_schema, unreadable, too_large.
+    """
+    # Numbers of channels and schemas mean something within one file of a split recording only.
+    defined = None if schema is None else (schema.name, schema.encoding, schema.data)
+    kind, decoded = _decoder(channel.message_encoding, defined, where)
+    try:
+        raw = decoded(data)
+        stamp_ns, value = _header_time(raw), _READERS[kind](raw)
+    except _FAULTS as error:
+        what = "Message cannot be decoded"
+        raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200]) from error
+    if kind in ("joints", "numbers"):
+        check_columns(len(value.names if isinstance(value, Joints) else value), where)
+    return kind, stamp_ns, value
 
 
-def _decoder(encoding: str, schema: Schema | None, where: str) -> tuple[Kind, Callable[[bytes], Any]]:
-    """Kind of a channel's messages, and what decodes them into objects."""
+@lru_cache(maxsize=256)
+def _decoder(encoding: str, defined: tuple[str, str, bytes] | None, where: str) -> tuple[Kind, Callable[[bytes], Any]]:
+    """Kind of a channel's messages, and what decodes them into objects; `defined`: name, encoding and text of the schema."""
     refused = partial(RejectedInputError, "unknown_schema", where=where)
-    kind = None if schema is None else schema_kind(schema.name)
-    if schema is not None and kind is not None:
+    name, language, text = defined or ("no schema", "none", b"")
+    kind = schema_kind(name)
+    if kind is not None:
         if encoding == "json":
             return kind, lambda data: _as_object(parse_json(data, where))
-        if encoding in ("cdr", "protobuf") and not schema.data.strip():
+        if encoding in ("cdr", "protobuf") and not text.strip():
             next_step = "record where the message's package is installed, or there: ros2 bag convert"
-            raise refused("The file holds no definition of its messages", got=schema.name, next_step=next_step)
-        if schema.encoding == "ros2msg" and _EMPTY_ARRAY.search(schema.data):
-            raise refused("Schema definition has arrays of length 0, which no message needs", got=schema.name)
+            raise refused("The file holds no definition of its messages", got=name, next_step=next_step)
+        if language == "ros2msg" and _EMPTY_ARRAY.search(text):
+            raise refused("Schema definition has arrays of length 0, which no message needs", got=name)
         factory = Ros2DecoderFactory() if encoding == "cdr" else ProtobufDecoderFactory()
         try:
             with redirect_stderr(StringIO()):  # the ROS 2 parser prints the line at fault as it is
-                decode = factory.decoder_for(encoding, schema)
+                decoded = factory.decoder_for(encoding, Schema(1, text, language, name))
         except _FAULTS as error:
             raise refused("Schema definition cannot be read", got=repr(error)[:200]) from error
-        if decode is not None:
-            return kind, decode
+        if decoded is not None:
+            return kind, decoded
     raise refused(
         "Messages of this schema are not understood",
         expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(_KINDS),
-        got="no schema" if schema is None else f"{schema.name} ({encoding}, {schema.encoding})",
+        got=f"{name} ({encoding}, {language})",
         next_step="name another topic, or convert the recording",
     )
