@@ -46,7 +46,7 @@ _SCHEMAS: dict[Kind, tuple[str, ...]] = {
     "pose": ("geometry_msgs/PoseStamped", "foxglove.PoseInFrame"),
     "marker": ("std_msgs/String", "std_msgs/Bool"),
 }  # fmt: skip
-_KINDS = {schema: kind for kind, schemas in _SCHEMAS.items() for schema in schemas}
+_KINDS: dict[str, Kind] = {schema: kind for kind, schemas in _SCHEMAS.items() for schema in schemas}
 
 
 def schema_kind(name: str) -> Kind | None:
