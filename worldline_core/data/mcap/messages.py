@@ -263,7 +263,7 @@ def decode(channel: Channel, schema: Schema | None, data: bytes, where: str) -> 
 def _decoder(encoding: str, defined: tuple[str, str, bytes] | None, where: str) -> tuple[Kind, Callable[[bytes], Any]]:
     """Kind of a channel's messages, and what decodes them into objects; `defined`: name, encoding and text of the schema."""
     refused = partial(RejectedInputError, "unknown_schema", where=where)
-    name, language, text = defined or ("no schema", "none", b"")
+    name, language, text = defined or ("", "no schema", b"")
     kind = schema_kind(name)
     if kind is not None:
         if encoding == "json":
@@ -284,6 +284,6 @@ def _decoder(encoding: str, defined: tuple[str, str, bytes] | None, where: str) 
     raise refused(
         "Messages of this schema are not understood",
         expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(_KINDS),
-        got=f"{name} ({encoding}, {language})",
+        got=f"{name or 'no schema'} ({encoding or 'no encoding'}, {language})",
         next_step="name another topic, or convert the recording",
     )
