@@ -304,8 +304,8 @@ class ImageTrack:
         shape, camera = image.shape, self.camera
         if camera is not None and shape[:2] != (camera.height, camera.width):
             what, where = "Calibration belongs to another image size", f"{where}, view {camera.view}"
-            size = camera.height, camera.width
-            raise RejectedInputError("missing_calibration", what, where=where, expected=shape[:2], got=size)
+            expected, got = f"{shape[1]}x{shape[0]}", f"{camera.width}x{camera.height}"
+            raise RejectedInputError("missing_calibration", what, where=where, expected=expected, got=got)
         for wanted in self.chosen:
             while number < wanted:
                 number, image = next(decoded)

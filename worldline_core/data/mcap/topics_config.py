@@ -161,8 +161,9 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
         if len({arm.tool_frame is None and arm.tool_pose is None for arm in self.arms}) > 1:
             raise ValueError("either all arms have tool poses or none")
         for arm in self.arms:
-            if arm.command is not None and arm.command.joints.width != arm.state.joints.width:
-                raise ValueError(f"arm {arm.name} has another number of joints than of commands")
+            joints, commands = arm.state.joints, arm.command and arm.command.joints
+            if commands is not None and commands.width != joints.width:
+                raise ValueError(f"arm {arm.name} has {joints.width} joints and {commands.width} commands")
         if self.primary_view is not None and self.primary_view not in self.views:
             raise ValueError(f"primary_view {self.primary_view} is none of {', '.join(self.views)}")
         seen: dict[str, str] = {}
