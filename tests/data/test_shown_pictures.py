@@ -11,10 +11,10 @@ import io
 import itertools
 import json
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -31,7 +31,7 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.plain_files import decode_image, image_size
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap.file import _decoded  # pyright: ignore[reportPrivateUsage]
+from worldline_core.data.mcap.file import ImageTrack, Stream
 from worldline_core.data.mcap.messages import EncodedImage
 from worldline_core.data.video.clip import FrameDecoder, VideoClip, open_video, read_clip, shown_size
 from worldline_core.data.video.encoder import encode_video
@@ -151,19 +151,23 @@ def test_a_matrix_that_is_not_stated_follows_from_the_number_of_lines(tmp_path: 
     assert off(next(read_clip(clip)).rgb) <= TOLERANCE
 
 
-def messages(path: Path, codec: str) -> Iterator[tuple[int, EncodedImage]]:
+def track(path: Path, codec: str) -> ImageTrack:
+    """The video's packets as messages of a topic, each with its time of presentation."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         annex_b = av.bitstream.BitStreamFilterContext(f"{codec}_mp4toannexb", stream)
         packets = [packet for source in container.demux(stream) for packet in annex_b.filter(source)]
-    for number, packet in enumerate(packets):
-        yield number, EncodedImage("", bytes(packet), codec.replace("hevc", "h265"))
+    sent = [EncodedImage("", bytes(packet), codec.replace("hevc", "h265")) for packet in packets]
+    file: Any = SimpleNamespace(path=path, messages=lambda *_: (("/video", "video", 0, 0, image) for image in sent))
+    keys = [image.picture == "key" for image in sent]
+    topic = Stream("/video", "video", log_ns=list(range(len(sent))), key_frames=keys)
+    return ImageTrack(file, topic, np.argsort([packet.pts for packet in packets]), np.arange(len(sent)))
 
 
 def test_video_messages_have_their_colours(made: dict[Path, Made]) -> None:
     for path, case in made.items():
         if case.codec != "av1":
-            found = [image for _, image in _decoded(messages(path, case.codec.removesuffix("10")), bytes, "here")]
+            found = list(track(path, case.codec.removesuffix("10")).frames())
             assert found
             assert max(map(off, found)) <= TOLERANCE, case
 

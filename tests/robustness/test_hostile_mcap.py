@@ -17,9 +17,9 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from tests.data.curating import rejected
 from tools.corrupted import mcap
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap import messages
 from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
 from worldline_core.data.mcap.file import McapFile
-from worldline_core.data.mcap.messages import MessageDecoder
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -104,7 +104,7 @@ def test_every_flipped_byte_of_our_own_file_is_noticed(sound: tuple[Path, bytes]
 
 
 def decode(encoding: str, schema: Schema, data: bytes) -> object:
-    return MessageDecoder("a").decode(Channel(1, "/a", encoding, {}, 1), schema, data)
+    return messages.decode(Channel(1, "/a", encoding, {}, 1), schema, data, "a")
 
 
 def ros(definition: bytes) -> Schema:

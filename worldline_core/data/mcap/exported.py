@@ -39,7 +39,6 @@ from worldline_core.store.atomic import atomic_path
 
 Encoding = Literal["protobuf", "ros2"]
 Message = Mapping[str, Any]
-_Schema = Literal["CompressedImage", "CameraCalibration", "FrameTransform", "JointStates"]
 EPISODE_METADATA = "worldline.episode"
 FORMAT_VERSION = 3
 STATIC_TRANSFORMS = "/tf_static"
@@ -72,7 +71,7 @@ def write_episode_mcap(
             messages.time_ns = round(float(time) * 1e9)
             for topic, values in (("/joint_states", episode.state), ("/joint_commands", episode.action)):
                 joints = [{"name": n, "position": v} for n, v in zip(names, values[index].tolist(), strict=True)]
-                messages.add(topic, "JointStates", {"joints": joints})
+                messages.add(topic, JointStates, {"joints": joints})
             messages.add_poses(index, episode.cameras, episode.T_base_ee)
             messages.add_images(next(pictures, {}), "png")
 
@@ -126,7 +125,7 @@ class _Messages:
     def __init__(self, stream: BinaryIO, encoding: Encoding) -> None:
         self.time_ns = 0
         self.writer: Writer | Ros2Writer
-        self._schemas: dict[str, Any] = {}
+        self._schemas: dict[type, Any] = {}
         self._channels: dict[str, int] = {}
         self._static_transforms = STATIC_TRANSFORMS if encoding == "ros2" else "/tf"
         if encoding == "ros2":
@@ -135,38 +134,36 @@ class _Messages:
             self.writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
             self.writer.start(profile="", library="worldline")
 
-    def add(self, topic: str, schema: _Schema, message: Message) -> None:
-        seconds, nanoseconds = divmod(self.time_ns, 10**9)
-        if isinstance(self.writer, Ros2Writer):
+    def add(self, topic: str, schema: Any, message: Message) -> None:
+        """Adds a message of one of Foxglove's classes."""
+        writer, (seconds, nanoseconds) = self.writer, divmod(self.time_ns, 10**9)
+        if isinstance(writer, Ros2Writer):
             name, converted = _ROS2[schema]
             if schema not in self._schemas:
-                self._schemas[schema] = self.writer.register_msgdef(name.replace("/", "/msg/"), _definition(name))
-            header = {
-                "stamp": {"sec": seconds, "nanosec": nanoseconds},
-                "frame_id": message.get("frame_id", message.get("parent_frame_id", "")),
-            }
-            self.writer.write_message(topic, self._schemas[schema], converted(message, header), self.time_ns)
+                self._schemas[schema] = writer.register_msgdef(name.replace("/", "/msg/"), _definition(name))
+            stamp = {"sec": seconds, "nanosec": nanoseconds}
+            header = {"stamp": stamp, "frame_id": message.get("frame_id", message.get("parent_frame_id", ""))}
+            writer.write_message(topic, self._schemas[schema], converted(message, header), self.time_ns)
             return
-        kind = _PROTOBUF[schema]
         if schema not in self._schemas:
-            self._schemas[schema] = register_schema(self.writer, kind)
+            self._schemas[schema] = register_schema(writer, schema)
         if topic not in self._channels:
-            self._channels[topic] = self.writer.register_channel(topic, "protobuf", self._schemas[schema])
-        data = kind(timestamp={"seconds": seconds, "nanos": nanoseconds}, **message).SerializeToString()
-        self.writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns)
+            self._channels[topic] = writer.register_channel(topic, "protobuf", self._schemas[schema])
+        data = schema(timestamp={"seconds": seconds, "nanos": nanoseconds}, **message).SerializeToString()
+        writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns)
 
     def add_poses(self, index: int, cameras: Mapping[str, CameraTrack], T_base_ee: np.ndarray | None) -> None:
         """Calibrations and fixed cameras with the first frame; moving cameras and tools with every frame."""
         for view, camera in cameras.items():
             if index == 0:
-                self.add(f"/{view}/calibration", "CameraCalibration", _calibration(camera))
+                self.add(f"/{view}/calibration", CameraCalibration, _calibration(camera))
             if index == 0 or camera.moving:
                 pose = camera.T_base_camera[index if camera.moving else 0]
                 topic = "/tf" if camera.moving else self._static_transforms
-                self.add(topic, "FrameTransform", _transform(f"{view}_camera", pose))
+                self.add(topic, FrameTransform, _transform(f"{view}_camera", pose))
         poses = () if T_base_ee is None else T_base_ee[index]
         for frame, pose in zip(_tool_frames(len(poses)), poses, strict=True):
-            self.add("/tf", "FrameTransform", _transform(frame, pose))
+            self.add("/tf", FrameTransform, _transform(frame, pose))
 
     def add_images(self, images: Mapping[tuple[str, str], np.ndarray], image_format: Literal["png", "jpeg"]) -> None:
         """By kind (image, robot_mask) and view."""
@@ -176,12 +173,7 @@ class _Messages:
             pixels = image.astype(np.uint8) * 255 if image.dtype == bool else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
             _, encoded = cv2.imencode(f".{image_format}", pixels, settings)
             message = {"frame_id": f"{view}_camera", "data": encoded.tobytes(), "format": image_format}
-            self.add(f"/{view}/{kind}", "CompressedImage", message)
-
-
-_PROTOBUF: dict[str, Any] = {
-    kind.DESCRIPTOR.name: kind for kind in (CompressedImage, CameraCalibration, FrameTransform, JointStates)
-}
+            self.add(f"/{view}/{kind}", CompressedImage, message)
 
 
 def _metadata(episode: Episode, views: list[str]) -> dict[str, str]:
@@ -238,47 +230,37 @@ def _joint_state(message: Message, header: Message) -> Message:
     return {"header": header, "name": names, "position": positions, "velocity": [], "effort": []}
 
 
-_ROS2: dict[_Schema, tuple[str, Callable[[Message, Message], Message]]] = {
-    "CompressedImage": ("sensor_msgs/CompressedImage", lambda message, header: {"header": header, **message}),
-    "CameraCalibration": ("sensor_msgs/CameraInfo", _camera_info),
-    "FrameTransform": ("tf2_msgs/TFMessage", _tf_message),
-    "JointStates": ("sensor_msgs/JointState", _joint_state),
+_ROS2: dict[type, tuple[str, Callable[[Message, Message], Message]]] = {
+    CompressedImage: ("sensor_msgs/CompressedImage", lambda message, header: {"header": header, **message}),
+    CameraCalibration: ("sensor_msgs/CameraInfo", _camera_info),
+    FrameTransform: ("tf2_msgs/TFMessage", _tf_message),
+    JointStates: ("sensor_msgs/JointState", _joint_state),
 }
 # Fields as ROS 2's common_interfaces and geometry2 define them, without their comments.
-_ROS2_FIELDS: dict[str, tuple[str, ...]] = {
-    "builtin_interfaces/Time": ("int32 sec", "uint32 nanosec"),
-    "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
-    "geometry_msgs/Vector3": ("float64 x", "float64 y", "float64 z"),
-    "geometry_msgs/Quaternion": ("float64 x 0", "float64 y 0", "float64 z 0", "float64 w 1"),
-    "geometry_msgs/Transform": ("geometry_msgs/Vector3 translation", "geometry_msgs/Quaternion rotation"),
-    "geometry_msgs/TransformStamped": (
-        "std_msgs/Header header", "string child_frame_id", "geometry_msgs/Transform transform",
-    ),
-    "sensor_msgs/RegionOfInterest": (
-        "uint32 x_offset", "uint32 y_offset", "uint32 height", "uint32 width", "bool do_rectify",
-    ),
-    "sensor_msgs/CompressedImage": ("std_msgs/Header header", "string format", "uint8[] data"),
-    "sensor_msgs/CameraInfo": (
-        "std_msgs/Header header", "uint32 height", "uint32 width", "string distortion_model", "float64[] d",
-        "float64[9] k", "float64[9] r", "float64[12] p", "uint32 binning_x", "uint32 binning_y",
-        "sensor_msgs/RegionOfInterest roi",
-    ),
-    "sensor_msgs/JointState": (
-        "std_msgs/Header header", "string[] name", "float64[] position", "float64[] velocity", "float64[] effort",
-    ),
-    "tf2_msgs/TFMessage": ("geometry_msgs/TransformStamped[] transforms",),
-}  # fmt: skip
+_ROS2_FIELDS = {
+    "builtin_interfaces/Time": "int32 sec, uint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp, string frame_id",
+    "geometry_msgs/Vector3": "float64 x, float64 y, float64 z",
+    "geometry_msgs/Quaternion": "float64 x 0, float64 y 0, float64 z 0, float64 w 1",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation, geometry_msgs/Quaternion rotation",
+    "geometry_msgs/TransformStamped": "std_msgs/Header header, string child_frame_id, geometry_msgs/Transform transform",
+    "sensor_msgs/RegionOfInterest": "uint32 x_offset, uint32 y_offset, uint32 height, uint32 width, bool do_rectify",
+    "sensor_msgs/CompressedImage": "std_msgs/Header header, string format, uint8[] data",
+    "sensor_msgs/CameraInfo": "std_msgs/Header header, uint32 height, uint32 width, string distortion_model, float64[] d, "
+    "float64[9] k, float64[9] r, float64[12] p, uint32 binning_x, uint32 binning_y, sensor_msgs/RegionOfInterest roi",
+    "sensor_msgs/JointState": "std_msgs/Header header, string[] name, float64[] position, float64[] velocity, float64[] effort",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+}
 
 
 def _definition(name: str) -> str:
     """Text of a message type: its own fields, then those of every type in them."""
     types = [name]
     for kind in types:  # grows
-        inner = [field.split()[0].split("[")[0] for field in _ROS2_FIELDS[kind]]
+        inner = [field.split()[0].removesuffix("[]") for field in _ROS2_FIELDS[kind].split(", ")]
         types += [found for found in dict.fromkeys(inner) if found in _ROS2_FIELDS and found not in types]
-    fields = ["\n".join(_ROS2_FIELDS[kind]) for kind in types]
-    others = zip(types[1:], fields[1:], strict=True)
-    return fields[0] + "".join(f"\n{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in others)
+    own, *others = (_ROS2_FIELDS[kind].replace(", ", "\n") for kind in types)
+    return own + "".join(f"\n{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in zip(types[1:], others, strict=True))
 
 
 def exported_episode_id(file: McapFile) -> str:
@@ -315,15 +297,19 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
     num_frames = int(about["num_frames"])
     video_frames = num_frames if about["video_frames"] is None else int(about["video_frames"])
     roles: dict[str, tuple[Kind, ...]] = {
-        "/joint_states": ("joints",),
-        "/joint_commands": ("joints",),
+        **dict.fromkeys(("/joint_states", "/joint_commands"), ("joints",)),
         **dict.fromkeys(("/tf", STATIC_TRANSFORMS), ("transforms",)),
         **dict.fromkeys((f"/{view}/calibration" for view in moving), ("calibration",)),
         **dict.fromkeys((f"/{view}/{kind}" for view in views for kind in ("image", "robot_mask")), IMAGE_KINDS),
     }
     streams = file.streams(roles)
-    joints = {name: _all_of(streams, f"/joint_{name}s", num_frames, file) for name in ("state", "command")}
-    images = {view: _all_of(streams, f"/{view}/image", video_frames, file) for view in views}
+
+    def all_of(topic: str, count: int) -> Stream:
+        found = len(streams[topic].log_ns) if topic in streams else 0
+        check_length("Messages", f"{file.path}, topic {topic}", states=max(count, 1), unit="messages", found=found)
+        return streams[topic]
+
+    joints = [all_of(topic, num_frames) for topic in ("/joint_states", "/joint_commands")]
     masks = {view: _track(file, streams[topic]) for view in views if (topic := f"/{view}/robot_mask") in streams}
     poses: dict[str, list[tuple[float, ...]]] = {}
     for stream in (streams[topic] for topic in ("/tf", STATIC_TRANSFORMS) if topic in streams):
@@ -333,25 +319,23 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
     cameras = RecordedCameras()
     for view in moving:
         topic = f"/{view}/calibration"
-        (calibration,) = _all_of(streams, topic, 1, file).values
+        (calibration,) = all_of(topic, 1).values
         camera_poses = _poses(poses, f"{view}_camera", num_frames if moving[view] else 1, file)
         add_camera(cameras, view, calibration, camera_poses, f"{file.path}, topic {topic}")
     tools = [_poses(poses, frame, num_frames, file) for frame in _tool_frames(int(about["num_arms"]))]
-    state, action = (
-        np.array([value.position for value in joints[name].values], dtype=ARRAYS["state"].dtype)
-        for name in ("state", "command")
-    )
+    state, action = (np.array([each.position for each in stream.values], ARRAYS["state"].dtype) for stream in joints)
     episode = Episode(
         **EpisodeDescription.arguments(about),
         state=state,
         action=action,
-        timestamps=np.array(joints["state"].log_ns, dtype=np.float64) / 1e9,
+        timestamps=np.array(joints[0].log_ns, dtype=np.float64) / 1e9,
         cameras=cameras.tracks,
         T_base_ee=np.stack(tools, axis=1) if tools else None,
         gripper=None if about["gripper"] is None else np.array(about["gripper"], dtype=ARRAYS["gripper"].dtype),
         video_frames=about["video_frames"],
     )
-    tracks = {view: _track(file, images[view], cameras.tracks.get(view)) for view in views}
+    images = {view: all_of(f"/{view}/image", video_frames) for view in views}
+    tracks = {view: _track(file, stream, cameras.tracks.get(view)) for view, stream in images.items()}
 
     def robot_masks(view: str) -> MadeFrames | None:
         if view not in masks:
@@ -366,12 +350,6 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
 def _tool_frames(num_arms: int) -> tuple[str, ...]:
     """Names of the tools' frames in the order of the arms; a single arm is the right one."""
     return ("left_tool", "right_tool")[-num_arms:] if num_arms else ()
-
-
-def _all_of(streams: Mapping[str, Stream], topic: str, count: int, file: McapFile) -> Stream:
-    found = len(streams[topic].log_ns) if topic in streams else 0
-    check_length("Messages", f"{file.path}, topic {topic}", states=max(count, 1), unit="messages", found=found)
-    return streams[topic]
 
 
 def _track(file: McapFile, stream: Stream, camera: CameraTrack | None = None) -> ImageTrack:

@@ -6,12 +6,12 @@ import re
 import struct
 import zlib
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain
-from typing import Any, BinaryIO, cast
+from typing import Any, cast
 
 import av
 import av.error
@@ -20,10 +20,10 @@ import numpy as np
 import zstandard
 from av.video.codeccontext import VideoCodecContext
 from mcap.exceptions import McapError
-from mcap.reader import McapReader, NonSeekingReader, SeekingReader
+from mcap.reader import FOOTER_SIZE, McapReader, NonSeekingReader, SeekingReader
 from mcap.records import Channel, Footer, Schema
 from mcap.records import Message as Record
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.summary import Summary
 
 from worldline_core.data.episodes.episode import CameraTrack
@@ -36,24 +36,14 @@ from worldline_core.data.guards.rejection import (
     unreadable,
 )
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
-from worldline_core.data.mcap.messages import (
-    IMAGE_KINDS,
-    VIDEO_CODECS,
-    EncodedImage,
-    Kind,
-    MessageDecoder,
-    RawImage,
-)
+from worldline_core.data.mcap.messages import IMAGE_KINDS, VIDEO_CODECS, EncodedImage, Kind, RawImage, decode
 from worldline_core.data.video.clip import Picture
 
 # What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
 _DAMAGE = (
     McapError, zstandard.ZstdError, EOFError, OSError, ValueError, RuntimeError, LookupError, struct.error, OverflowError,
 )  # fmt: skip
-_MAGIC = b"\x89MCAP0\r\n"
-_FOOTER_BYTES = 9 + 20
 _PNG = b"\x89PNG"
-_MAX_PARAMETER_SETS = 64
 # ROS and Foxglove name -> bytes per pixel, and OpenCV's conversion to RGB.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
@@ -86,10 +76,6 @@ class Stream:
     key_frames: list[bool] = field(default_factory=list)
     frame: str = ""
 
-    @property
-    def has_header(self) -> bool:
-        return bool(self.stamps_ns) and self.stamps_ns[0] is not None
-
 
 class McapFile:
     """Read access to one file, which is open only while it is read.
@@ -99,18 +85,21 @@ class McapFile:
 
     def __init__(self, path: AnyPath) -> None:
         self.path = path
-        self._decoder = MessageDecoder(path)
         _ = self._summary
 
     @cached_property
     def _summary(self) -> Summary | None:
         """None for a complete file without a summary, which is then read from its beginning."""
         with _reading(self.path), regular_file(self.path, "MCAP file").open("rb") as stream:
-            _check_format(stream, self.path)
-        with self._reader(indexed=True) as reader:
-            summary = reader.get_summary()
-            indexed = [] if summary is None else [index.chunk_start_offset for index in summary.chunk_indexes]
-            if len(set(indexed)) < len(indexed):
+            begins = stream.read(16)
+            for magic, (got, next_step) in _OTHER_FORMATS.items():
+                if begins.startswith(magic):
+                    what = "Recording is in another format"
+                    raise RejectedInputError("unreadable", what, where=self.path, got=got, next_step=next_step)
+            stream.seek(0)
+            summary = SeekingReader(stream, record_size_limit=MAX_CHUNK_BYTES).get_summary()
+            chunks = [] if summary is None else [index.chunk_start_offset for index in summary.chunk_indexes]
+            if len(set(chunks)) < len(chunks):
                 raise ValueError("an index that leads to one chunk twice")
             return summary
 
@@ -119,11 +108,9 @@ class McapFile:
         path = regular_file(self.path, "MCAP file")
         with _reading(self.path), path.open("rb") as stream:
             reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
-            (footer,) = deque(reader.records, maxlen=1)
-            if not isinstance(footer, Footer):
-                raise ValueError("no footer at the end")
-            end = path.stat().st_size - len(_MAGIC)
-            stream.seek(footer.summary_start or end - _FOOTER_BYTES)
+            footer = cast("Footer", deque(reader.records, maxlen=1)[0])  # with which the records end
+            end = path.stat().st_size - MAGIC_SIZE
+            stream.seek(footer.summary_start or end - FOOTER_SIZE)
             if footer.summary_crc not in (0, zlib.crc32(stream.read(end - 4 - stream.tell()))):
                 raise ValueError("a summary that does not fit its checksum")
 
@@ -155,12 +142,11 @@ class McapFile:
         return first
 
     def lacks_topics(self, missing: Collection[str]) -> RejectedInputError:
-        what, next_step = "MCAP file lacks a topic", "correct the topics in curate.sources[]"
-        expected = ", ".join(sorted(missing))
         got = ", ".join(f"{topic} ({schema})" for topic, schema in self.topics.items()) or "no topics"
         return RejectedInputError(
-            "missing_topic", what, where=self.path, expected=expected, got=got, next_step=next_step
-        )
+            "missing_topic", "MCAP file lacks a topic", where=self.path, expected=", ".join(sorted(missing)), got=got,
+            next_step="correct the topics in curate.sources[]",
+        )  # fmt: skip
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
@@ -171,14 +157,15 @@ class McapFile:
         """
         held: dict[str, list[bytes]] = {}
         for schema, channel, record in self._records(topics, start_ns, stop_ns):
-            kind, stamp_ns, value = self._decoder.decode(channel, schema, record.data)
+            where = f"{self.path}, topic {channel.topic}"
+            kind, stamp_ns, value = decode(channel, schema, record.data, where)
             if kind == "video":
-                value.check_video(f"{self.path}, topic {channel.topic}")
+                value.check_video(where)
                 sets = held.setdefault(channel.topic, [])
                 if value.picture is None:
-                    sets[:] = [*sets, *value.parameter_sets()][-_MAX_PARAMETER_SETS:]
+                    sets += value.parameter_sets()
                     continue
-                value = replace(value, data=b"".join([*sets, value.data])) if sets else value
+                value = replace(value, data=b"".join([*sets, value.data]))
                 sets.clear()
             yield channel.topic, kind, record.log_time, stamp_ns, value
 
@@ -210,24 +197,25 @@ class McapFile:
     def _records(
         self, topics: Collection[str] | None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[Schema | None, Channel, Record]]:
-        chosen = None if topics is None else list(topics)
         with self._reader() as reader:
+            read = partial(
+                reader.iter_messages, topics, log_time_order=False, starting_at=start_ns, ending_before=stop_ns
+            )
             summary = reader.get_summary() if isinstance(reader, SeekingReader) else None
-            chunks = [] if summary is None else summary.chunk_indexes
-            for chunk in chunks or [None]:
-                if summary is not None and chunk is not None:
-                    # One at a time: in the order of the file the reader unpacks all chunks before it gives the first
-                    # message, in the order of log times all that overlap.
-                    summary.chunk_indexes = [chunk]
-                yield from reader.iter_messages(
-                    chosen, log_time_order=False, starting_at=start_ns, ending_before=stop_ns
-                )
+            if summary is None:
+                yield from read()
+                return
+            # Chunk by chunk: in the order of the file the reader unpacks all of them before it gives the first
+            # message, in the order of log times all that overlap.
+            for chunk in summary.chunk_indexes:
+                summary.chunk_indexes = [chunk]
+                yield from read()
 
     @contextmanager
-    def _reader(self, *, indexed: bool | None = None) -> Iterator[McapReader]:
+    def _reader(self) -> Iterator[McapReader]:
         """A reader of the open file, by its index where the summary has one."""
-        if indexed is None:
-            indexed = self._summary is not None and bool(self._summary.chunk_indexes and self._summary.channels)
+        summary = self._summary
+        indexed = summary is not None and summary.chunk_indexes and summary.channels
         with _reading(self.path), regular_file(self.path, "MCAP file").open("rb") as stream:
             kind = SeekingReader if indexed else NonSeekingReader
             yield kind(stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
@@ -240,12 +228,8 @@ class SplitMcap(McapFile):
     """
 
     def __init__(self, folder: AnyPath, parts: Sequence[AnyPath]) -> None:
-        self.parts = [McapFile(part) for part in parts]
-        super().__init__(folder)
-
-    @property
-    def _summary(self) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """None: every part has its own."""
+        self.path = folder
+        self.parts = [McapFile(part) for part in parts]  # each with its own summary
 
     @cached_property
     def topics(self) -> dict[str, str]:
@@ -275,16 +259,6 @@ _OTHER_FORMATS = {
     b"#ROSBAG V": ("a bag of ROS 1", "convert it: rosbags-convert --src FILE.bag --dst FOLDER --dst-storage mcap"),
 }
 """First bytes of what is often recorded for MCAP: what it is, and how it becomes MCAP."""
-
-
-def _check_format(stream: BinaryIO, where: object) -> None:
-    begins = stream.read(16)
-    for magic, (got, next_step) in _OTHER_FORMATS.items():
-        if begins.startswith(magic):
-            what = "Recording is in another format"
-            raise RejectedInputError("unreadable", what, where=where, expected="MCAP", got=got, next_step=next_step)
-    if not begins.startswith(_MAGIC):
-        raise ValueError("another beginning than that of an MCAP file")
 
 
 # Images: read in order of time, each decoded only when an instant needs it.
@@ -318,15 +292,19 @@ class ImageTrack:
         """(n,) log times in order of time: of a video with B-frames in another order, that of decoding."""
         return np.array(self.stream.log_ns, np.int64)[self.order]
 
+    @property
+    def where(self) -> str:
+        return f"{self.file.path}, topic {self.stream.topic}"
+
     def frames(self) -> Iterator[np.ndarray]:
         """uint8 (H, W, 3) RGB of each frame, in order; any fault is a RejectedInputError."""
-        where = f"{self.file.path}, topic {self.stream.topic}"
-        decoded = self._video(where) if self.stream.kind == "video" else self._images(where)
+        where = self.where
+        decoded = self._video() if self.stream.kind == "video" else self._images()
         number, image = next(decoded)
-        shape = image.shape
-        if self.camera is not None and shape[:2] != (self.camera.height, self.camera.width):
-            what, where = "Calibration belongs to another image size", f"{where}, view {self.camera.view}"
-            expected, got = f"{shape[1]}x{shape[0]}", f"{self.camera.width}x{self.camera.height}"
+        shape, camera = image.shape, self.camera
+        if camera is not None and shape[:2] != (camera.height, camera.width):
+            what, where = "Calibration belongs to another image size", f"{where}, view {camera.view}"
+            expected, got = f"{shape[1]}x{shape[0]}", f"{camera.width}x{camera.height}"
             raise RejectedInputError("missing_calibration", what, where=where, expected=expected, got=got)
         for wanted in self.chosen:
             while number < wanted:
@@ -336,50 +314,70 @@ class ImageTrack:
                 raise RejectedInputError("unreadable", what, where=where, expected=shape[:2], got=image.shape[:2])
             yield image
 
-    def _images(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
+    def _images(self) -> Iterator[tuple[int, np.ndarray]]:
         numbers = np.unique(self.chosen)
         for number, value in zip(numbers.tolist(), self._messages(self.order[numbers]), strict=True):
-            place = f"{where}, image {number}"
+            place = f"{self.where}, image {number}"
             raw = isinstance(value, RawImage)
             yield number, _raw_pixels(value, place) if raw else _still(value, place, self.camera is not None)
 
-    def _video(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
+    def _video(self) -> Iterator[tuple[int, np.ndarray]]:
         """Frames from the last key frame before the first chosen one on, in order of time; none may be missing.
 
         Messages are decoded in the order in which they were logged, and each picture has the number of its message.
         """
-        keys, log_ns = np.flatnonzero(self.key_frames[: self.chosen[0] + 1]), self.log_ns
+        keys = np.flatnonzero(self.key_frames[: self.chosen[0] + 1])
         if not len(keys):
             what = "No key frame comes before the first frame of the episode"
-            raise RejectedInputError("truncated_video", what, where=where, next_step="begin the episode later")
+            raise RejectedInputError("truncated_video", what, where=self.where, next_step="begin the episode later")
         first, last = int(keys[-1]), int(self.chosen[-1])
-        logged = np.lexsort((self.order, log_ns))
-        place = np.empty_like(logged)
-        place[logged] = np.arange(len(logged))
-        numbers = logged[place[first] : place[first : last + 1].max() + 1]
-        packets = zip(numbers.tolist(), self._messages(self.order[numbers]), strict=True)
-        earlier_sets = partial(self._parameter_sets, int(log_ns[first]))
-        pictures = _decoded(packets, earlier_sets, where, calibrated=self.camera is not None)
+        logged = np.lexsort((self.order, self.log_ns))
+        place = np.argsort(logged)
         expected, previous = first, -1
-        for number, image in pictures:
-            # Before the first: pictures that lean on an earlier key frame; after the last: what is shown later.
-            if first <= number <= last and number == expected > previous:
+        for number, image in self._decoded(logged[place[first] : place[first : last + 1].max() + 1]):
+            if number <= previous:
+                raise RejectedInputError(
+                    "clock_skew", "Pictures of a video come in another order than their times", where=self.where,
+                    expected="times of presentation in the headers of a video with B-frames",
+                    got=f"frame {number} is shown after frame {previous}",
+                    next_step="set time: header; or encode the video without B-frames",
+                )  # fmt: skip
+            previous = number
+            # Others lean on an earlier key frame, are shown after the last, or come after one that is lost.
+            if number == expected <= last:
                 expected += 1
                 yield number, image
-            elif first <= number <= last or number < previous:
-                if number > previous and all(other != expected for other, _ in pictures):
-                    break
-                raise RejectedInputError(
-                    "clock_skew",
-                    "Pictures of a video come in another order than their times",
-                    where=f"{where}, frame {number}",
-                    expected="times of presentation in the headers of a video with B-frames",
-                    got=f"frame {expected} is shown after frame {max(number, previous)}",
-                    next_step="set time: header; or encode the video without B-frames",
-                )
-            previous = number
         if expected <= last:
-            raise _lost_frame(f"{where}, frame {expected}")
+            what, where = "Video frames are missing or damaged", f"{self.where}, frame {expected}"
+            raise RejectedInputError("truncated_video", what, where=where, next_step="cut the recording at the damage")
+
+    def _decoded(self, numbers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+        """(number, RGB) of these messages, each one frame in Annex B, in the order in which they are shown; up to a damaged one."""
+        messages = self._messages(self.order[numbers])
+        first: EncodedImage = next(messages)
+        decoder = cast("VideoCodecContext", VideoCodecContext.create(VIDEO_CODECS[first.format], "r"))
+        decoder.thread_type = "NONE"
+        sets = b"" if first.parameter_sets() else self._parameter_sets(int(self.log_ns[numbers[0]]))
+
+        def shown() -> Iterator[av.VideoFrame]:
+            for place, (number, image) in enumerate(zip(numbers.tolist(), chain([first], messages), strict=True)):
+                packet = av.Packet(image.data if place else sets + image.data)
+                packet.pts, packet.dts = number, place
+                yield from decoder.decode(packet)
+            yield from decoder.decode(None)
+
+        try:
+            for frame in shown():
+                check_image_size(frame.width, frame.height, self.where)
+                if frame.is_corrupt or frame.pts is None:
+                    return
+                picture = Picture(frame, self.where)
+                if self.camera is not None and picture.orientation != UPRIGHT:
+                    raise turned_view(self.where, picture.orientation)
+                yield frame.pts, picture.rgb
+        except av.error.FFmpegError as error:
+            what = "Video cannot be decoded"
+            raise RejectedInputError("truncated_video", what, where=self.where, got=str(error)) from error
 
     def _parameter_sets(self, log_ns: int) -> bytes:
         """Those of the file up to a log time, the last ones last."""
@@ -388,8 +386,6 @@ class ImageTrack:
             for unit in value.parameter_sets():
                 found.pop(unit, None)
                 found[unit] = None
-                if len(found) > _MAX_PARAMETER_SETS:
-                    del found[next(iter(found))]
         return b"".join(found)
 
     def _messages(self, wanted: np.ndarray) -> Iterator[Any]:
@@ -406,8 +402,7 @@ class ImageTrack:
             if done == len(indices):
                 return
         what = "File holds fewer images than when it was first read"
-        where = f"{self.file.path}, topic {self.stream.topic}"
-        raise RejectedInputError("changed_while_reading", what, where=where, expected=len(indices), got=done)
+        raise RejectedInputError("changed_while_reading", what, where=self.where, expected=len(indices), got=done)
 
 
 def frames_after_loss(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray, log_ns: np.ndarray) -> np.ndarray:
@@ -423,48 +418,6 @@ def frames_after_loss(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarr
     last_loss = np.maximum.accumulate(np.where(lost, np.arange(len(lost)), -1))
     last_key = np.maximum.accumulate(np.where(key_frames, np.arange(len(lost)), -1))
     return last_loss > last_key
-
-
-def _decoded(
-    messages: Iterator[tuple[int, EncodedImage]],
-    earlier_sets: Callable[[], bytes],
-    where: str,
-    *,
-    calibrated: bool = False,
-) -> Iterator[tuple[int, np.ndarray]]:
-    """(number, RGB) of video messages (at least one), each one frame in Annex B, in the order in which they are shown.
-
-    Args:
-        earlier_sets: parameter sets from before the first message, asked for where it has none.
-    """
-    first = next(messages)
-    decoder = cast("VideoCodecContext", VideoCodecContext.create(VIDEO_CODECS[first[1].format], "r"))
-    decoder.thread_type = "NONE"
-    sets = b"" if first[1].parameter_sets() else earlier_sets()
-
-    def packets() -> Iterator[av.Packet | None]:
-        for place, (number, image) in enumerate(chain([first], messages)):
-            packet = av.Packet(image.data if place else sets + image.data)
-            packet.pts, packet.dts = number, place
-            yield packet
-        yield None  # what the decoder still holds
-
-    try:
-        for frame in (frame for packet in packets() for frame in decoder.decode(packet)):
-            check_image_size(frame.width, frame.height, where)
-            if frame.is_corrupt or frame.pts is None:
-                raise _lost_frame(f"{where}, frame {frame.pts}")
-            picture = Picture(frame, where)
-            if calibrated and picture.orientation != UPRIGHT:
-                raise turned_view(where, picture.orientation)
-            yield int(frame.pts), picture.rgb
-    except av.error.FFmpegError as error:
-        raise RejectedInputError("truncated_video", "Video cannot be decoded", where=where, got=str(error)) from error
-
-
-def _lost_frame(where: str) -> RejectedInputError:
-    what, next_step = "Video frames are missing or damaged", "cut the recording at the damage"
-    return RejectedInputError("truncated_video", what, where=where, next_step=next_step)
 
 
 def _still(image: EncodedImage, where: str, calibrated: bool) -> np.ndarray:

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from io import StringIO
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -33,35 +33,25 @@ _EMPTY_ARRAY = re.compile(rb"\[\s*0+\s*\]")
 Kind = Literal["image", "video", "raw_image", "calibration", "joints", "numbers", "transforms", "pose", "marker"]
 IMAGE_KINDS: tuple[Kind, ...] = ("image", "video", "raw_image")
 
-SCHEMA_KINDS: dict[str, Kind] = {
-    "sensor_msgs/CompressedImage": "image",
-    "sensor_msgs/Image": "raw_image",
-    "sensor_msgs/CameraInfo": "calibration",
-    "sensor_msgs/JointState": "joints",
-    "tf2_msgs/TFMessage": "transforms",
-    "geometry_msgs/TransformStamped": "transforms",
-    "geometry_msgs/PoseStamped": "pose",
-    "std_msgs/Float64MultiArray": "numbers",
-    "std_msgs/Float32MultiArray": "numbers",
-    "std_msgs/Float64": "numbers",
-    "std_msgs/Float32": "numbers",
-    "std_msgs/String": "marker",
-    "std_msgs/Bool": "marker",
-    "foxglove.CompressedImage": "image",
-    "foxglove.CompressedVideo": "video",
-    "foxglove.RawImage": "raw_image",
-    "foxglove.CameraCalibration": "calibration",
-    "foxglove.FrameTransform": "transforms",
-    "foxglove.FrameTransforms": "transforms",
-    "foxglove.PoseInFrame": "pose",
-    "foxglove.JointStates": "joints",
-}
-"""Schemas that can be read, by the names that `schema_kind` compares."""
+_SCHEMAS: dict[Kind, tuple[str, ...]] = {
+    "image": ("sensor_msgs/CompressedImage", "foxglove.CompressedImage"),
+    "video": ("foxglove.CompressedVideo",),
+    "raw_image": ("sensor_msgs/Image", "foxglove.RawImage"),
+    "calibration": ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"),
+    "joints": ("sensor_msgs/JointState", "foxglove.JointStates"),
+    "numbers": ("std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray", "std_msgs/Float64", "std_msgs/Float32"),
+    "transforms": (
+        "tf2_msgs/TFMessage", "geometry_msgs/TransformStamped", "foxglove.FrameTransform", "foxglove.FrameTransforms",
+    ),
+    "pose": ("geometry_msgs/PoseStamped", "foxglove.PoseInFrame"),
+    "marker": ("std_msgs/String", "std_msgs/Bool"),
+}  # fmt: skip
+_KINDS: dict[str, Kind] = {schema: kind for kind, schemas in _SCHEMAS.items() for schema in schemas}
 
 
 def schema_kind(name: str) -> Kind | None:
     """Kind of the messages of `sensor_msgs/msg/Image`, `foxglove_msgs/msg/RawImage`, ...; None for a schema that is not read."""
-    return SCHEMA_KINDS.get(name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove."))
+    return _KINDS.get(name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove."))
 
 
 VIDEO_CODECS = {"h264": "h264", "h265": "hevc"}
@@ -104,16 +94,13 @@ class EncodedImage:
 
     def check_video(self, where: str) -> None:
         """Raises: RejectedInputError (unknown_schema) for another codec than H.264 and H.265, or another form than Annex B."""
+        refused = partial(RejectedInputError, "unknown_schema", where=where)
         if self.format not in VIDEO_CODECS:
-            what, expected = "Video codec is not supported", " or ".join(VIDEO_CODECS)
-            raise RejectedInputError("unknown_schema", what, where=where, expected=expected, got=self.format)
+            raise refused("Video codec is not supported", expected=" or ".join(VIDEO_CODECS), got=self.format)
         if not re.match(rb"\x00\x00+\x01", self.data):
-            what, expected = "Video messages are not in Annex B", "a start code (00 00 00 01) before every NAL unit"
             got = f"{self.data[:8].hex(' ')}, in AVCC the length of the unit"
             next_step = "write the packets through FFmpeg's bitstream filter h264_mp4toannexb or hevc_mp4toannexb"
-            raise RejectedInputError(
-                "unknown_schema", what, where=where, expected=expected, got=got, next_step=next_step
-            )
+            raise refused("Video messages are not in Annex B", expected="00 00 01", got=got, next_step=next_step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,12 +201,10 @@ def _pose_values(position: Any, orientation: Any) -> tuple[float, ...]:
 
 
 def _transform(raw: Any) -> Transform:
-    if hasattr(raw, "header"):  # geometry_msgs/TransformStamped
-        inner, stamp, parent = raw.transform, raw.header.stamp, raw.header.frame_id
-    else:
-        inner, stamp, parent = raw, raw.timestamp, raw.parent_frame_id
+    # geometry_msgs/TransformStamped, or foxglove.FrameTransform
+    inner, parent = (raw.transform, _frame(raw)) if hasattr(raw, "header") else (raw, str(raw.parent_frame_id))
     values = _pose_values(inner.translation, inner.rotation)
-    return Transform(str(parent).lstrip("/"), str(raw.child_frame_id).lstrip("/"), _nanoseconds(stamp), values)
+    return Transform(parent.lstrip("/"), str(raw.child_frame_id).lstrip("/"), _header_time(raw) or 0, values)
 
 
 def _pose(raw: Any) -> Transform:
@@ -248,71 +233,57 @@ def _as_object(value: Any) -> Any:
     return [_as_object(item) for item in value] if isinstance(value, list) else value
 
 
-# What the decoders raise for bytes that are not of their schema; the ROS 2 parser raises plain subclasses of these.
+# What the decoders and the parser of ROS 2 definitions raise for bytes and texts that are none of theirs.
 _FAULTS = (
     McapError, DecodeError, ValueError, TypeError, LookupError, AttributeError, EOFError, RuntimeError, struct.error,
+    InvalidSpecification, InvalidValue, NameError, AssertionError,
 )  # fmt: skip
-# What the ROS 2 parser raises beyond that for texts that are no definitions.
-_SCHEMA_FAULTS = (InvalidSpecification, InvalidValue, NameError, AssertionError)
 
 
-class MessageDecoder:
-    """Decodes the messages of one file's channels."""
+def decode(channel: Channel, schema: Schema | None, data: bytes, where: str) -> tuple[Kind, int | None, Any]:
+    """Kind of a message, its header time [ns] (None where the schema has none), and its content.
 
-    def __init__(self, where: object) -> None:
-        self._where = where
-        self._channels: dict[tuple[object, ...], tuple[Kind, Callable[[bytes], Any]]] = {}
-
-    def decode(self, channel: Channel, schema: Schema | None, data: bytes) -> tuple[Kind, int | None, Any]:
-        """Kind of a message, its header time [ns] (None where the schema has none), and its content."""
-        # Numbers of channels and schemas mean something within one file of a split recording only.
-        key = channel.topic, channel.message_encoding, *(() if schema is None else (schema.name, schema.data))
-        if key not in self._channels:
-            self._channels[key] = self._channel(channel, schema)
-        kind, decode = self._channels[key]
-        try:
-            raw = decode(data)
-            stamp_ns, value = _header_time(raw), _READERS[kind](raw)
-        except _FAULTS as error:
-            what, where = "Message cannot be decoded", f"{self._where}, topic {channel.topic}"
-            raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200]) from error
-        if kind in ("joints", "numbers"):
-            columns = len(value.names if isinstance(value, Joints) else value)
-            check_columns(columns, f"{self._where}, topic {channel.topic}")
-        return kind, stamp_ns, value
-
-    def _channel(self, channel: Channel, schema: Schema | None) -> tuple[Kind, Callable[[bytes], Any]]:
-        encoding, where = channel.message_encoding, f"{self._where}, topic {channel.topic}"
-        name, defined = ("no schema", "no schema") if schema is None else (schema.name or "no schema", schema.encoding)
-        kind = schema_kind(name)
-        decode = None if kind is None or schema is None else _decoder(encoding, schema, where)
-        if kind is None or decode is None:
-            raise RejectedInputError(
-                "unknown_schema",
-                "Messages of this schema are not understood",
-                where=where,
-                expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(SCHEMA_KINDS),
-                got=f"{name} ({encoding or 'no encoding'}, {defined})",
-                next_step="name another topic, or convert the recording",
-            )
-        return kind, decode
-
-
-def _decoder(encoding: str, schema: Schema, where: str) -> Callable[[bytes], Any] | None:
-    """Decoder of a channel's messages into objects; None where the schema's encoding does not belong to that of the channel."""
-    if encoding == "json":
-        return lambda data: _as_object(parse_json(data, where))
-    if encoding in ("cdr", "protobuf") and not schema.data.strip():
-        what, got = "The file holds no definition of its messages", f"an empty definition of {schema.name}"
-        next_step = "record where the message's package is installed, or write the bag again there: ros2 bag convert"
-        raise RejectedInputError("unknown_schema", what, where=where, got=got, next_step=next_step)
-    if schema.encoding == "ros2msg" and _EMPTY_ARRAY.search(schema.data):
-        what = "Schema definition has arrays of length 0, which no message needs"
-        raise RejectedInputError("unknown_schema", what, where=where, got=schema.name)
-    factory = Ros2DecoderFactory() if encoding == "cdr" else ProtobufDecoderFactory()
+    Raises: RejectedInputError: unknown_schema, unreadable, too_large.
+    """
+    # Numbers of channels and schemas mean something within one file of a split recording only.
+    defined = None if schema is None else (schema.name, schema.encoding, schema.data)
+    kind, decoded = _decoder(channel.message_encoding, defined, where)
     try:
-        with redirect_stderr(StringIO()):  # the ROS 2 parser prints the line at fault as it is
-            return factory.decoder_for(encoding, schema)
-    except (*_FAULTS, *_SCHEMA_FAULTS) as error:
-        what = "Schema definition cannot be read"
-        raise RejectedInputError("unknown_schema", what, where=where, got=repr(error)[:200]) from error
+        raw = decoded(data)
+        stamp_ns, value = _header_time(raw), _READERS[kind](raw)
+    except _FAULTS as error:
+        what = "Message cannot be decoded"
+        raise RejectedInputError("unreadable", what, where=where, got=repr(error)[:200]) from error
+    if kind in ("joints", "numbers"):
+        check_columns(len(value.names if isinstance(value, Joints) else value), where)
+    return kind, stamp_ns, value
+
+
+@lru_cache(maxsize=256)
+def _decoder(encoding: str, defined: tuple[str, str, bytes] | None, where: str) -> tuple[Kind, Callable[[bytes], Any]]:
+    """Kind of a channel's messages, and what decodes them into objects; `defined`: name, encoding and text of the schema."""
+    refused = partial(RejectedInputError, "unknown_schema", where=where)
+    name, language, text = defined or ("", "no schema", b"")
+    kind = schema_kind(name)
+    if kind is not None:
+        if encoding == "json":
+            return kind, lambda data: _as_object(parse_json(data, where))
+        if encoding in ("cdr", "protobuf") and not text.strip():
+            next_step = "record where the message's package is installed, or there: ros2 bag convert"
+            raise refused("The file holds no definition of its messages", got=name, next_step=next_step)
+        if language == "ros2msg" and _EMPTY_ARRAY.search(text):
+            raise refused("Schema definition has arrays of length 0, which no message needs", got=name)
+        factory = Ros2DecoderFactory() if encoding == "cdr" else ProtobufDecoderFactory()
+        try:
+            with redirect_stderr(StringIO()):  # the ROS 2 parser prints the line at fault as it is
+                decoded = factory.decoder_for(encoding, Schema(1, text, language, name))
+        except _FAULTS as error:
+            raise refused("Schema definition cannot be read", got=repr(error)[:200]) from error
+        if decoded is not None:
+            return kind, decoded
+    raise refused(
+        "Messages of this schema are not understood",
+        expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(_KINDS),
+        got=f"{name or 'no schema'} ({encoding or 'no encoding'}, {language})",
+        next_step="name another topic, or convert the recording",
+    )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import REPEATS_STATE, CameraTrack, Episode, Outcome
+from worldline_core.data.episodes.episode import REPEATS_STATE, Episode, Outcome
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -108,52 +108,49 @@ class _Recording:
 
     def _read_streams(self) -> dict[str, Stream]:
         """Every topic that the episode needs; a missing transform is reported where a pose needs it."""
-
-        def is_silent(topics: Collection[str]) -> RejectedInputError:
-            what, expected = "A topic has no messages during the episode", ", ".join(sorted(topics))
-            return RejectedInputError("missing_topic", what, where=self.file.path, expected=expected)
-
         topics = self.config.topics
-        self._leave_out_views(
-            {t for role in _KINDS for t in topics[role]} - set(self.file.topics), self.file.lacks_topics
-        )
+        self._leave_out_views({topic for role in _KINDS for topic in topics[role]} - set(self.file.topics))
         topics = self.config.topics
         roles = {topic: kinds for role, kinds in _KINDS.items() for topic in sorted(topics[role])}
         needed = set(roles) - topics["calibrations"]
         roles |= {topic: ("transforms",) for topic in self.config.transforms if topic in self.file.topics}
         streams = self.file.streams(roles, *self.around_ns)
-        self._leave_out_views(needed - set(streams), is_silent)
+        self._leave_out_views(needed - set(streams))
         return streams
 
-    def _leave_out_views(self, missing: set[str], fault: Callable[[Collection[str]], RejectedInputError]) -> None:
-        """Go on without the views whose images are missing. Raises: the fault of all, where anything else is missing."""
-        views = self.config.views
-        gone = {view: each for view, each in views.items() if each.image in missing}
-        kept = {view: each for view, each in views.items() if view not in gone}
-        primary = self.config.primary_view
-        config = self.config.model_copy(update={"views": kept, "primary_view": primary if primary in kept else None})
-        if missing and (not kept or any(missing & topics for topics in config.topics.values())):
+    def _leave_out_views(self, missing: set[str]) -> None:
+        """Go on without the views whose images are missing.
+
+        Raises: RejectedInputError (missing_topic) for all that is missing, where that is not only images.
+        """
+
+        def fault(topics: set[str]) -> RejectedInputError:
+            if not topics <= set(self.file.topics):
+                return self.file.lacks_topics(topics)
+            what, expected = "A topic has no messages during the episode", ", ".join(sorted(topics))
+            return RejectedInputError("missing_topic", what, where=self.file.path, expected=expected)
+
+        config = self.config
+        kept = {view: each for view, each in config.views.items() if each.image not in missing}
+        primary = config.primary_view if config.primary_view in kept else None
+        self.config = config.model_copy(update={"views": kept, "primary_view": primary})
+        if missing and (not kept or any(missing & topics for topics in self.config.topics.values())):
             raise fault(missing)
-        self.absent |= {view: fault([each.image]) for view, each in gone.items()}
-        self.config = config
+        self.absent |= {view: fault({each.image}) for view, each in config.views.items() if view not in kept}
 
     def _signal(self, readings: TopicReadings) -> _Signal:
         """The declared numbers of a topic; messages with other joints (several drivers may share it) are left out."""
-        stream = self.streams[readings.topic]
+        stream, wanted = self.streams[readings.topic], readings.names or readings.columns or ()
         taken: list[int] = []
         rows: list[list[float]] = []
         for number, value in enumerate(stream.values):
-            columns, numbers = readings.columns or (), value
-            if isinstance(value, Joints):
-                known = set(readings.names or ()) <= set(value.names)
-                columns = [value.names.index(name) for name in readings.names or () if known]
-                numbers = value.position
-            if columns and max(columns) < len(numbers):
+            named = isinstance(value, Joints)
+            known = dict(zip(value.names, value.position, strict=False) if named else enumerate(value))
+            if known.keys() >= set(wanted):
                 taken.append(number)
-                rows.append([numbers[column] for column in columns])
+                rows.append([known[each] for each in wanted])
         if not rows:
-            what = "No message of a topic has the declared joints or columns"
-            expected = ", ".join(readings.names or map(str, readings.columns or ()))
+            what, expected = "No message of a topic has the declared joints or columns", ", ".join(map(str, wanted))
             got = ", ".join(sorted({name for v in stream.values for name in getattr(v, "names", ())})) or "an array"
             raise RejectedInputError("missing_column", what, where=self.at(stream.topic), expected=expected, got=got)
         times = self.times_ns[stream.topic][taken]
@@ -171,14 +168,11 @@ class _Recording:
 
     def _calibration(self, topic: str) -> Calibration:
         """The calibration around the episode, or in the whole file where it was sent only once."""
-        if topic in self.streams:
-            values = self.streams[topic].values
-        else:
-            values = [value for _, kind, _, _, value in self.file.messages([topic]) if kind == "calibration"]
-        if not values:
+        stream = self.streams.get(topic) or self.file.streams({topic: _KINDS["calibrations"]}).get(topic)
+        if stream is None:
             raise RejectedInputError("missing_calibration", "Calibration topic has no messages", where=self.at(topic))
-        first = values[0]
-        different = next((value for value in values if value != first), None)
+        first = stream.values[0]
+        different = next((value for value in stream.values if value != first), None)
         if different is not None:
             what = "Calibration changes during the recording: a zoom, or two cameras on one topic"
             raise RejectedInputError("changing_calibration", what, where=self.at(topic), expected=first, got=different)
@@ -193,10 +187,9 @@ class _Recording:
         """
         config = self.config
 
-        def read_static(topics: Iterable[str], stop_ns: int | None) -> TransformTree:
+        def read_static(topics: Collection[str], stop_ns: int | None) -> TransformTree:
             tree = TransformTree(self.file.path, config.max_gap_s)
-            present = [topic for topic in topics if topic in self.file.topics]
-            for _, _, log_ns, _, transforms in self.file.messages(present, None, stop_ns) if present else ():
+            for _, _, log_ns, _, transforms in self.file.messages(topics, None, stop_ns):
                 tree.add(transforms, [log_ns] * len(transforms), static=True)
             return tree
 
@@ -215,7 +208,7 @@ class _Recording:
     def grid(self) -> np.ndarray:
         """(t,) instants [ns]: from the first image of the primary view after all topics have begun, until the first ends."""
         config = self.config
-        # Gaps between images are judged in `chosen_images`, by the distance of instants from the nearest image.
+        # Gaps between images are judged in `track`, by the distance of instants from the nearest image.
         topics = [(config.views[view].image, times, float("inf")) for view, (times, _) in self.images.items()]
         topics += [(readings.topic, times, config.max_gap_s) for readings, (times, _) in self.signals.items()]
         topics += [(topic, times, config.max_gap_s) for topic, ((times, _), _) in self.tools.items()]
@@ -237,46 +230,37 @@ class _Recording:
             raise RejectedInputError("too_short", what, where=self.file.path, got=got, next_step=next_step)
         return grid
 
-    def chosen_images(self, view: str, grid: np.ndarray) -> np.ndarray:
-        """(t,) the nearest image of each instant."""
-        config, (times, _) = self.config, self.images[view]
-        where = self.at(config.views[view].image)
-        if (step_ns := median_step_ns(times)) * config.fps > 1.25e9:
-            what, next_step = "Camera is slower than the wanted rate", "lower the source's fps"
-            expected, got = f"{config.fps} fps", f"{1e9 / step_ns:.2f} fps"
+    def track(self, view: str, grid: np.ndarray) -> ImageTrack:
+        """The nearest image of each instant, none of which is a video frame that depends on a lost message."""
+        config, (times, order) = self.config, self.images[view]
+        stream, fps, step_ns = self.streams[config.views[view].image], config.fps, median_step_ns(times)
+        where = self.at(stream.topic)
+        if step_ns * fps > 1.25e9:
             raise RejectedInputError(
-                "wrong_fps", what, where=where, expected=expected, got=got, next_step=next_step,
+                "wrong_fps", "Camera is slower than the wanted rate", where=where, expected=f"{fps} fps",
+                got=f"{1e9 / step_ns:.2f} fps", next_step="lower the source's fps",
                 evidence={"measured_fps": 1e9 / step_ns},
             )  # fmt: skip
         chosen = nearest(times, grid)
-        distance = np.abs(times[chosen] - grid) * config.fps / 1e9
-        if distance.max() > config.max_image_distance_frames:
-            at_s = float((grid[int(np.argmax(distance))] - grid[0]) / 1e9)
-            expected = f"an image within {config.max_image_distance_frames} frames of every instant"
-            got, evidence = (
-                f"{distance.max():.2f} frames at {at_s:.3f} s",
-                {"gap_s": float(2 * distance.max() / config.fps)},
-            )
+        distance = np.abs(times[chosen] - grid) * fps / 1e9
+        furthest, at_s = float(distance.max()), float((grid[np.argmax(distance)] - grid[0]) / 1e9)
+        if furthest > config.max_image_distance_frames:
             raise RejectedInputError(
-                "time_gap", "Images are missing", where=where, expected=expected, got=got, evidence=evidence
-            )
-        return chosen
-
-    def track(self, view: str, chosen: np.ndarray, camera: CameraTrack | None) -> ImageTrack:
-        """The chosen images, none of which is a video frame that depends on a lost message."""
-        stream, (times, order) = self.streams[self.config.views[view].image], self.images[view]
-        track = ImageTrack(self.file, stream, order, chosen, self.around_ns, camera)
+                "time_gap", "Images are missing", where=where, got=f"{furthest:.2f} frames at {at_s:.3f} s",
+                expected=f"an image within {config.max_image_distance_frames} frames of every instant",
+                evidence={"gap_s": 2 * furthest / fps},
+            )  # fmt: skip
+        track = ImageTrack(self.file, stream, order, chosen, self.around_ns)
         if stream.kind == "video":
-            spoiled = frames_after_loss(times, median_step_ns(times), track.key_frames, track.log_ns)[chosen]
+            spoiled = frames_after_loss(times, step_ns, track.key_frames, track.log_ns)[chosen]
             if spoiled.any():
                 first, count = int(np.argmax(spoiled)), int(spoiled.sum())
-                what, next_step = "Video frames depend on a message that is missing", "cut the recording at the gap"
-                where = f"{self.at(stream.topic)}, frame {first}"
-                got = f"{count} of {len(chosen)} frames after a gap, before the next key frame"
-                evidence = {"first_frame": first, "frames": count}
                 raise RejectedInputError(
-                    "truncated_video", what, where=where, got=got, next_step=next_step, evidence=evidence
-                )
+                    "truncated_video", "Video frames depend on a message that is missing",
+                    where=f"{where}, frame {first}", next_step="cut the recording at the gap",
+                    got=f"{count} of {len(chosen)} frames after a gap, before the next key frame",
+                    evidence={"first_frame": first, "frames": count},
+                )  # fmt: skip
         return track
 
     def _check_values(self, arm: ArmReadings, grid: np.ndarray, share: float) -> None:
@@ -289,12 +273,9 @@ class _Recording:
             finite: np.ndarray = np.all(np.isfinite(values), axis=1)
             if not finite.all():
                 at_s = float((times[np.argmin(finite)] - grid[0]) / 1e9)
-                what = "Readings of a topic are not finite"
-                expected = "finite numbers between the episode's beginning and end"
+                what, evidence = "Readings of a topic are not finite", {"at_s": at_s}
                 got = f"{int((~finite).sum())} of {len(finite)} messages, the first at {at_s:.3f} s"
-                raise RejectedInputError(
-                    "nan_state", what, where=where, expected=expected, got=got, evidence={"at_s": at_s}
-                )
+                raise RejectedInputError("nan_state", what, where=where, got=got, evidence=evidence)
             if readings is arm.gripper:  # which may be switched: it has no speed
                 check_alternation(times, arm.gripper.range.opening(values)[0], where)
                 continue
@@ -341,7 +322,7 @@ def read_topics_episode(
     recording = _Recording(config, file, segment)
     config, unknown = recording.config, recording.uncalibrated
     grid = recording.grid()
-    chosen = {view: recording.chosen_images(view, grid) for view in config.views}
+    tracks = {view: recording.track(view, grid) for view in config.views}
     cameras = RecordedCameras()
     for view, frame in recording.camera_frames.items():
         topics = config.views[view]
@@ -386,8 +367,6 @@ def read_topics_episode(
             **cameras.notes(),
         },
     )
-    tracks = {view: recording.track(view, chosen[view], cameras.tracks.get(view)) for view in config.views}
-    views, lenses = tuple(config.views), cameras.lenses
-    return LoadedEpisode(
-        episode, views, lambda view: tracks[view].frames(), distortions=lenses, absent=recording.absent
-    )
+    tracks = {view: replace(track, camera=cameras.tracks.get(view)) for view, track in tracks.items()}
+    views, lenses, absent = tuple(tracks), cameras.lenses, recording.absent
+    return LoadedEpisode(episode, views, lambda view: tracks[view].frames(), distortions=lenses, absent=absent)

@@ -47,22 +47,25 @@ def times_by_topic(
     log_ns = {topic: np.array(stream.log_ns, np.int64) for topic, stream in streams.items()}
     if config.time == "log":
         return log_ns, 0
+    refused = partial(RejectedInputError, "clock_skew")
     # A simulated clock is 0 once, a driver that sets none writes 0 always.
     unset = {topic: count for topic, stream in streams.items() if (count := _without_time(stream)) > 1}
     if unset:
-        where = f"{where}, topic {', '.join(unset)}"
         got = ", ".join(f"0 in {count} of {len(log_ns[topic])}" for topic, count in unset.items())
-        what, next_step = "Messages have no header time", "set time: log"
-        raise RejectedInputError("clock_skew", what, where=where, got=got, next_step=next_step)
-    headed = [topic for topic, stream in streams.items() if stream.has_header and stream.kind != "calibration"]
-    stamps_ns = {topic: np.array(streams[topic].stamps_ns, np.int64) + config.offset_ns(topic) for topic in headed}
+        where = f"{where}, topic {', '.join(unset)}"
+        raise refused("Messages have no header time", where=where, got=got, next_step="set time: log")
+    stamps_ns = {
+        topic: np.array(stream.stamps_ns, np.int64) + config.offset_ns(topic)
+        for topic, stream in streams.items()
+        if stream.stamps_ns[0] is not None and stream.kind != "calibration"
+    }
     least_ms = {topic: float((log_ns[topic] - times).min()) / 1e6 for topic, times in stamps_ns.items()}
     least, skew_ms = min(least_ms.values(), default=0.0), np.ptp(list(least_ms.values()) or [0.0])
     if skew_ms > config.max_clock_skew_ms:
-        got = ", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items()))
-        raise RejectedInputError(
-            "clock_skew", "Clocks of topics disagree", where=where, got=got, evidence={"skew_ms": float(skew_ms)},
+        raise refused(
+            "Clocks of topics disagree", where=where, evidence={"skew_ms": float(skew_ms)},
             expected=f"least delays within {config.max_clock_skew_ms} ms of each other",
+            got=", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least_ms.items())),
             next_step="declare time_offsets_ms, or set time: log",
         )  # fmt: skip
     joints = config.arms[0].state.joints.topic if config.arms else ""
@@ -89,13 +92,12 @@ def in_order(times_ns: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     Raises: RejectedInputError (clock_jump) for a time more than MAX_DISORDER_S out of order.
     """
     back_s = (np.maximum.accumulate(times_ns) - times_ns) / 1e9
-    if back_s.max() > MAX_DISORDER_S:
+    if (jump_s := float(back_s.max())) > MAX_DISORDER_S:
         first = int(np.argmax(back_s > MAX_DISORDER_S))
-        what, expected = "Times of a topic jump back", f"at most {MAX_DISORDER_S} s out of order"
         raise RejectedInputError(
-            "clock_jump", what, where=f"{where}, message {first}", expected=expected, got=f"{back_s.max():.3f} s",
+            "clock_jump", "Times of a topic jump back", where=f"{where}, message {first}", got=f"{jump_s:.3f} s",
             next_step="set time: log, if the recorder's clock is sound, or cut the recording at the jump",
-            evidence={"message": first, "jump_s": float(back_s.max())},
+            evidence={"message": first, "jump_s": jump_s},
         )  # fmt: skip
     return np.unique(times_ns, return_index=True)
 
@@ -119,9 +121,7 @@ def in_order_with_values(times_ns: np.ndarray, values: np.ndarray, where: str) -
 
 def _conflict(what: str, where: str, got: str) -> RejectedInputError:
     next_step = "record the topic with one publisher, or declare another topic (a command that steps: resample: hold)"
-    return RejectedInputError(
-        "conflicting_messages", what, where=where, expected="one publisher", got=got, next_step=next_step
-    )
+    return RejectedInputError("conflicting_messages", what, where=where, got=got, next_step=next_step)
 
 
 @np.errstate(over="ignore")
@@ -301,30 +301,29 @@ class TransformTree:
     def connected(self, base: str, frame: str) -> bool:
         return bool(set(self._chain(base)) & set(self._chain(frame)))
 
-    def moving_times(self, base: str, frame: str) -> list[np.ndarray]:
-        edges = [self._edges[child] for side in self._between(base, frame) for child in side]
-        return [edge.ordered[0] for edge in edges if edge.moving]
-
-    def _between(self, base: str, frame: str) -> tuple[list[str], list[str]]:
-        """Frames from the base, and from the frame, up to the first frame above both (in neither list)."""
+    def _path(self, base: str, frame: str) -> tuple[list[_Edge], list[_Edge]]:
+        """Transforms from the base, and from the frame, up to the first frame above both."""
         up, down = self._chain(base), self._chain(frame)
         common = next((name for name in down if name in up), None)
         if common is None:
             known = ", ".join(f"{edge.parent} -> {child}" for child, edge in sorted(self._edges.items()))
             what, expected = "No transforms lead from the base to a frame", f"{base} -> {frame}"
             raise RejectedInputError("missing_calibration", what, where=self._where, expected=expected, got=known)
-        return up[: up.index(common)], down[: down.index(common)]
+        above, below = ([self._edges[name] for name in side[: side.index(common)]] for side in (up, down))
+        return above, below
+
+    def moving_times(self, base: str, frame: str) -> list[np.ndarray]:
+        return [edge.ordered[0] for side in self._path(base, frame) for edge in side if edge.moving]
 
     def poses(self, base: str, frame: str, grid_ns: np.ndarray) -> np.ndarray:
         """(t, 4, 4) T_base_frame at the instants; every transform between the two is resampled by itself."""
-        up, down = self._between(base, frame)
+        up, down = self._path(base, frame)
         return rigid_inverse(self._product(up, grid_ns)) @ self._product(down, grid_ns)
 
-    def _product(self, frames: list[str], grid_ns: np.ndarray) -> np.ndarray:
+    def _product(self, edges: list[_Edge], grid_ns: np.ndarray) -> np.ndarray:
         """Pose of the first of these frames, each the child of the next, in the parent of the last."""
         pose, gap = np.tile(np.eye(4), (len(grid_ns), 1, 1)), self._max_gap_s
-        for child in frames:
-            edge = self._edges[child]
+        for edge in edges:
             times_ns, values = edge.ordered
             if edge.moving:
                 start, stop = int(grid_ns[0]), int(grid_ns[-1])
@@ -377,8 +376,6 @@ def _intrinsics(calibration: Calibration, *, rectified: bool, where: str) -> tup
         if x + region_width > width or y + region_height > height:
             raise refused(f"Region of interest leaves the image of {width}x{height}", got=calibration.roi)
         transform = transform.crop(y, x, (region_height, region_width))
-    across, down = (max(each, 1) for each in calibration.binning)
-    if (across, down) != (1, 1):
-        height, width = transform.image_size
-        transform = transform.resize((height // down, width // across))
+    (height, width), (across, down) = transform.image_size, (max(each, 1) for each in calibration.binning)
+    transform = transform.resize((height // down, width // across))
     return transform.intrinsics(K), transform.image_size

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, NonNegativeInt, model_validator
 
 from worldline_core.config import FrameRate, StrictModel
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
@@ -17,20 +17,14 @@ class TopicReadings(StrictModel):
 
     topic: str
     names: tuple[str, ...] | None = Field(default=None, description="joints, for JointState messages")
-    columns: tuple[int, ...] | None = Field(
-        default=None, description="positions, for messages that are a list of numbers"
-    )
-    resample: Literal["linear", "hold"] = Field(
-        default="linear", description="hold: the last value counts until the next one"
-    )
+    columns: tuple[NonNegativeInt, ...] | None = Field(default=None, description="places in messages without names")
+    resample: Literal["linear", "hold"] = Field(default="linear", description="hold: a value counts until the next one")
 
     @model_validator(mode="after")
     def _one_choice(self) -> TopicReadings:
-        chosen = self.names or self.columns
-        if (self.names is None) == (self.columns is None) or not chosen:
-            raise ValueError(f"{self.topic}: give either names or columns, at least one")
-        if len(set(chosen)) != len(chosen) or any(column < 0 for column in self.columns or ()):
-            raise ValueError(f"{self.topic}: names and columns must be different and not negative")
+        chosen = self.names or self.columns or ()
+        if (self.names is None) == (self.columns is None) or not 0 < len(chosen) == len(set(chosen)):
+            raise ValueError(f"{self.topic}: give either names or columns, at least one, none twice")
         return self
 
     @property
@@ -77,13 +71,8 @@ class ViewTopics(StrictModel):
     """One camera."""
 
     image: str = Field(description="topic of images, compressed or raw, or of video")
-    calibration: str | None = Field(
-        default=None, description="topic of CameraInfo or CameraCalibration; null: uncalibrated"
-    )
-    frame: str | None = Field(
-        default=None,
-        description="camera frame with OpenCV axes (ROS: ..._optical_frame); null: the one its messages name",
-    )
+    calibration: str | None = Field(default=None, description="CameraInfo or CameraCalibration; null: uncalibrated")
+    frame: str | None = Field(default=None, description="with OpenCV axes (_optical_frame); null: as its messages say")
     rectified: bool = Field(default=False, description="the images are rectified: P holds their K, and no lens is left")
 
 
@@ -135,9 +124,7 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
     embodiment: EmbodimentName
     fps: FrameRate = Field(description="rate to which everything is brought")
     views: dict[str, ViewTopics] = Field(min_length=1)
-    arms: tuple[ArmTopics, ...] = Field(
-        default=(), max_length=2, description="left before right; none, with embodiment none: the pictures alone"
-    )
+    arms: tuple[ArmTopics, ...] = Field(default=(), description="left before right; none: the pictures alone")
     without_commands: Literal["refuse", "repeat_state"] = Field(
         default="refuse", description="repeat_state: recordings without command topics get the measured state as action"
     )
@@ -164,10 +151,8 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
     def _complete(self) -> McapTopicsSourceConfig:
         names = [arm.name for arm in self.arms]
         if not names and self.embodiment != NO_EMBODIMENT:
-            raise ValueError(
-                f"the arms of {self.embodiment} are not declared; embodiment: none reads the pictures alone"
-            )
-        if names and names not in (["left"], ["right"], ["left", "right"]):
+            raise ValueError(f"the arms of {self.embodiment} are not declared; pictures alone need embodiment: none")
+        if names not in ([], ["left"], ["right"], ["left", "right"]):
             raise ValueError(f"arms are {names}; expected left before right, each once")
         if len({arm.command is None for arm in self.arms}) > 1:
             raise ValueError("either all arms have commands or none")
@@ -176,10 +161,9 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
         if len({arm.tool_frame is None and arm.tool_pose is None for arm in self.arms}) > 1:
             raise ValueError("either all arms have tool poses or none")
         for arm in self.arms:
-            if arm.command is not None and arm.command.joints.width != arm.state.joints.width:
-                raise ValueError(
-                    f"arm {arm.name} has {arm.state.joints.width} joints and {arm.command.joints.width} commands"
-                )
+            joints, commands = arm.state.joints, arm.command and arm.command.joints
+            if commands is not None and commands.width != joints.width:
+                raise ValueError(f"arm {arm.name} has {joints.width} joints and {commands.width} commands")
         if self.primary_view is not None and self.primary_view not in self.views:
             raise ValueError(f"primary_view {self.primary_view} is none of {', '.join(self.views)}")
         seen: dict[str, str] = {}
