@@ -36,7 +36,7 @@ from benchmarks.harness import RECORDINGS, command_line, print_table
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.camera_errors import KINDS, LAG, PARAMETERS, SCALE, moved_camera
-from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, diagnose_source
+from worldline_core.calibration.diagnosis import Diagnosis, diagnose_source
 from worldline_core.calibration.estimate.base_pose import place_second_arm, with_base
 from worldline_core.calibration.estimate.estimate import estimate_views
 from worldline_core.calibration.estimate.verdict import ViewEstimate
@@ -153,7 +153,7 @@ def examine(episode: Healthy, base: Episode, conventions: RecordedConventions, *
     return diagnose(corrupt(base, conventions), gray, episode.kinematics, quick=quick)
 
 
-def named(diagnosis: Conclusion) -> str:
+def named(diagnosis: Diagnosis) -> str:
     return diagnosis.best.mistake if diagnosis.verdict == "explained" else diagnosis.verdict
 
 
@@ -261,7 +261,7 @@ class Row:
                 f"{len(self.wrong)} of {len(self.together)}")  # fmt: skip
 
 
-def holds(diagnosis: Conclusion, view: str, theta: np.ndarray) -> list[bool]:
+def holds(diagnosis: Diagnosis, view: str, theta: np.ndarray) -> list[bool]:
     """For each kind, whether the error that was put in is within the interval of the estimate, and below the bound."""
     found = []
     for error in diagnosis.camera_errors:
@@ -275,7 +275,7 @@ def holds(diagnosis: Conclusion, view: str, theta: np.ndarray) -> list[bool]:
     return found
 
 
-def wrong_line(found: Conclusion, kind: str, view: str, *, others: bool) -> str:
+def wrong_line(found: Diagnosis, kind: str, view: str, *, others: bool) -> str:
     """A line that names something else than what was put in; empty where none does."""
     true = {"about the axis": {"rotation"}, "orbit": {"rotation", "translation"}, "healthy": set()}.get(kind, {kind})
     if found.verdict == "explained":

@@ -21,7 +21,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("calibration"))
     arguments = parser.parse_args()
     chosen = [row.episode_id for row in EpisodeSet.open(arguments.episode_set).rows[: arguments.episodes]]
-    found = check_command(None, arguments.episode_set, episodes=chosen, output=arguments.output)
+    found = check_command(arguments.episode_set, artifact=True, episodes=chosen, output=arguments.output)
     print(table_text(found))
     print(f"pictures: {arguments.output}")
 

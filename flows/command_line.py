@@ -309,8 +309,8 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
 
         with clear_full_disk():
             found = check_command(
-                arguments.config,
-                arguments.artifact,
+                arguments.artifact or arguments.config,
+                artifact=arguments.artifact is not None,
                 overrides=arguments.overrides,
                 episodes=arguments.episodes,
                 output=arguments.output,

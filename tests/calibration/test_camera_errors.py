@@ -23,7 +23,7 @@ from worldline_core.calibration.camera_errors import (
     significant,
 )
 from worldline_core.calibration.check import diagnosis_picture
-from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, Explanation, diagnose_source
+from worldline_core.calibration.diagnosis import Diagnosis, Explanation, diagnose_source
 from worldline_core.calibration.observation import Motion
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
@@ -48,7 +48,7 @@ def quickly(item: benchmark.Healthy, episode: Episode) -> Diagnosis:
     return diagnose(episode, item.gray, item.kinematics, quick=True)
 
 
-def estimated(found: Conclusion, view: str, kind: str) -> KindOfError:
+def estimated(found: Diagnosis, view: str, kind: str) -> KindOfError:
     return next(each for e in found.camera_errors if e.view == view for each in e.kinds if each.kind == kind)
 
 
@@ -188,7 +188,7 @@ def test_what_one_episode_alone_shows_is_not_said_of_its_source() -> None:
     def one(gain: float) -> Diagnosis:
         written = Explanation(RecordedConventions(), -20.0, {"flow head": -20.0})
         late = Explanation(RecordedConventions(image_lag_frames=1), gain - 20.0, {"flow head": 0.0})
-        return Diagnosis(verdict="unexplained", best=written, ranked=(late, written), episode_id="e")
+        return Diagnosis(verdict="unexplained", best=written, ranked=(late, written))
 
     assert diagnose_source("source", [one(20.0), *[one(0.0)] * 4]).verdict != "explained"
     assert diagnose_source("source", [one(4.0)] * 5).best.mistake == "image_lag_frames"
@@ -196,8 +196,7 @@ def test_what_one_episode_alone_shows_is_not_said_of_its_source() -> None:
 
 def test_episodes_beyond_their_bounds_are_mixed() -> None:
     def source(*values: float) -> str:
-        found = [Diagnosis(verdict="consistent", episode_id=f"e{i}") for i in range(len(values))]
-        each = [d.with_camera_errors((camera_error(value),)) for d, value in zip(found, values, strict=True)]
+        each = [Diagnosis(verdict="consistent").with_camera_errors((camera_error(value),)) for value in values]
         return diagnose_source("source", each).verdict
 
     assert source(*(-60.0, 60.0) * 4) == "mixed"

@@ -27,17 +27,16 @@ from worldline_core.calibration.diagnosis import (
     unjudged_gain,
 )
 from worldline_core.calibration.evidence import (
-    MIN_IMAGE_PAIRS,
     WORST_TERM,
-    finger_flow,
     frozen_views,
     gripper_terms,
     hand_eye_log_likelihood,
     image_terms,
+    not_judged,
+    notes_on,
     observable_views,
     pose_terms,
     rms_hand_eye,
-    stopped_share,
 )
 from worldline_core.calibration.observation import Observation, Reading, arms_of, observe, read
 from worldline_core.data.episodes.conventions import RecordedConventions, applicable
@@ -57,8 +56,6 @@ EXCHANGED_DOUBT = 3.0
 INTRINSICS_SNAP, SAME_INTRINSICS_SIZE = 0.02, 0.1
 """Relative distance within which a usual image size is taken; log distance within which the size is as recorded."""
 MIN_TOOL_OFFSET_M, MAX_TOOL_OFFSET_M = 0.01, 0.5
-COMMANDS_FIT_RATIO, NOTICEABLE_M = 3.0, 0.001
-"""Camera poses follow the commands when their residual against the states is larger by this ratio, and noticeable."""
 REMEDIES = {
     "embodiment": "The recording fits {0}, not the declared {1}: name the robot that it is of",
     "wrist_extrinsics": "Each wrist camera has the other's extrinsics: exchange the two where the source is written",
@@ -93,16 +90,14 @@ def diagnose(
     Raises: DataError: images or kinematics do not fit the episode.
     """
     observation = observe(episode, frames, kinematics)
-    name = episode.episode_id
     recorded = read(observation, RecordedConventions())
     if recorded is None or not episode.cameras:
         missing = "tool poses (no kinematics for its joints)" if recorded is None else "camera calibration"
         notes = (f"The recording has no {missing}: nothing can be compared",)
-        return Diagnosis(verdict="too_little_evidence", notes=notes, episode_id=name)
-    search = _Search(observation, recorded)
-    diagnosis = Diagnosis(verdict="consistent", episode_id=name, not_judged=not_judged(observation))
-    if quick and (unsuspicious := search.unsuspicious()) is not None:
-        diagnosis = replace(diagnosis, best=unsuspicious, ranked=(unsuspicious,))
+        return Diagnosis(verdict="too_little_evidence", notes=notes)
+    search, blind = _Search(observation, recorded), not_judged(observation)
+    if quick and (fine := search.unsuspicious()) is not None:
+        diagnosis = Diagnosis(verdict="consistent", best=fine, ranked=(fine,), not_judged=blind)
         return diagnosis.with_camera_errors(estimate_camera_errors(observation, recorded))
     as_recorded, notes = search.as_recorded, notes_on(observation, recorded)
     ranked = sorted([as_recorded, *search.singles()], key=lambda e: -e.score)
@@ -132,10 +127,18 @@ def diagnose(
         verdict = "too_little_evidence"
         notes.append("No tool moves and no picture changes: a mistake would leave no trace")
     nearest = nearest_texts(ranked, as_recorded) if verdict == "unexplained" else ()
-    found = {"verdict": verdict, "best": best, "ranked": tuple(ranked), "notes": tuple(notes), "nearest": nearest}
-    diagnosis = replace(diagnosis, **found)
+    diagnosis = Diagnosis(
+        verdict=verdict, best=best, ranked=tuple(ranked), notes=tuple(notes), nearest=nearest, not_judged=blind
+    )
     reading = search.read(best.conventions) if best.other is None else None
     return diagnosis if reading is None else diagnosis.with_camera_errors(estimate_camera_errors(observation, reading))
+
+
+def all_terms(observation: Observation, reading: Reading, poses: Mapping[str, float] | None = None) -> dict[str, float]:
+    """All evidence of a reading by name; `poses` where its pose terms are known, since image lags do not change them."""
+    terms = dict(pose_terms(observation, reading) if poses is None else poses)
+    terms |= image_terms(observation, reading) | gripper_terms(observation, reading)
+    return terms | {f"frozen {view}": WORST_TERM for view in frozen_views(observation, reading)}
 
 
 class _Search:
@@ -146,25 +149,20 @@ class _Search:
         self.frozen = frozen_views(observation, recorded)
         self.recorded_poses = pose_terms(observation, recorded)
 
-    def terms(self, reading: Reading, poses: Mapping[str, float] | None = None) -> dict[str, float]:
-        """All evidence of a reading; `poses` where its pose terms are known, since image lags do not change them."""
-        observation = self.observation
-        terms = dict(pose_terms(observation, reading) if poses is None else poses)
-        terms |= image_terms(observation, reading) | gripper_terms(observation, reading)
-        return terms | {f"frozen {view}": WORST_TERM for view in frozen_views(observation, reading)}
-
-    def explain(self, reading: Reading, terms: dict[str, float], other: tuple[str, str] | None = None) -> Explanation:
+    def explain(
+        self, conventions: RecordedConventions, terms: dict[str, float], other: tuple[str, str] | None = None
+    ) -> Explanation:
         """A reading with its score: the sum of its terms, less the cost of departing from the contract."""
-        departures = len(reading.conventions.departures) + (other is not None)
-        cost = COMPLEXITY * departures + VIEWS_COST * (reading.conventions.views is not None)
+        departures = len(conventions.departures) + (other is not None)
+        cost = COMPLEXITY * departures + VIEWS_COST * (conventions.views is not None)
         # That no video is frozen in a reading is no gain: the picture of an arm that rests stays the same.
         thawed = len(self.frozen) - sum(name.startswith("frozen ") for name in terms)
         cost -= WORST_TERM * max(0, thawed)
-        return Explanation(reading.conventions, float(sum(terms.values())) - cost, terms, other)
+        return Explanation(conventions, float(sum(terms.values())) - cost, terms, other)
 
     @cached_property
     def as_recorded(self) -> Explanation:
-        return self.explain(self.recorded, self.terms(self.recorded, self.recorded_poses))
+        return self.explain(RecordedConventions(), all_terms(self.observation, self.recorded, self.recorded_poses))
 
     def unsuspicious(self) -> Explanation | None:
         """The recording as written if no cheap evidence speaks against it, else None."""
@@ -172,7 +170,7 @@ class _Search:
         if self.frozen:
             return None
         images = image_terms(observation, self.recorded, wrist_flow=False)
-        found = self.explain(self.recorded, {**self.recorded_poses, **images})
+        found = self.explain(RecordedConventions(), {**self.recorded_poses, **images})
         if min(self.recorded_poses.values(), default=0.0) < SUSPICION or bad_terms(found):
             return None
         if (inverted := self.read(RecordedConventions(gripper="inverted"))) is not None:
@@ -213,8 +211,8 @@ class _Search:
 
     def lags_by_view(self, late: Reading) -> Iterator[Explanation]:
         """A lag of all pictures, and of those views alone whose own pictures fit better with it."""
-        terms, written = self.terms(late, self.recorded_poses), self.as_recorded.evidence
-        yield self.explain(late, terms)
+        terms, written = all_terms(self.observation, late, self.recorded_poses), self.as_recorded.evidence
+        yield self.explain(late.conventions, terms)
         views = [view for view in late.cameras if view in self.observation.gray]
         gains = {view: _of_view(terms, view) - _of_view(written, view) for view in views}
         better = [(view,) for view in views if gains[view] > 1.0]
@@ -222,7 +220,7 @@ class _Search:
         for chosen in dict.fromkeys([*better, clearly]):
             if chosen and len(chosen) < len(views):
                 conventions = late.conventions.model_copy(update={"views": chosen})
-                yield self.explain(replace(late, conventions=conventions), _exchanged(written, terms, chosen))
+                yield self.explain(conventions, _exchanged(written, terms, chosen))
 
     def exchanged_wrist_cameras(self) -> Iterator[Explanation]:
         """Two wrist cameras with each other's poses, or each other's videos."""
@@ -242,7 +240,7 @@ class _Search:
     def as_written(self, observation: Observation, other: tuple[str, str]) -> Iterator[Explanation]:
         """The reading of another observation as written; none where no tool poses are known."""
         if (reading := read(observation, RecordedConventions())) is not None:
-            yield self.explain(reading, _Search(observation, reading).terms(reading), other)
+            yield self.explain(reading.conventions, all_terms(observation, reading), other)
 
     def other_robots(self) -> Iterator[Explanation]:
         """The recording as written, with the other robots that have the same arms, if it has joints.
@@ -264,16 +262,14 @@ class _Search:
 
     def in_views_that_improve(self, reading: Reading) -> Explanation:
         """The mistake in those views that it improves: one camera of a rig may be written unlike the others."""
-        terms, written = self.terms(reading), self.as_recorded.evidence
-        if reading.conventions.departures[0] not in _CAMERA_FIELDS:
-            return self.explain(reading, terms)
-        views = list(reading.cameras)
+        conventions, written = reading.conventions, self.as_recorded.evidence
+        terms = all_terms(self.observation, reading)
+        views = list(reading.cameras) if conventions.departures[0] in _CAMERA_FIELDS else []
         better = tuple(view for view in views if _of_view(terms, view) > _of_view(written, view) + 1.0)
-        if not better or len(better) == len(views):
-            return self.explain(reading, terms)
-        partial = self.read(reading.conventions.model_copy(update={"views": better}))
-        merged = _exchanged(terms, written, [view for view in views if view not in better])
-        return self.explain(reading if partial is None else partial, merged)
+        if better and len(better) < len(views):
+            conventions = conventions.model_copy(update={"views": better})
+            terms = _exchanged(terms, written, [view for view in views if view not in better])
+        return self.explain(conventions, terms)
 
     def pairs(self, ranked: list[Explanation]) -> list[Explanation]:
         """Two mistakes at once: one of the best single ones, with another or with the numbers estimated beside it."""
@@ -287,7 +283,7 @@ class _Search:
             beside = () if (undone := self.read(one)) is None else (*ones[number + 1 :], *self.numbers_beside(undone))
             for both in (_together(one, conventions) for conventions in beside):
                 if both is not None and both not in found and (reading := self.read(both)) is not None:
-                    found[both] = self.explain(reading, self.terms(reading))
+                    found[both] = self.explain(both, all_terms(self.observation, reading))
         return list(found.values())
 
     def numbers_beside(self, undone: Reading) -> Iterator[RecordedConventions]:
@@ -349,11 +345,8 @@ def robots_like(layout: tuple[tuple[str, int], ...]) -> tuple[ArmKinematics, ...
 
 def conventions_to_try(observation: Observation, recorded: Reading) -> list[RecordedConventions]:
     """One mistake each, without image lags (see `image_lags`), most of them with a fixed value."""
-    episode, kinematics = observation.episode, observation.kinematics
+    episode = observation.episode
     found = [c for c in _FIXED_MISTAKES if applicable(episode, c.departures[0])]
-    arms = kinematics.embodiment.arms if kinematics is not None and episode.state_kind == "joints" else ()
-    if len({len(arm.joints) for arm in arms}) > 1:
-        found = [c for c in found if c.arms != "exchanged"]
     found += [RecordedConventions(intrinsics_size=size) for size in intrinsics_sizes(episode.cameras)]
     found += [RecordedConventions(camera_lag_frames=lag) for lag in camera_lags(observation, recorded)]
     if (offset := tool_offset(observation, recorded)) is not None:
@@ -426,43 +419,7 @@ def tool_offset(observation: Observation, recorded: Reading) -> float | None:
     else:
         for i, arm in enumerate(observation.arms):
             if arm.T_tool_mount is not None and (camera := recorded.cameras.get(arm.wrist_view)) is not None:
-                mount, _, _ = rms_hand_eye(recorded.tools[:, i], camera.poses(np.arange(len(recorded.tools))))
+                mount, _, _ = rms_hand_eye(recorded.tools[:, i], camera.T_base_camera)
                 offsets.append(float(mount[2, 3] - arm.T_tool_mount[2, 3]))
     offset = float(np.median(offsets)) if offsets else 0.0
     return round(offset, 4) if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None
-
-
-def not_judged(observation: Observation) -> dict[str, str]:
-    """By calibrated view, why its pictures say nothing about its camera."""
-    found = {}
-    for view, camera in observation.episode.cameras.items():
-        count = len(observation.gray.get(view, ()))
-        if count <= MIN_IMAGE_PAIRS:
-            found[view] = f"{count} pictures are too few to compare motion with"
-        elif view in observation.wrists and not camera.moving:
-            found[view] = "its camera has one pose, though its hand moves"
-        elif view not in observation.wrists and view not in observation.still_views:
-            found[view] = "its camera moves, and no hand carries it"
-        elif not observation.motion(view).moves:
-            found[view] = "its pictures do not change"
-    return found
-
-
-def notes_on(observation: Observation, recorded: Reading) -> list[str]:
-    """Limits of the evidence, and other facts for a person."""
-    notes: list[str] = []
-    for view, i in observation.wrists.items():
-        camera, commands = recorded.cameras.get(view), recorded.action_tools
-        if camera is None or commands is None:
-            continue
-        poses = camera.poses(np.arange(len(commands)))
-        states_m, commands_m = (rms_hand_eye(tools[:, i], poses)[1] for tools in (recorded.tools, commands))
-        if states_m > NOTICEABLE_M and states_m > COMMANDS_FIT_RATIO * commands_m:
-            fits = f"follow the commands ({1e3 * commands_m:.1f} mm), not the states ({1e3 * states_m:.1f} mm)"
-            notes.append(f"{view}: the camera poses {fits}")
-    if recorded.gripper is None:
-        return [*notes, "gripper: the state names no gripper columns, polarity is not judged"]
-    for i, arm in enumerate(observation.arms):
-        if finger_flow(observation, recorded, i) is None and stopped_share(recorded, i) is None:
-            notes.append(f"gripper {arm.name}: does not move enough to be seen, polarity is not judged")
-    return notes

@@ -219,25 +219,23 @@ class StillView:
         certainty: np.ndarray | None = None,
     ) -> None:
         """points: (n + 1, p, 3), radii: (p,) [m]; motion of the n steps, and how far its flow is trusted (n, r, c), 0 to 1."""
-        self.camera, self.points, self.radii, self.certainty = camera, points, radii, certainty
+        self.camera, self.points, self.radii = camera, points, radii
+        self.certainty = np.ones(motion.change.shape, np.float32) if certainty is None else certainty
         change = np.log1p(np.maximum(motion.change - NOISE_CHANGE, 0.0))
         self.measured = np.concatenate([motion.flow, change[..., None]], axis=-1).astype(np.float32)
         self.steps = np.ones(len(self.measured), dtype=bool)
-        self._by_blur: dict[float, np.ndarray] = {}
-        self._maps: dict[bytes, tuple[np.ndarray, ...]] = {}
 
     def at(self, camera: CameraTrack) -> StillView:
         """The same measured motion, compared with what another camera predicts."""
         other = copy(self)
-        other.camera, other._maps = camera, {}
+        other.camera = camera
         return other
 
     def mirrored(self) -> StillView:
         """The same robot before pictures with left and right exchanged."""
         other = copy(self)
         other.measured = self.measured[:, :, ::-1] * np.array([-1.0, 1.0, 1.0], np.float32)
-        other.certainty = None if self.certainty is None else self.certainty[:, :, ::-1]
-        other._by_blur, other._maps = {}, {}
+        other.certainty = self.certainty[:, :, ::-1]
         return other
 
     @property
@@ -249,7 +247,7 @@ class StillView:
     def without(self, cells: np.ndarray) -> StillView:
         """The same without what moves in some cells (n, r, c)."""
         other = copy(self)
-        other.measured, other._by_blur, other._maps = self.measured * ~cells[..., None], {}, {}
+        other.measured = self.measured * ~cells[..., None]
         return other
 
     def only(self, steps: np.ndarray) -> StillView:
@@ -260,18 +258,15 @@ class StillView:
 
     def equations(self, theta: np.ndarray, blur: float) -> Equations:
         """Normal equations at `theta`, on maps with this blur [cells]."""
-        size, key = PARAMETERS + 1, theta.tobytes()
-        if key not in self._maps:  # the start is evaluated with more than one blur
-            self._maps[key] = self._predicted(theta)
-        value, shift, growth, cover = self._maps[key]
-        measured, value = self._blurred(blur), _blurred(value, blur)
+        size = PARAMETERS + 1
+        value, shift, growth, cover = self._predicted(theta)
+        measured, value = _blurred(self.measured, blur), _blurred(value, blur)
         moving = np.abs(measured).max(axis=-1) > 0.3
         active = (cover > 0.1) | moving
         down, across = (np.moveaxis(each, -1, 0).copy() for each in np.gradient(value, axis=(1, 2)))
-        columns = np.arange(size)
         information, gradient, likelihood = np.zeros((size + 2, size + 2)), np.zeros(size + 2), 0.0
         for gain_index, channels in ((size, (0, 1)), (size + 1, (2,))):
-            trust = np.ones(1, np.float32) if self.certainty is None or channels == (2,) else np.sqrt(self.certainty)
+            trust = np.ones(1, np.float32) if channels == (2,) else np.sqrt(self.certainty)
             predicted, seen = (trust[..., None] * each[..., channels] for each in (value, measured))
             gain = max(float((predicted * seen).sum()) / max(float((predicted**2).sum()), 1e-9), 0.05)
             error, cells = seen - gain * predicted, float((trust**2 * active).sum())
@@ -281,21 +276,18 @@ class StillView:
             # The sample count must not depend on the camera: one that covers more would seem more likely.
             likelihood -= len(channels) * float((trust**2 * moving).sum()) / 2 * np.log(max(left_open, 1e-9))
             for c, channel in enumerate(channels):
-                slope = across[channel] * shift[0]
-                slope += down[channel] * shift[1]
-                slope *= -gain
+                slope = -gain * (across[channel] * shift[0] + down[channel] * shift[1])
                 if channel < 2:
                     slope[:-1] += gain * cover * growth[channel]
                 slope = np.ascontiguousarray((trust * slope).reshape(size, -1).T)
                 scaled = gain * predicted[..., c].reshape(-1)
                 residual = error[..., c].reshape(-1)
-                information[np.ix_(columns, columns)] += weight * (slope.T @ slope)
-                cross = weight * (slope.T @ scaled)
-                information[columns, gain_index] += cross
-                information[gain_index, columns] += cross
+                information[:size, :size] += weight * (slope.T @ slope)
+                information[:size, gain_index] += weight * (slope.T @ scaled)
                 information[gain_index, gain_index] += weight * float(scaled @ scaled)
-                gradient[columns] += weight * (slope.T @ residual)
+                gradient[:size] += weight * (slope.T @ residual)
                 gradient[gain_index] += weight * float(scaled @ residual)
+        information[size:, :size] = information[:size, size:].T
         samples = SAMPLE_CELLS_STILL
         return _without_nuisance(Equations(information / samples, gradient / samples, likelihood / samples))
 
@@ -303,16 +295,9 @@ class StillView:
         """(3,) sums over all cells and steps: predicted times measured flow, predicted squared, measured squared."""
         theta = np.zeros(PARAMETERS)
         theta[LAG] = lag
-        value = self._predicted(theta)[0]
-        seen, value = self._blurred(blur)[..., :2], _blurred(value, blur)[..., :2]
-        if self.certainty is not None:
-            seen, value = (np.sqrt(self.certainty)[..., None] * each for each in (seen, value))
+        maps, trust = (self.measured, self._predicted(theta)[0]), np.sqrt(self.certainty)[..., None]
+        seen, value = (trust * _blurred(each, blur)[..., :2] for each in maps)
         return np.array([(value * seen).sum(), (value**2).sum(), (seen**2).sum()], dtype=np.float64)
-
-    def _blurred(self, blur: float) -> np.ndarray:
-        if blur not in self._by_blur:
-            self._by_blur[blur] = _blurred(self.measured, blur)
-        return self._by_blur[blur]
 
     def shown(self, theta: np.ndarray) -> np.ndarray:
         """(2, k) mean displacement of the robot in the picture by each parameter [% of the width]; none by the lag."""
@@ -339,13 +324,11 @@ class StillView:
         # A cell takes from the points near it their step, and how the parameters move the step's start and change the step.
         # Where several points meet, the fastest one counts most.
         weight = (length + 0.1) ** 2
-        taken = np.empty((2, 1 + 2 * PARAMETERS, *length.shape), np.float32)
-        np.multiply(np.moveaxis(step, -1, 0), weight, out=taken[:, 0])
-        np.multiply((slope[:, :, :-1] + slope[:, :, 1:]) / 2 / CELL_PX, weight, out=taken[:, 1:PARAMETERS])
-        np.multiply(np.moveaxis(-step, -1, 0) / CELL_PX, weight, out=taken[:, PARAMETERS])
-        np.multiply(np.diff(slope, axis=2), weight, out=taken[:, 1 + PARAMETERS : -1])
-        np.multiply(np.moveaxis(-faster, -1, 0), weight, out=taken[:, -1])
-        taken = np.concatenate([taken.reshape(2 * (1 + 2 * PARAMETERS), *length.shape), weight[None]])
+        by_start, by_end, now = slope[:, :, :-1], slope[:, :, 1:], np.moveaxis(step, -1, 0)[:, None]
+        later = np.moveaxis(-faster, -1, 0)[:, None]
+        parts = [now, (by_start + by_end) / 2 / CELL_PX, -now / CELL_PX, by_end - by_start, later]
+        taken = (weight * np.concatenate(parts, axis=1)).reshape(4 * PARAMETERS + 2, *length.shape)
+        taken = np.concatenate([taken, weight[None]]).astype(np.float32)
         thickness, way = (weight * reach).astype(np.float32), step / CELL_PX
         square = (way**2).sum(axis=-1, keepdims=True) + 1e-6
         lines = np.concatenate([way, -(start * way).sum(axis=-1, keepdims=True)], axis=-1) / square
@@ -353,42 +336,23 @@ class StillView:
         cells = np.stack([column, row, np.ones_like(row)])
         found = np.zeros((len(taken), count, len(row)), np.float32)
         thicker, cover = np.zeros((2, count, len(row)), np.float32), np.zeros((count, len(row)), np.float32)
-        # New arrays at each step would cost as much as the arithmetic.
-        planes = np.empty((5, length.shape[1], len(row)), np.float32)
         for i in range(count):
             on = np.flatnonzero(alive[i])
-            if not len(on):
-                continue
-            x, y, along, inside, other = planes[:, : len(on)]
-            (across, down), far = way[i, on].T[..., None], start[i, on].T[..., None]
-            np.matmul(lines[i, on], cells, out=along)  # the place on a point's step that is nearest to a cell
-            np.clip(along, 0.0, 1.0, out=along)
-            np.subtract(column, far[0], out=x)
-            x -= np.multiply(along, across, out=other)
-            np.subtract(row, far[1], out=y)
-            y -= np.multiply(along, down, out=other)
-            np.multiply(x, x, out=along)
-            along += np.multiply(y, y, out=other)
-            distance = np.sqrt(along, out=along)
-            np.subtract(distance, reach[i, on, None], out=inside)
-            inside /= EDGE_CELLS
-            np.exp(np.clip(inside, -20.0, 20.0, out=inside), out=inside)
-            inside += 1.0
-            np.divide(1.0, inside, out=inside)
-            np.subtract(1.0, np.prod(np.subtract(1.0, inside, out=other), axis=0), out=cover[i])
-            np.matmul(taken[:, i, on], inside, out=found[:, i])
-            inside /= np.clip(distance, 0.3, None, out=distance)
-            for axis, away in enumerate((x, y)):
-                thicker[axis, i] = thickness[i, on] @ np.multiply(inside, away, out=other)
+            along = np.clip(lines[i, on] @ cells, 0.0, 1.0)  # the place on a point's step that is nearest to a cell
+            x = column - start[i, on, :1] - along * way[i, on, :1]
+            y = row - start[i, on, 1:] - along * way[i, on, 1:]
+            distance = np.sqrt(x * x + y * y)
+            inside = 1.0 / (1.0 + np.exp(np.clip((distance - reach[i, on, None]) / EDGE_CELLS, -20.0, 20.0)))
+            cover[i] = 1.0 - np.prod(1.0 - inside, axis=0)
+            found[:, i] = taken[:, i, on] @ inside
+            inside /= np.maximum(distance, 0.3)
+            thicker[:, i] = thickness[i, on] @ (inside * x), thickness[i, on] @ (inside * y)
         total = found[-1] + 1e-9
         thicker /= total
         found = (found[:-1] / total).reshape(2, -1, count, rows, columns)
         cover = cover.reshape(count, rows, columns)
-        motion = found[:, 0]
-        value = np.empty((count, rows, columns, 3), np.float32)
-        np.multiply(cover, motion, out=np.moveaxis(value, -1, 0)[:2])
-        speed = np.log1p(np.minimum(lengths(np.moveaxis(motion, 0, -1)), LONGEST_STEP_PX))
-        np.multiply(cover, speed, out=value[..., 2])
+        speed = np.log1p(np.minimum(lengths(np.moveaxis(found[:, 0], 0, -1)), LONGEST_STEP_PX))
+        value = cover[..., None] * np.stack([*found[:, 0], speed], axis=-1)
         shift = np.concatenate([found[:, 1 : 1 + PARAMETERS], thicker.reshape(2, 1, count, rows, columns)], axis=1)
         return value, shift, found[:, 1 + PARAMETERS :], cover
 
@@ -402,12 +366,10 @@ def projected(points: np.ndarray, camera: CameraTrack) -> tuple[np.ndarray, np.n
     x, y = seen[..., 0] / depth, seen[..., 1] / depth
     f, g = K[0, 0], K[1, 1]
     uv = np.stack([f * x + K[0, 2], g * y + K[1, 2]], axis=-1)
-    slope = np.zeros((2, LAG, *x.shape))
-    u = f * x * y, -f * (1 + x * x), f * y, -f / depth, 0.0, f * x / depth, f * x
-    v = g * (1 + y * y), -g * x * y, -g * x, 0.0, -g / depth, g * y / depth, g * y
-    for place, value in zip(np.ndindex(2, LAG), (*u, *v), strict=True):
-        slope[place] = value
-    return uv, depth, ahead, slope
+    none = np.zeros_like(x)
+    u = f * x * y, -f * (1 + x * x), f * y, -f / depth, none, f * x / depth, f * x
+    v = g * (1 + y * y), -g * x * y, -g * x, none, -g / depth, g * y / depth, g * y
+    return uv, depth, ahead, np.array([u, v])
 
 
 def delayed(values: np.ndarray, frames: float) -> np.ndarray:
@@ -450,26 +412,23 @@ class WristView:
     ) -> None:
         """camera of n + 1 poses, gray (n + 1, h, w), motion of the n steps; hand (n + 1, p, 3), radii (p,) [m]."""
         self.camera, self.differences = camera, _STEPS
-        self._steps: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         shows = (motion.texture > MIN_TEXTURE) & (motion.change > MIN_CHANGE)
         shows &= ~covered_cells(camera, hand, radii, shows.shape)
         step, row, column = np.nonzero(shows)
         self.step, self.row, self.column = step, row, column
         self.flow = motion.flow[step, row, column].astype(np.float64)
-        pictures, self._first, self._of, count = np.unique(
-            step, return_index=True, return_inverse=True, return_counts=True
-        )
+        _, self._first, self._of, count = np.unique(step, return_index=True, return_inverse=True, return_counts=True)
         self.share = np.minimum(1.0, MOST_CELLS_A_STEP / count)[self._of]
         self.uv = cell_centres(camera.height, camera.width)[row, column]
         self._pixels = np.c_[self.uv, np.ones(len(step))]
         across = (self.uv - ((camera.width - 1) / 2, (camera.height - 1) / 2)) / camera.width
         self.plane = np.c_[np.ones(len(step)), across]
-        tensor = np.empty((len(step), 2, 2), np.float32)
-        for number, picture in enumerate(pictures):
-            x, y = (cv2.Sobel(gray[picture], cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
-            here = slice(self._first[number], self._first[number] + count[number])
-            means = cell_means(np.stack([x * x, x * y, y * y]))[:, row[here], column[here]]
-            tensor[here] = np.array([means[:2], means[1:]]).T
+        edges = []
+        for image in gray[:-1]:
+            x, y = (cv2.Sobel(image, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+            xx, xy, yy = cell_means(np.stack([x * x, x * y, y * y]))
+            edges.append([[xx, xy], [xy, yy]])
+        tensor = np.array(edges)[step, :, :, row, column]
         sharp = tensor / (np.trace(tensor, axis1=1, axis2=2) + FAINT_EDGE)[:, None, None]
         error_px = FLOW_ERROR_PX + FLOW_ERROR_SHARE * lengths(self.flow)
         self.certainty = sharp.astype(np.float64) / error_px[:, None, None] ** 2
@@ -477,7 +436,7 @@ class WristView:
     def at(self, camera: CameraTrack) -> WristView:
         """The same cells, compared with the flow that another camera predicts; its place on the hand is a parameter, too."""
         other = copy(self)
-        other.camera, other._steps, other.differences = camera, {}, _STEPS_AND_PLACE
+        other.camera, other.differences = camera, _STEPS_AND_PLACE
         return other
 
     def without(self, covered: np.ndarray) -> WristView:
@@ -516,13 +475,11 @@ class WristView:
         seen = self._seen(theta)
         depth = self._depth(seen)
         error, by_depth, weight, distance = self._errors(seen, depth)
-        both = np.empty((*self.flow.shape, len(columns) + 1))
-        both[..., -1] = error
-        now = self._flow(seen, depth)
-        for column, i in enumerate(columns):
-            changed = theta.copy()
-            changed[i] += self.differences[i]
-            both[..., column] = (self._flow(self._seen(changed), depth) - now) / self.differences[i]
+        now, slopes = self._flow(seen, depth), []
+        for i in columns:
+            changed = theta + self.differences[i] * np.eye(PARAMETERS)[i]
+            slopes.append((self._flow(self._seen(changed), depth) - now) / self.differences[i])
+        both = np.stack([*slopes, error], axis=-1)
         cross, fitted = self._per_step(by_depth, weight, both)
         found = np.tensordot(both, weight @ both, ((0, 1), (0, 1)))
         found -= np.tensordot(cross, fitted, ((0, 1), (0, 1)))
@@ -552,10 +509,7 @@ class WristView:
     def _seen(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Homogeneous pixels (m, 3) of the cells' rays after the step, and their motion by a unit of inverse depth (m, 3)."""
         camera = moved_camera(self.camera, theta)
-        moves = theta[[0, 1, 2, 3, 4, 5, LAG]].tobytes()  # the other changes K alone
-        if moves not in self._steps:
-            self._steps[moves] = _steps_between(camera.T_base_camera, float(theta[LAG]))
-        turns, places = self._steps[moves]
+        turns, places = _steps_between(camera.T_base_camera, float(theta[LAG]))
         turned = camera.K @ turns @ np.linalg.inv(camera.K)
         return np.einsum("mij,mj->mi", turned[self.step], self._pixels), (places @ camera.K.T)[self.step]
 
@@ -620,12 +574,10 @@ def _estimate(view: str, evidence: StillView | WristView, shared: float, every: 
     """The error of one view whose pictures are `every` frames apart."""
     prior = np.diag(PRIOR_DEVIATION**-2.0)
     theta = np.zeros(PARAMETERS)
-    start = equations = evidence.equations(theta, BLURS[-1])
-    change = np.linalg.solve(equations.information + prior, equations.gradient)
-    far = float(change @ equations.gradient) > FAR
-    for number, blur in enumerate(BLURS_FAR if far else BLURS):
-        if far or number:
-            equations = evidence.equations(theta, blur)
+    start = evidence.equations(theta, BLURS[-1])
+    far = float(np.linalg.solve(start.information + prior, start.gradient) @ start.gradient) > FAR
+    for blur in BLURS_FAR if far else BLURS:
+        equations = evidence.equations(theta, blur) if far or theta.any() else start
         change = np.linalg.solve(equations.information + prior, equations.gradient - prior @ theta)
         theta = theta + change / max(1.0, float(np.abs(change / LARGEST_STEP).max()))
     last = evidence.equations(theta, BLURS[-1])

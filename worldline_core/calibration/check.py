@@ -28,16 +28,11 @@ from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_s
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.camera_errors import corrected_camera
-from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, Explanation, SourceDiagnosis, diagnose_source
+from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SourceDiagnosis, diagnose_source
 from worldline_core.config import apply_overrides, load_config, read_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.recorded_episode import check_camera, check_times, check_values
-from worldline_core.data.episodes.conventions import (
-    RecordedConventions,
-    along_tool_z,
-    apply_conventions,
-    frames_with_all,
-)
+from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, frames_with_all
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
@@ -230,15 +225,14 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName) 
         for camera in episode.cameras.values():
             check_camera(episode, camera)
         frames = {view: episode_images(loaded, view) for view in loaded.views}
-        arms, note = _kinematics_of(episode, kinematics)
-        notes = (note,) if note else ()
+        arms, notes = _kinematics_of(episode, kinematics)
         diagnosis = diagnose(episode, frames, arms)
     except DataError as error:
         reason = error.reason if isinstance(error, RejectedInputError) else "unreadable"
         details = [f"{name} {value}" for name in ("expected", "got") if (value := getattr(error, name)) is not None]
         said = "; ".join([error.what, *details])
         return EpisodeCheck(item.episode_id, item.source, None, reason, said)
-    picture: str | None = f"pictures/{safe_stem(diagnosis.episode_id)}.jpg"
+    picture: str | None = f"pictures/{safe_stem(episode.episode_id)}.jpg"
     try:
         write_bytes_atomic(output / picture, jpeg_bytes(diagnosis_picture(diagnosis, episode, frames, arms)))
     except DataError as error:
@@ -247,16 +241,16 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName) 
     return EpisodeCheck(item.episode_id, item.source, diagnosis, config_lines=lines, picture=picture, notes=notes)
 
 
-def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmKinematics | None, str]:
-    """Kinematics of an episode's robot where it has as many arms as the recording; else None, and why."""
+def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmKinematics | None, tuple[str, ...]]:
+    """Kinematics of an episode's robot where it has as many arms as the recording; else None, and a note that says why."""
     try:
         built = kinematics.get(episode.embodiment)
     except (ConfigError, DataError, UnavailableError) as error:
         how = f" ({error.next_step})" if error.next_step else ""
-        return None, f"without kinematics of {episode.embodiment}: {error.what}{how}"
+        return None, (f"without kinematics of {episode.embodiment}: {error.what}{how}",)
     if episode.T_base_ee is None or episode.T_base_ee.shape[1] == len(built.embodiment.arms):
-        return built, ""
-    return None, f"without kinematics of {episode.embodiment}: it has other arms than the recording"
+        return built, ()
+    return None, (f"without kinematics of {episode.embodiment}: it has other arms than the recording",)
 
 
 def episode_images(loaded: LoadedEpisode, view: str) -> MadeFrames:
@@ -287,32 +281,27 @@ def _sum_up(listed: Sequence[ListedEpisode], checked: Sequence[EpisodeCheck]) ->
 
 
 def check_command(
-    config: Path | None,
-    artifact: Path | None,
+    path: Path,
     *,
+    artifact: bool = False,
     overrides: Sequence[str] = (),
     episodes: Sequence[str] = (),
     output: Path | None = None,
 ) -> CalibrationCheck:
-    """Check some `episodes` (none: all) of a configuration file's sources or of an EpisodeSet; `overrides` (`a.b=value`) change
-    the file.
+    """Check some `episodes` (none: all) of a configuration file's sources or, with `artifact`, of an EpisodeSet's folder;
+    `overrides` (`a.b=value`) change the file.
 
     Writes into `output`, by default `artifacts/calibration/<name of the file or folder>`.
 
     Raises:
-        ConfigError: neither or both of file and folder are given, or the file has a mistake.
+        ConfigError: the file has a mistake, or a folder is to be changed.
         DataError: the source cannot be opened, or has no such episode.
         ArtifactError: the EpisodeSet is damaged.
     """
-    descriptions: dict[str, str] = {}
-    if artifact is not None and config is None:
-        if overrides:
-            raise ConfigError("--set changes a configuration file, and none is given", got=", ".join(overrides))
-        listed, name = episodes_of_artifact(artifact), artifact.resolve().name
-    elif config is not None and artifact is None:
-        (listed, descriptions), name = episodes_of_config(config, overrides), config.stem
-    else:
-        raise ConfigError("Give a source's configuration file or an EpisodeSet", got=f"{config}, {artifact}")
+    if artifact and overrides:
+        raise ConfigError("--set changes a configuration file, and none is given", got=", ".join(overrides))
+    listed, descriptions = (episodes_of_artifact(path), {}) if artifact else episodes_of_config(path, overrides)
+    name = path.resolve().name if artifact else path.stem
     known = {item.episode_id for item in listed}
     if unknown := set(episodes) - known:
         expected = f"one of {len(known)} ids, such as {', '.join(sorted(known)[:3])}"
@@ -324,7 +313,7 @@ def check_command(
 # Texts and pages
 
 
-def verdict_text(found: Conclusion) -> str:
+def verdict_text(found: Diagnosis) -> str:
     """The verdict, with the cameras that are off or what could have gone unseen, and the views that nothing judges."""
     said = words(found.verdict)
     if found.verdict == "off":
@@ -407,7 +396,7 @@ def as_json(check: CalibrationCheck) -> dict[str, Any]:
     return json.loads(TypeAdapter(Any, config=ConfigDict(ser_json_inf_nan="null")).dump_json(content))
 
 
-def _conclusion_json(found: Conclusion) -> dict[str, Any]:
+def _conclusion_json(found: Diagnosis) -> dict[str, Any]:
     return {
         "verdict": found.verdict,
         "mistake": found.best.mistake,
@@ -460,15 +449,10 @@ def diagnosis_picture(
 
     Raises: DataError when nothing can be drawn in any view.
     """
-    conventions = diagnosis.best.conventions
-    repaired, offset, first = None, 0.0, 0
+    best, verdict = diagnosis.best, verdict_text(diagnosis)
+    conventions, repaired = best.conventions, None
     if conventions.departures:
-        if recorded.T_base_ee is None:
-            # Tools come from kinematics: apply_conventions has no recorded poses to move.
-            offset = conventions.tool_offset_z_m
-            conventions = conventions.model_copy(update={"tool_offset_z_m": 0.0})
         repaired = apply_conventions(recorded, conventions)
-        first = frames_with_all(recorded.num_frames, conventions)[0]
     elif diagnosis.verdict == "off":
         cameras = {e.view: corrected_camera(recorded.cameras[e.view], e) for e in diagnosis.off}
         repaired = replace(recorded, cameras={**recorded.cameras, **cameras})
@@ -477,9 +461,9 @@ def diagnosis_picture(
     arms: Sequence[str] = ()
     for view in (view for view in frames if view in recorded.cameras):
         before = recorded_tracks(recorded, view, kinematics)
-        after = before if repaired is None else recorded_tracks(repaired, view, kinematics, offset)
+        after = before if repaired is None else recorded_tracks(repaired, view, kinematics)
         # Image m belongs to state m as recorded, and to state m - lag of the repaired episode.
-        lag = 0 if repaired is None else first + conventions.image_lag(view)
+        lag = frames_with_all(recorded.num_frames, conventions)[0] + conventions.image_lag(view)
         common = [n for n in range(min(len(frames[view]), before.num_frames)) if 0 <= n - lag < after.num_frames]
         chosen = [common[i] for i in evenly_spaced(len(common), 2 * MOMENTS if repaired is None else MOMENTS)]
         if not chosen:
@@ -492,7 +476,6 @@ def diagnosis_picture(
     if not left:
         expected = "a calibrated view with images"
         raise DataError("Nothing to draw", where=f"episode {recorded.episode_id}", expected=expected)
-    best, verdict = diagnosis.best, verdict_text(diagnosis)
     titles = "as recorded", f"repaired: {best.text if best.departures else verdict}"
     rows = [each for each in zip((left, right), titles, strict=True) if each[0]]
     sheets = [contact_sheet(row, tile_height=TILE_HEIGHT, title=title, min_width=MIN_WIDTH) for row, title in rows]
@@ -506,10 +489,8 @@ def diagnosis_picture(
     ])  # fmt: skip
 
 
-def recorded_tracks(
-    episode: Episode, view: str, kinematics: ArmKinematics | None, tool_offset_z_m: float = 0.0
-) -> EpisodeTracks:
-    """The state's tools, moved along their +z, in one view with K and camera poses as the episode has them."""
+def recorded_tracks(episode: Episode, view: str, kinematics: ArmKinematics | None) -> EpisodeTracks:
+    """The state's tools in one view with K and camera poses as the episode has them."""
     camera = episode.cameras[view]
     if episode.T_base_ee is not None:
         tools = torch.tensor(episode.T_base_ee, dtype=torch.float64)
@@ -523,7 +504,6 @@ def recorded_tracks(
     else:
         expected = "recorded tool poses, or joints and kinematics"
         raise DataError("No tools to draw", where=f"episode {episode.episode_id}", expected=expected)
-    tools = torch.from_numpy(along_tool_z(tools.numpy(), tool_offset_z_m))
     poses = torch.tensor(camera.poses(np.arange(episode.num_frames)), dtype=torch.float64)[:, None]
     K = torch.tensor(camera.K, dtype=torch.float64)[None]
     size, count = (camera.height, camera.width), tools.shape[1]

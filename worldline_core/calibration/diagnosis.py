@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -106,8 +106,8 @@ NOTHING_TRIED = Explanation(RecordedConventions(), 0.0, {})
 
 
 @dataclass(frozen=True, kw_only=True)
-class Conclusion:
-    """Conclusion over an episode or a source; docs/calibration.md says what each verdict means.
+class Diagnosis:
+    """Conclusion over an episode, or over a source; docs/calibration.md says what each verdict means.
 
     Attributes:
         best: the reading to believe; the recording as written unless the verdict is explained.
@@ -131,7 +131,7 @@ class Conclusion:
     def as_recorded(self) -> Explanation:
         return next(explanation for explanation in self.ranked if explanation.mistake == "none")
 
-    def with_camera_errors[C: Conclusion](self: C, errors: tuple[CameraError, ...], *, together: bool = False) -> C:
+    def with_camera_errors(self, errors: tuple[CameraError, ...], *, together: bool = False) -> Self:
         """With the cameras' errors; consistent becomes `off` where one is significant (`together`: over a source), and
         `mixed` where the episodes of a source contradict each other."""
         off, verdict = significant(errors, together=together), self.verdict
@@ -142,14 +142,7 @@ class Conclusion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Diagnosis(Conclusion):
-    """Conclusion over one episode."""
-
-    episode_id: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class SourceDiagnosis(Conclusion):
+class SourceDiagnosis(Diagnosis):
     """Conclusion over a source, with summed scores; `votes`: verdicts and mistakes of its episodes, counted."""
 
     source: str
@@ -264,8 +257,8 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
     )  # fmt: skip
     if best.other is not None:
         return found
-    alike = {d.episode_id: d.camera_errors for d in listed if d.best.conventions == best.conventions}
-    return found.with_camera_errors(combine(list(alike.values())), together=len(alike) >= FEWEST_TOGETHER)
+    alike = [d.camera_errors for d in listed if d.best.conventions == best.conventions]
+    return found.with_camera_errors(combine(alike), together=len(alike) >= FEWEST_TOGETHER)
 
 
 _Key = frozenset[tuple[str, str]]

@@ -36,6 +36,8 @@ MAX_REACH_M, MAX_CAMERA_M, MAX_WRIST_CAMERA_M = 2.5, 5.0, 0.5
 """Tool from base, camera from base, wrist camera from its tool."""
 FOLLOWS_COMMANDS_COST = 2.0
 """Camera poses may follow the commands rather than the states."""
+COMMANDS_FIT_RATIO, NOTICEABLE_M = 3.0, 0.001
+"""Camera poses follow the commands when their residual against the states is larger by this ratio, and noticeable."""
 FACING_DEG, FACING_SPREAD_DEG = 45.0, 10.0
 """Between a wrist camera's axis and the direction to its tool."""
 
@@ -119,11 +121,10 @@ def _quadratic(*ratios: float) -> float:
 
 def _wrist(observation: Observation, reading: Reading, camera: CameraTrack) -> dict[str, float]:
     view, i = camera.view, observation.wrists[camera.view]
-    poses = camera.poses(np.arange(len(reading.tools)))
-    mount, metres, degrees = rms_hand_eye(reading.tools[:, i], poses)
+    mount, metres, degrees = rms_hand_eye(reading.tools[:, i], camera.T_base_camera)
     rigid = hand_eye_log_likelihood(metres, degrees)
     if reading.action_tools is not None:
-        _, *by_action = rms_hand_eye(reading.action_tools[:, i], poses)
+        _, *by_action = rms_hand_eye(reading.action_tools[:, i], camera.T_base_camera)
         rigid = max(rigid, hand_eye_log_likelihood(*by_action) - FOLLOWS_COMMANDS_COST)
     terms = {f"hand-eye {view}": rigid}
     if (stated := observation.arms[i].T_tool_mount) is not None:
@@ -169,10 +170,9 @@ def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, f
 
 def in_view_share(reading: Reading, camera: CameraTrack) -> float:
     """Share of frames with some arm's tool in the picture, in front of the camera."""
-    poses = camera.poses(np.arange(len(reading.tools)))
     inside = np.zeros(len(reading.tools), dtype=bool)
     for i in range(reading.tools.shape[1]):
-        uv, depth = project_points(reading.tools[:, i, :3, 3], camera.K, poses)
+        uv, depth = project_points(reading.tools[:, i, :3, 3], camera.K, camera.T_base_camera)
         inside |= (depth > MIN_DEPTH_M) & inside_image(uv, (camera.height, camera.width))
     return float(inside.mean())
 
@@ -218,15 +218,31 @@ def image_terms(observation: Observation, reading: Reading, *, wrist_flow: bool 
     return terms
 
 
+def unseen(observation: Observation, view: str) -> str | None:
+    """The reason why a calibrated view's pictures say nothing of motion; None where they do. A view of no hand must stand still."""
+    count = len(observation.gray.get(view, ()))
+    if count <= MIN_IMAGE_PAIRS:
+        return f"{count} pictures are too few to compare motion with"
+    if view not in observation.wrists and view not in observation.still_views:
+        return "its camera moves, and no hand carries it"
+    return None if observation.motion(view).moves else "its pictures do not change"
+
+
 def observable_views(observation: Observation) -> list[str]:
-    """Calibrated views with enough pictures and motion; those of no hand must stand still."""
-    return [
-        view
-        for view in observation.episode.cameras
-        if len(observation.gray.get(view, ())) > MIN_IMAGE_PAIRS
-        and (view in observation.wrists or view in observation.still_views)
-        and observation.motion(view).moves
-    ]
+    """Calibrated views whose pictures show motion."""
+    return [view for view in observation.episode.cameras if unseen(observation, view) is None]
+
+
+def not_judged(observation: Observation) -> dict[str, str]:
+    """By calibrated view, why its pictures say nothing about its camera."""
+    found = {}
+    for view, camera in observation.episode.cameras.items():
+        why = unseen(observation, view)
+        if why is None and view in observation.wrists and not camera.moving:
+            why = "its camera has one pose, though its hand moves"
+        if why is not None:
+            found[view] = why
+    return found
 
 
 def frozen_views(observation: Observation, reading: Reading) -> list[str]:
@@ -291,12 +307,8 @@ def shortened(steps: np.ndarray) -> np.ndarray:
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's correlation of two series; 0 where one does not vary. np.corrcoef takes longer for the same bits."""
-    both = np.array([a, b], dtype=np.float64)
-    both -= both.mean(axis=1, keepdims=True)
-    covariance = both @ both.T * (1 / (len(a) - 1))
-    one, two = np.sqrt(covariance.diagonal())
-    return float(np.clip(covariance[0, 1] / one / two, -1.0, 1.0)) if min(one, two) > 1e-9 else 0.0
+    """Pearson's correlation of two series; 0 where one does not vary."""
+    return float(np.corrcoef(a, b)[0, 1]) if min(np.std(a), np.std(b)) > 1e-9 else 0.0
 
 
 def cosine(a: np.ndarray, b: np.ndarray) -> float:
@@ -363,7 +375,7 @@ def finger_agreement(observation: Observation, reading: Reading, arm: int) -> fl
     if name not in reading.predictions:
         tool, (points, radii) = reading.tools[:, arm, :3, 3], reading.capsules
         near = np.median(lengths(points - tool[:, None]), axis=0) < FINGER_LENGTH_M
-        T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
+        T_camera_base = rigid_inverse(camera.T_base_camera)
         points = points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
         fixed = replace(camera, T_base_camera=np.eye(4)[None])
         reading.predictions[name] = predict_motion(points, radii[near], fixed)
@@ -392,8 +404,7 @@ def finger_flow(observation: Observation, reading: Reading, arm: int) -> float |
     opening = np.diff(reading.gripper[:, arm])
     states, images = reading.steps(observation.num_images, view)
     motion, camera = observation.motion(view), reading.cameras[view]
-    poses = camera.poses(np.arange(len(reading.tools)))
-    uv, depth = project_points(reading.tools[:, arm, :3, 3], camera.K, poses)
+    uv, depth = project_points(reading.tools[:, arm, :3, 3], camera.K, camera.T_base_camera)
     point, near = np.median(uv, axis=0), float(np.median(depth))
     if near < 0.01 or not np.isfinite(point).all():
         return 0.0
@@ -422,3 +433,23 @@ def stopped_share(reading: Reading, arm: int) -> float | None:
     still = np.maximum(np.abs(np.gradient(opening)), np.abs(np.gradient(command))) < STOPPED_STEP
     rests = still & (np.abs(gap) > STOPPED_GAP)
     return float((gap[rests] > 0).mean()) if rests.sum() >= 4 else None
+
+
+def notes_on(observation: Observation, recorded: Reading) -> list[str]:
+    """Limits of the evidence, and other facts for a person."""
+    notes: list[str] = []
+    for view, i in observation.wrists.items():
+        camera, commands = recorded.cameras.get(view), recorded.action_tools
+        if camera is None or commands is None:
+            continue
+        arms = recorded.tools[:, i], commands[:, i]
+        states_m, commands_m = (rms_hand_eye(tools, camera.T_base_camera)[1] for tools in arms)
+        if states_m > NOTICEABLE_M and states_m > COMMANDS_FIT_RATIO * commands_m:
+            fits = f"follow the commands ({1e3 * commands_m:.1f} mm), not the states ({1e3 * states_m:.1f} mm)"
+            notes.append(f"{view}: the camera poses {fits}")
+    if recorded.gripper is None:
+        return [*notes, "gripper: the state names no gripper columns, polarity is not judged"]
+    for i, arm in enumerate(observation.arms):
+        if finger_flow(observation, recorded, i) is None and stopped_share(recorded, i) is None:
+            notes.append(f"gripper {arm.name}: does not move enough to be seen, polarity is not judged")
+    return notes
