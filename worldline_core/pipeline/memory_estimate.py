@@ -158,7 +158,7 @@ class Work(NamedTuple):
 
 
 def outlined(config: WorldModelConfig, lora: LoRAConfig | None = None) -> WorldModel:
-    """A model without values, with adapters where they are asked for; call it as `Training.outline`."""
+    """A model without values, with adapters where they are asked for; call it within a FakeTensorMode."""
     with unset_fake_temporarily(), torch.device("meta"):  # peft moves adapters from device to device
         model = build_world_model(config)
         if lora is not None:
@@ -212,13 +212,14 @@ class Training:
             if shards == 1:
                 _hold(work.models, trainer, trainer.weights)
             trained = [[value for value in model.parameters() if value.requires_grad] for model in work.models]
+            weights = [value for values in trained for value in values]
             counts = [sum(value.numel() for value in values) for values in trained]
             block = sum(value.numel() for value in work.models[0].layers[0].parameters())
             scores = _weight_bytes([one for one, count in zip(work.models[1:], counts[1:], strict=True) if not count])
             found = {
                 "parameters": sum(counts) or sum(value.numel() for value in work.models[0].parameters()),
                 "weights": (_weight_bytes(work.models) - scores) / shards,
-                "moments": sum(_moment_bytes(value, trainer) for values in trained for value in values) / shards,
+                "moments": sum(_moment_bytes(value, trainer) for value in weights) / shards,
                 "average": (trainer.average == "device") * 4 * counts[0] / shards,
                 **{name: sum(value.nbytes for value in one.state_dict().values()) for name, one in work.whole.items()},
                 "frozen scores": scores / shards,
@@ -237,7 +238,7 @@ class Training:
                     return work.run(step)[0]
 
             for step, share in self.turns:
-                held = traced(partial(loss, step), [value for values in trained for value in values])
+                held = traced(partial(loss, step), weights)
                 found |= {f"{_MOMENT} in {step}": held.forward, f"{_MOMENT} after {step}": held.backward}
                 found["operations"] += share * held.operations
             for number, (times, look) in enumerate(work.before):
@@ -321,7 +322,7 @@ def _flow_matching(config: Stage1Config | Stage2Config, source: Sources, model: 
         before.append((trainer.batch_size, lambda: look(torch.empty(size))))
     objective = FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
     if stored:
-        reader = hold_weights(build_world_model(model), "bf16", "bf16")
+        reader = hold_weights(outlined(model), "bf16", "bf16")
         objective.encode_text = torch.no_grad()(reader.encode_text)
     return Work(partial(objective.loss, batch, torch.Generator()), [network], whole=whole, before=before)
 
