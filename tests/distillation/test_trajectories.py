@@ -23,7 +23,8 @@ from worldline_core.distillation.trajectory_regression import (
 from worldline_core.model.block_causal_attention import KVCache, block_bounds
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import CAUSAL_SIGMAS as NODES
-from worldline_core.pipeline.memory_estimate import Sources, Training, trainings
+from worldline_core.pipeline import memory_estimate
+from worldline_core.pipeline.memory_estimate import Sources, trainings
 from worldline_core.pipeline.memory_trace import Held
 from worldline_core.training.training_config import SigmaSampling
 
@@ -140,7 +141,7 @@ def test_stage2_says_in_part_what_blocks_of_clips_it_knows_should_become(make_mo
 
 
 def test_the_teacher_is_in_the_memory_sheet(make_model, monkeypatch):
-    monkeypatch.setattr(Training, "_held", lambda *_args, **_named: Held(100, 0))
+    monkeypatch.setattr(memory_estimate, "traced", lambda *_: Held(100, 0))
     source = Sources(None, None, (32, 32), (4, 4))
 
     def planned(**forcing):
@@ -155,7 +156,7 @@ def test_the_teacher_is_in_the_memory_sheet(make_model, monkeypatch):
 
 @pytest.mark.slow
 def test_scores_that_share_their_weights_are_planned_once(make_model, monkeypatch):
-    monkeypatch.setattr(Training, "_held", lambda *_args, **_named: Held(100, 0))
+    monkeypatch.setattr(memory_estimate, "traced", lambda *_: Held(100, 0))
     source = Sources(None, None, (32, 32), (4, 4))
 
     def planned(**adapters):

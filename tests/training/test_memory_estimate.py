@@ -1,5 +1,6 @@
 """Estimated memory is what a real training step takes; what cannot fit is refused before the first step."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -108,12 +109,12 @@ def test_estimated_memory_is_what_the_allocator_hands_out(size, values, tmp_path
 def test_a_deep_model_holds_what_two_shallow_ones_predict(monkeypatch):
     # The backward pass of deep models holds most where shallow ones do before it.
     for depths in (memory_trace.SHALLOW, (1, 2)):
-        held = memory_trace.extrapolated(lambda layers: Held(10 + layers, 2 * layers, 3 + layers), 36, depths)
-        assert held == (46, 72, 39)
+        found = memory_trace.extrapolated(lambda layers: {"before": 10 + layers, "after": 2 * layers}, 36, depths)
+        assert found == {"before": 46, "after": 72}
     config = MixtureConfig(towers="generation", num_layers=10)
-    line = training_of(config, sharding=BLOCK)._held(sharded=False)
-    monkeypatch.setattr(memory_estimate, "extrapolated", lambda trace, layers: trace(layers))
-    assert line == training_of(config, sharding=BLOCK)._held(sharded=False)
+    lines = [training_of(config, sharding=BLOCK).estimate(devices) for devices in (1, 2)]
+    monkeypatch.setattr(memory_estimate, "extrapolated", lambda figures, layers: figures(layers))
+    assert lines == [training_of(config, sharding=BLOCK).estimate(devices) for devices in (1, 2)]
 
 
 def test_operations_are_those_that_torch_counts():
@@ -123,8 +124,8 @@ def test_operations_are_those_that_torch_counts():
         objective(model).loss(batch, torch.Generator(), 0)[0].backward()
     tokens, width = 3 * 5 * 4 * 6, config.num_heads * config.head_dim
     attention = config.num_layers * 14 * tokens**2 * width  # two products on the way there and five on the way back
-    held = training_of(config, 17, precision="fp32")._held(sharded=False)
-    assert held.operations == sum(counter.get_flop_counts()["Global"].values()) + attention
+    figures = training_of(config, 17, precision="fp32").figures(config.num_layers, shards=1)
+    assert figures["operations"] == sum(counter.get_flop_counts()["Global"].values()) + attention
 
 
 def test_checkpointing_and_more_devices_hold_less():
@@ -136,17 +137,16 @@ def test_checkpointing_and_more_devices_hold_less():
 
 
 def test_parts_are_shared_out_but_for_what_is_frozen_and_whole(monkeypatch):
-    monkeypatch.setattr(Training, "_held", lambda *_args, **_named: Held(100, 0))
+    monkeypatch.setattr(memory_estimate, "traced", lambda *_: Held(100, 0))
 
-    def work(layers):
-        models = [build_world_model(TWO_LAYERS.model_copy(update={"num_layers": layers})) for _ in "ab"]
-        return Work(lambda _: None, models[:1], [models[1].requires_grad_(False)], {"tokenizer": torch.nn.Linear(1, 1)})
+    def work(config):
+        models = [build_world_model(config), build_world_model(config).requires_grad_(False)]
+        return Work(lambda _: None, models, {"tokenizer": torch.nn.Linear(1, 1)})
 
-    monkeypatch.setattr(Training, "outline", lambda _, layers, _weights: work(layers))
     count = sum(value.numel() for value in build_world_model(TWO_LAYERS).parameters())
 
     def parts(devices, **trainer):
-        return training_of(TWO_LAYERS, precision="fp32", **trainer).estimate(devices).parts
+        return replace(training_of(TWO_LAYERS, precision="fp32", **trainer), work=work).estimate(devices).parts
 
     whole = {"weights": 4, "moments": 8, "average": 4, "frozen scores": 4, "gradients": 4}
     assert parts(1, accumulation=2) == {name: size * count for name, size in whole.items()} | {

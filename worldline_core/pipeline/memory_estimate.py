@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
@@ -29,12 +29,11 @@ from worldline_core.distillation.trajectory_regression import TrajectoryBatch, T
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import read_checkpoint_info
 from worldline_core.model.lpips import LPIPS
-from worldline_core.model.mixture import is_text_parameter
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import spatial_compression, tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WanConfig, WorldModelConfig
-from worldline_core.pipeline.memory_trace import Held, extrapolated, traced
+from worldline_core.pipeline.memory_trace import extrapolated, traced
 from worldline_core.training.adapters import add_adapters, share_frozen
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
@@ -45,7 +44,6 @@ from worldline_core.training.optimizers import BLOCK, in_eight_bits
 from worldline_core.training.processes import hold_weights
 from worldline_core.training.relational import RelationalTerm, common_shape, similarity_matrices
 from worldline_core.training.resident import track_bytes
-from worldline_core.training.stage1 import is_trained
 from worldline_core.training.stage2 import stage2_model_config
 from worldline_core.training.trainer import autocast
 from worldline_core.training.training_config import (
@@ -60,8 +58,9 @@ from worldline_core.training.video_teacher import teacher_outline
 USABLE = 0.92
 """Share of a device's memory that a stage may fill; the rest is for the driver, communication and fragmentation."""
 
+_MOMENT = "most"
 AnyStage = Stage1Config | Stage2Config | DistillConfig
-Before = tuple[int, Callable[[], Held]]
+Before = tuple[int, Callable[[], Any]]
 
 
 def gigabytes(size: float) -> str:
@@ -80,7 +79,6 @@ class Sources:
     grid: tuple[int, int]
 
     @classmethod
-    @cache
     def of(cls, tokenizer: Path | None, teacher: Path | None, image_size: tuple[int, int]) -> Sources:
         """With the latents that a tokenizer makes of pictures of a size."""
         space = spatial_compression(tokenizer)
@@ -107,19 +105,10 @@ class Sources:
         count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
         return self.batch(model, count * trainer.batch_size, views, max(clips.lengths), text)
 
-    def encoding(self, batch: Batch, trainer: TrainerConfig) -> Before:
-        """Encode a batch, one view of a clip after the other: number of passes, and memory of one."""
-        encode = partial(self.looking, "tokenizer", batch.clips[0].num_frames, trainer.precision)
-        return len(batch.clips) * len(batch.views), encode
-
-    @cache  # noqa: B019 - a few sources a process
-    def looking(
-        self, by: Literal["tokenizer", "teacher"], frames: int, precision: Literal["bf16", "fp32"], views: int = 1
-    ) -> Held:
-        """Memory that the tokenizer needs to encode one view of a clip, or the relational teacher to encode all of them."""
-        with FakeTensorMode(), torch.no_grad(), autocast(TrainerConfig(steps=1, precision=precision)):
-            look = teacher_outline(self.teacher)[1] if by == "teacher" else tokenizer_outline(self.tokenizer).encode
-            return traced(lambda: look(torch.empty(views, 3, frames, *self.image_size)))
+    def encoder(self, batch: Batch) -> tuple[nn.Module, Before]:
+        """The tokenizer, and its encoding of a batch, one view of a clip after the other."""
+        tokenizer, size = tokenizer_outline(self.tokenizer), (1, 3, batch.clips[0].num_frames, *self.image_size)
+        return tokenizer, (len(batch.clips) * len(batch.views), lambda: tokenizer.encode(torch.empty(size)))
 
 
 @dataclass(frozen=True)
@@ -157,25 +146,23 @@ class Work(NamedTuple):
 
     Attributes:
         run: by the step's number; where something is trained, its loss comes first.
-        models, scores: world models that are trained, the first alone averaged, and those that are not.
+        models: world models: the one that is averaged, others that are trained, frozen scores.
         whole: other models that are not trained, whole on every device.
         before: what is done before ``run``, and how often: clips are encoded, a teacher looks at them.
     """
 
     run: Callable[[int], Sequence[Any]]
     models: Sequence[WorldModel]
-    scores: Sequence[WorldModel] = ()
     whole: Mapping[str, nn.Module] = {}
     before: Sequence[Before] = ()
 
 
-def outlined(config: WorldModelConfig, lora: LoRAConfig | None) -> WorldModel:
-    """A model without values, with adapters where they are asked for; call it as `Training.outline`."""
-    if lora is None:
-        return build_world_model(config)
+def outlined(config: WorldModelConfig, lora: LoRAConfig | None = None) -> WorldModel:
+    """A model without values, with adapters where they are asked for; call it within a FakeTensorMode."""
     with unset_fake_temporarily(), torch.device("meta"):  # peft moves adapters from device to device
         model = build_world_model(config)
-        add_adapters(model, lora, 0)
+        if lora is not None:
+            add_adapters(model, lora, 0)
     return model._apply(lambda one: torch.empty(one.shape, dtype=one.dtype))
 
 
@@ -183,6 +170,14 @@ def _weight_bytes(models: Sequence[nn.Module]) -> int:
     """Bytes of models' weights; those that share a storage count once."""
     weights = [value for model in models for value in model.parameters()]
     return sum({value.untyped_storage()._cdata: value.nbytes for value in weights}.values())
+
+
+def _hold(models: Sequence[WorldModel], trainer: TrainerConfig, weights: Literal["fp32", "bf16"]) -> None:
+    """Give models the weights that a device computes with."""
+    for one in models:
+        hold_weights(one, trainer.precision, weights)
+    if len(models) > 2:  # what the fake score does not train is the real one's
+        share_frozen(*models[1:])
 
 
 def _moment_bytes(parameter: Tensor, trainer: TrainerConfig) -> float:
@@ -205,72 +200,69 @@ class Training:
     work: Callable[[WorldModelConfig], Work]
     turns: Sequence[tuple[int, float]] = ((0, 1.0),)
 
-    def outline(self, layers: int, weights: Literal["fp32", "bf16"] | None) -> Work:
-        """The step of a model of so many layers; call it within a FakeTensorMode, or to count weights on the device "meta".
+    def figures(self, layers: int, shards: int) -> dict[str, float]:
+        """Bytes on each of so many devices, and operations of a micro-step, of a model of so many layers.
 
-        Args:
-            weights: those of trained matrices as a device computes with them; None: all in float32, as shards are kept.
+        Each grows by as much with every layer. Gradients and operations are those of one micro-step; the most bytes before and
+        after the loss are apart, for each kind of step.
         """
-        work = self.work(self.model.model_copy(update={"num_layers": layers}))
-        if weights is not None:
-            for one in (*work.models, *work.scores):
-                hold_weights(one, self.trainer.precision, weights)
-            if len(work.models) > 1:
-                share_frozen(work.models[1], work.scores[0])
-        return work
-
-    def _held(self, sharded: bool) -> Held:
-        """A micro-step; its operations are a mean over the kinds of steps."""
         trainer = self.trainer.model_copy(update={"device": "cpu"})  # tensors without values follow a CPU's paths
+        with FakeTensorMode():
+            work = self.work(self.model.model_copy(update={"num_layers": layers}))
+            if shards == 1:
+                _hold(work.models, trainer, trainer.weights)
+            trained = [[value for value in model.parameters() if value.requires_grad] for model in work.models]
+            weights = [value for values in trained for value in values]
+            counts = [sum(value.numel() for value in values) for values in trained]
+            block = sum(value.numel() for value in work.models[0].layers[0].parameters())
+            scores = _weight_bytes([one for one, count in zip(work.models[1:], counts[1:], strict=True) if not count])
+            found = {
+                "parameters": sum(counts) or sum(value.numel() for value in work.models[0].parameters()),
+                "weights": (_weight_bytes(work.models) - scores) / shards,
+                "moments": sum(_moment_bytes(value, trainer) for value in weights) / shards,
+                "average": (trainer.average == "device") * 4 * counts[0] / shards,
+                **{name: sum(value.nbytes for value in one.state_dict().values()) for name, one in work.whole.items()},
+                "frozen scores": scores / shards,
+                # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
+                "gathered": 0 if shards == 1 else block * (2 * 2 + 2 + 4),
+                "gradients": max(sum(value.nbytes for value in values) for values in trained),
+                "operations": 0.0,
+            }
+            if shards > 1:
+                _hold(work.models, trainer, "bf16")  # shards are kept in float32
+            for one in work.models:
+                one.checkpointing = trainer.sharding.checkpointing
 
-        def trace(step: int, layers: int) -> Held:
-            with FakeTensorMode():
-                work = self.outline(layers, "bf16" if sharded else trainer.weights)
-                for one in (*work.models, *work.scores):
-                    one.checkpointing = trainer.sharding.checkpointing
-                weights = [value for one in work.models for value in one.parameters()]
+            def loss(step: int) -> Tensor:
+                with autocast(trainer):
+                    return work.run(step)[0]
 
-                def loss() -> Tensor:
-                    with autocast(trainer):
-                        return work.run(step)[0]
-
-                return traced(loss, weights)
-
-        kinds = [extrapolated(partial(trace, step), self.model.num_layers) for step, _ in self.turns]
-        operations = sum(share * held.operations for (_, share), held in zip(self.turns, kinds, strict=True))
-        return Held(max(max(held[:2]) for held in kinds), 0, operations)
+            for step, share in self.turns:
+                held = traced(partial(loss, step), weights)
+                found |= {f"{_MOMENT} in {step}": held.forward, f"{_MOMENT} after {step}": held.backward}
+                found["operations"] += share * held.operations
+            for number, (times, look) in enumerate(work.before):
+                with torch.no_grad(), autocast(trainer):
+                    held = traced(look)
+                found[f"{_MOMENT} before, {number}"] = held.forward
+                found["operations"] += times * held.operations
+        return found
 
     def estimate(self, devices: int) -> Estimate:
         """Memory on each of so many devices that share the training."""
         trainer, sharding = self.trainer, self.trainer.sharding
         shards, clips = min(sharding.shards or devices, devices), trainer.batch_size * devices
         micro_steps = trainer.accumulation if trainer.global_batch is None else -(-trainer.global_batch // clips)
-        held = self._held(sharded=shards > 1)
-        with torch.device("meta"):
-            work = self.outline(self.model.num_layers, trainer.weights if shards == 1 else None)
-        before = [(times, look()) for times, look in work.before]
-        trained = [[value for value in model.parameters() if value.requires_grad] for model in work.models]
-        counts = [sum(value.numel() for value in values) for values in trained]
-        block = sum(value.numel() for value in work.models[0].layers[0].parameters())
-        summed = micro_steps == 1 or sharding.reduce_every_micro_step
-        scores = _weight_bytes(work.scores)
-        parts = {
-            "weights": (_weight_bytes([*work.scores, *work.models]) - scores) / shards,
-            "moments": sum(_moment_bytes(value, trainer) for values in trained for value in values) / shards,
-            "average": (trainer.average == "device") * 4 * counts[0] / shards,
-            **{name: sum(value.nbytes for value in one.state_dict().values()) for name, one in work.whole.items()},
-            "frozen scores": scores / shards,
-            # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
-            "gathered": 0 if shards == 1 else block * (2 * 2 + 2 + 4),
-            "gradients": max(sum(value.nbytes for value in values) for values in trained) / (shards if summed else 1),
-            "activations": max([held.forward, *(look.forward for _, look in before)]),
-        }
-        operations = micro_steps * (held.operations + sum(times * look.operations for times, look in before))
+        parts = extrapolated(partial(self.figures, shards=shards), self.model.num_layers)
+        if micro_steps == 1 or sharding.reduce_every_micro_step:
+            parts["gradients"] /= shards
+        parts["activations"] = max(parts.pop(name) for name in list(parts) if name.startswith(_MOMENT))
+        operations = parts.pop("operations")
         return Estimate(
             self.title,
-            parameters=sum(counts) or sum(value.numel() for value in work.models[0].parameters()),
+            parameters=round(parts.pop("parameters")),
             parts={name: size for name, size in parts.items() if size},
-            operations=operations if trainer.precision == "bf16" else None,
+            operations=micro_steps * operations if trainer.precision == "bf16" else None,
             steps=trainer.steps,
             minutes=trainer.minutes,
         )
@@ -310,27 +302,27 @@ def _flow_matching(config: Stage1Config | Stage2Config, source: Sources, model: 
     stored = first is not None and first.text_tower == "stored"
     network = outlined(model.model_copy(update={"towers": "generation"}) if stored else model, config.lora)
     if first is not None and config.lora is None:
-        for name, value in network.named_parameters():
-            read = is_text_parameter(name) and first.text_tower != "trained"
-            value.requires_grad_(is_trained(name) and not read)
+        read = () if first.text_tower == "trained" else network.text_parameters()
+        for _, value in (*network.action_parameters(), *read):
+            value.requires_grad_(False)
     text = 0 if first is None else first.text.max_length
     batch = source.largest(model, trainer, config.clips, model.views, text)
     whole, before, term = dict[str, nn.Module](), list[Before](), None
     if isinstance(config.input, FrameInput):
-        whole["tokenizer"] = tokenizer_outline(source.tokenizer)
-        before.append(source.encoding(batch, trainer))
+        whole["tokenizer"], encode = source.encoder(batch)
+        before.append(encode)
     if isinstance(config, Stage2Config) and config.relational is not None:
         relational = config.relational.model_copy(update={"student_layer": None})  # all are held, whichever it is
-        whole["teacher"] = teacher_outline(source.teacher)[0]
+        whole["teacher"], look = teacher_outline(source.teacher)
         term = RelationalTerm(relational, cast("Any", None), network.config.num_layers)
         term.targets = lambda batch, grid: similarity_matrices(
             torch.empty(*batch.latents.shape[:2], *grid, 1), common_shape(relational, grid)
         )
-        frames, views = max(config.clips.lengths), len(model.views)
-        before.append((trainer.batch_size, partial(source.looking, "teacher", frames, trainer.precision, views)))
+        size = len(model.views), 3, max(config.clips.lengths), *source.image_size
+        before.append((trainer.batch_size, lambda: look(torch.empty(size))))
     objective = FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
     if stored:
-        reader = hold_weights(build_world_model(model), "bf16", "bf16")
+        reader = hold_weights(outlined(model), "bf16", "bf16")
         objective.encode_text = torch.no_grad()(reader.encode_text)
     return Work(partial(objective.loss, batch, torch.Generator()), [network], whole=whole, before=before)
 
@@ -343,8 +335,8 @@ def _distillation(
     batch = source.largest(model, trainer, config.first_clips if forcing else config.clips, config.views)
     whole, before, distance = dict[str, nn.Module](), list[Before](), None
     if isinstance(config.input, FrameInput):  # it stays, though the later steps use the latents of the trajectories
-        whole["encoder"] = tokenizer_outline(source.tokenizer)
-        before = [source.encoding(batch, trainer)] if making or forcing else []
+        whole["encoder"], encode = source.encoder(batch)
+        before = [encode] if making or forcing else []
     network = outlined(model, None if making else config.lora)
     if making:
         network.requires_grad_(False)
@@ -355,31 +347,32 @@ def _distillation(
             return [teacher_trajectories(*given, views=batch.views, spec=spec, substeps=(1,) * spec.steps)]
 
         return Work(run, [network], whole=whole, before=before)
-    models, scores = [network], list[WorldModel]()
+    models = [network]
     if forcing:
-        scores = [build_world_model(model).requires_grad_(False)] if config.teacher_forcing.teacher_share else []
-        objective: Any = TeacherForcingObjective(network, config, *scores)
+        if config.teacher_forcing.teacher_share:
+            models.append(outlined(model).requires_grad_(False))
+        objective: Any = TeacherForcingObjective(network, config, *models[1:])
+        return Work(partial(objective.loss, batch, torch.Generator()), models, whole, before)
+    shown, views, channels, frames, *grid = batch.latents.shape
+    nodes = torch.empty(shown, config.spec.steps + 1, views, channels, frames - 1, *grid)
+    mask = torch.ones(shown, views, frames, *grid)
+    batch = TrajectoryBatch(**vars(batch), nodes=nodes, history=batch.latents, mask=mask)
+    if config.lpips_weights is not None:
+        decoder, lpips = tokenizer_outline(source.tokenizer), LPIPS().requires_grad_(False)
+        if config.perceptual.bfloat16:
+            for parameter in decoder.parameters():
+                parameter.data = parameter.data.bfloat16()
+        whole |= {"tokenizer": decoder, "lpips": lpips}
+        compared = 1 + config.perceptual.latent_frames
+        perceptual = PerceptualLoss(decoder, lpips, config.perceptual.latent_frames)
+        # One view after the other, and what comes before the compared frames without gradients: neither adds up.
+        distance = lambda a, b: perceptual(a[:1, :1, :, -compared:], b[:1, :1, :, -compared:])  # noqa: E731
+    if part == "trajectory regression":
+        objective = TrajectoryObjective(network, config, distance)
     else:
-        shown, views, channels, frames, *grid = batch.latents.shape
-        nodes = torch.empty(shown, config.spec.steps + 1, views, channels, frames - 1, *grid)
-        mask = torch.ones(shown, views, frames, *grid)
-        batch = TrajectoryBatch(**vars(batch), nodes=nodes, history=batch.latents, mask=mask)
-        if config.lpips_weights is not None:
-            decoder, lpips = tokenizer_outline(source.tokenizer), LPIPS().requires_grad_(False)
-            if config.perceptual.bfloat16:
-                for parameter in decoder.parameters():
-                    parameter.data = parameter.data.bfloat16()
-            whole |= {"tokenizer": decoder, "lpips": lpips}
-            compared = 1 + config.perceptual.latent_frames
-            perceptual = PerceptualLoss(decoder, lpips, config.perceptual.latent_frames)
-            # One view after the other, and what comes before the compared frames without gradients: neither adds up.
-            distance = lambda a, b: perceptual(a[:1, :1, :, -compared:], b[:1, :1, :, -compared:])  # noqa: E731
-        if part == "trajectory regression":
-            objective = TrajectoryObjective(network, config, distance)
-        else:
-            models, scores = [network, outlined(model, config.lora)], [build_world_model(model).requires_grad_(False)]
-            objective = DistributionMatchingObjective(network, scores[0], models[1], config, distance)
-    return Work(partial(objective.loss, batch, torch.Generator()), models, scores, whole, before)
+        models += [outlined(model, config.lora), outlined(model).requires_grad_(False)]
+        objective = DistributionMatchingObjective(network, models[2], models[1], config, distance)
+    return Work(partial(objective.loss, batch, torch.Generator()), models, whole, before)
 
 
 def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:

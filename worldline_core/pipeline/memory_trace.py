@@ -7,7 +7,7 @@ backward pass, as the tokenizers and Stage III do.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,8 +20,8 @@ from torch.utils.flop_counter import flop_registry
 
 WHOLE = 8
 """Most layers of a model that is traced as it is."""
-SHALLOW = (4, 5)
-"""Depths that the line of a deeper model goes through: with fewer layers its worst moment can be another one."""
+SHALLOW = (2, 3)
+"""Depths that the line of a deeper model goes through: with one layer its worst moment can be another one."""
 _ATEN: Any = torch.ops.aten
 _DEVICE: Any = torch.ops.prim.device.default
 _FLASH = "_scaled_dot_product_flash_attention"
@@ -145,10 +145,12 @@ def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> 
     return Held(forward, tracker.most, tracker.operations)
 
 
-def extrapolated(trace: Callable[[int], Held], layers: int, shallow: tuple[int, int] = SHALLOW) -> Held:
-    """Return ``trace(layers)``. A deep model is extrapolated by a straight line through two adjacent shallow depths, because its
-    layers are equal."""
+def extrapolated(
+    figures: Callable[[int], Mapping[str, float]], layers: int, shallow: tuple[int, int] = SHALLOW
+) -> dict[str, float]:
+    """Return ``figures(layers)``. A deep model's are extrapolated by a straight line through two adjacent shallow depths, because
+    its layers are equal."""
     if layers <= WHOLE:
-        return trace(layers)
-    first, second = (trace(depth) for depth in shallow)
-    return Held(*(a + (b - a) * (layers - shallow[0]) for a, b in zip(first, second, strict=True)))
+        return {**figures(layers)}
+    first, second = (figures(depth) for depth in shallow)
+    return {name: value + (second[name] - value) * (layers - shallow[0]) for name, value in first.items()}

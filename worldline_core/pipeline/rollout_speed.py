@@ -17,7 +17,7 @@ from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig
 from worldline_core.model.tokenizers import VideoTokenizer, tokenizer_outline
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline.memory_estimate import Sources
-from worldline_core.pipeline.memory_trace import Held, extrapolated, traced
+from worldline_core.pipeline.memory_trace import extrapolated, traced
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
 
 
@@ -73,7 +73,7 @@ def block_costs(
 def _sampling(config: DistillConfig, model: WorldModelConfig, source: Sources, views: Sequence[str]) -> float:
     spec = config.spec
 
-    def trace(layers: int) -> Held:
+    def operations(layers: int) -> dict[str, float]:
         with FakeTensorMode(), torch.no_grad():
             network = build_world_model(model.model_copy(update={"num_layers": layers})).eval()
             simulator = BlockCausalSimulator(network, spec, noise=_NoNoise(), views=views)
@@ -86,9 +86,9 @@ def _sampling(config: DistillConfig, model: WorldModelConfig, source: Sources, v
                     network.write_block(block.latents, simulator.cache, action_maps=block.action_maps, views=views)
 
             traced(fill)
-            return traced(lambda: simulator.step(block.action_maps))
+            return {"block": traced(lambda: simulator.step(block.action_maps)).operations}
 
-    return extrapolated(trace, model.num_layers, (1, 2)).operations  # exact at any depth, unlike the most bytes
+    return extrapolated(operations, model.num_layers, (1, 2))["block"]  # exact at any depth, unlike the most bytes
 
 
 def _decoding(config: DistillConfig, source: Sources) -> tuple[float, float]:
