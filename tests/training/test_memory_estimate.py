@@ -113,7 +113,7 @@ def test_a_deep_model_holds_what_two_shallow_ones_predict(monkeypatch):
         assert found == {"before": 46, "after": 72}
     config = MixtureConfig(towers="generation", num_layers=10)
     lines = [training_of(config, sharding=BLOCK).estimate(devices) for devices in (1, 2)]
-    monkeypatch.setattr(memory_estimate, "extrapolated", lambda figures, layers: figures(layers))
+    monkeypatch.setattr(memory_estimate, "extrapolated", lambda figures, layers, _: figures(layers))
     assert lines == [training_of(config, sharding=BLOCK).estimate(devices) for devices in (1, 2)]
 
 

@@ -33,7 +33,7 @@ from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import spatial_compression, tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WanConfig, WorldModelConfig
-from worldline_core.pipeline.memory_trace import extrapolated, traced
+from worldline_core.pipeline.memory_trace import SHALLOW, extrapolated, traced
 from worldline_core.training.adapters import add_adapters, share_frozen
 from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
@@ -192,6 +192,7 @@ class Training:
     Attributes:
         work: a step of the model, whose depth may be another one, made without values.
         turns: numbers of steps, one of each kind that the training takes (distribution matching alternates), and their shares.
+        shallow: depths that the line of a deeper model goes through.
     """
 
     title: str
@@ -199,6 +200,7 @@ class Training:
     model: WorldModelConfig
     work: Callable[[WorldModelConfig], Work]
     turns: Sequence[tuple[int, float]] = ((0, 1.0),)
+    shallow: tuple[int, int] = SHALLOW
 
     def figures(self, layers: int, shards: int) -> dict[str, float]:
         """Bytes on each of so many devices, and operations of a micro-step, of a model of so many layers.
@@ -253,7 +255,7 @@ class Training:
         trainer, sharding = self.trainer, self.trainer.sharding
         shards, clips = min(sharding.shards or devices, devices), trainer.batch_size * devices
         micro_steps = trainer.accumulation if trainer.global_batch is None else -(-trainer.global_batch // clips)
-        parts = extrapolated(partial(self.figures, shards=shards), self.model.num_layers)
+        parts = extrapolated(partial(self.figures, shards=shards), self.model.num_layers, self.shallow)
         if micro_steps == 1 or sharding.reduce_every_micro_step:
             parts["gradients"] /= shards
         parts["activations"] = max(parts.pop(name) for name in list(parts) if name.startswith(_MOMENT))
@@ -284,15 +286,17 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
     # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
     passes = (1 + sum(steps.substeps)) / (1 + config.spec.steps)
     model = model.model_copy(update={"towers": "generation"})
+    alternating = ((0, 1 - 1 / CYCLE), (CYCLE - 1, 1 / CYCLE))
+    shallow = (4, 5)  # at lower depths a score's worst moment can be another one
     parts = {
-        "teacher forcing": (config.teacher_forcing.trainer, ((0, 1.0),)),
+        "teacher forcing": (config.teacher_forcing.trainer,),
         f"trajectories (a shard of {clips} clips)": (shard, ((0, passes),)),
-        "trajectory regression": (config.trajectory_regression.trainer, ((0, 1.0),)),
-        "distribution matching": (config.distribution_matching.trainer, ((0, 1 - 1 / CYCLE), (CYCLE - 1, 1 / CYCLE))),
+        "trajectory regression": (config.trajectory_regression.trainer,),
+        "distribution matching": (config.distribution_matching.trainer, alternating, shallow),
     }
     return [
-        Training(f"distill: {part}", trainer, model, partial(_distillation, part, config, source, trainer), turns)
-        for part, (trainer, turns) in parts.items()
+        Training(f"distill: {part}", trainer, model, partial(_distillation, part, config, source, trainer), *settings)
+        for part, (trainer, *settings) in parts.items()
     ]
 
 

@@ -146,7 +146,7 @@ def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> 
 
 
 def extrapolated(
-    figures: Callable[[int], Mapping[str, float]], layers: int, shallow: tuple[int, int] = SHALLOW
+    figures: Callable[[int], Mapping[str, float]], layers: int, shallow: tuple[int, int]
 ) -> dict[str, float]:
     """Return ``figures(layers)``. A deep model's are extrapolated by a straight line through two adjacent shallow depths, because
     its layers are equal."""
