@@ -12,7 +12,7 @@ from torch import Tensor
 
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
-from worldline_core.model.layers import TextContext, is_action_parameter
+from worldline_core.model.layers import TextContext
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.text import load_text_encoder, padded
 from worldline_core.model.world_model import WorldModel
@@ -28,11 +28,6 @@ from worldline_core.training.training_config import Stage1Config
 
 MOST_BYTES = 2**32
 """Most bytes of the machine's memory that the keys and values of all prompts may take."""
-
-
-def is_trained(name: str) -> bool:
-    """Returns whether Stage I trains a parameter: all of both towers, not the action branch."""
-    return not is_action_parameter(name)
 
 
 def stage1_groups(model: WorldModel) -> list[ParameterGroup]:
