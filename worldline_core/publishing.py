@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, cast
 
+import httpx
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, snapshot_download
 from pydantic import ValidationError
 from upath import UPath
@@ -23,7 +24,7 @@ from worldline_core.config import StrictModel
 from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import for_evaluation_only
-from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError, WorldLineError
+from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
 from worldline_core.http_exchange import hub_access
 from worldline_core.report.data import write_card
 from worldline_core.store.artifact_files import (
@@ -184,9 +185,7 @@ def _client_errors(where: str, verb: str) -> Iterator[None]:
     """Turn errors of a store's client, also those by odd answers of a server, into one that names the next step."""
     try:
         yield
-    except (WorldLineError, MemoryError):
-        raise
-    except Exception as error:
+    except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, httpx.HTTPError) as error:
         raise ArtifactError(
             f"The store did not finish the {verb}", where=where, got=first_line(error)[:300],
             next_step="check the name, the room and the rights (of HF_TOKEN), then run the same command again",
@@ -203,11 +202,15 @@ def _published(where: str) -> tuple[UPath, dict[str, int], FileList | None]:
         return location, present, None
     if present[FILE_LIST] > MAX_LIST_BYTES:
         raise ArtifactError("List of files is too large", where=source, expected=f"at most {MAX_LIST_BYTES} bytes")
+    what, content = "List of files is damaged or of another version", source.read_bytes()
+    if len(content) != present[FILE_LIST]:
+        expected = f"{present[FILE_LIST]} bytes, as the store lists it"
+        raise ArtifactError(what, where=source, expected=expected, got=f"{len(content)} bytes")
     try:
-        return location, present, FileList.model_validate_json(source.read_bytes())
+        return location, present, FileList.model_validate_json(content)
     except ValidationError as error:
         got = error.errors(include_url=False)[0]["msg"]
-        raise ArtifactError("List of files is damaged or of another version", where=source, got=got) from error
+        raise ArtifactError(what, where=source, got=got) from error
 
 
 def _keep_listed(folder: Path, contents: FileList) -> list[str]:

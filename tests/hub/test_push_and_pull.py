@@ -168,10 +168,7 @@ def test_odd_answers_end_in_one_message(hub: Any, folder: Path, tmp_path: Path, 
     for part, answer in ODD_ANSWERS:
         with subtests.test(part=part, answer=answer[:80]):
             hub.instead = lambda method, path, p=part, body=answer: body if re.search(p, path) else None
-            with pytest.raises(
-                ArtifactError,
-                match=r"did not finish the pull|No finished EpisodeSet|List of files is|not those of the set",
-            ):
+            with pytest.raises(ArtifactError, match=r"did not finish the pull|No finished EpisodeSet|List of files is"):
                 pull(PLACE, tmp_path / "back")
 
 

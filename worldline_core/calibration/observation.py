@@ -13,7 +13,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from einops import reduce
 from torch import Tensor
 
 from worldline_core.actions.robot_masks import robot_capsules
@@ -31,6 +30,7 @@ METRES_PER_RADIAN = 0.15
 """A wrist camera that turns by one radian shows about as much change as one that travels this far."""
 MIN_SHAPED_LINKS = 3
 """With shapes of fewer links of an arm, capsules along its links stand for it."""
+_STEPS_AT_ONCE = 64
 _CAPSULE_SAMPLES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 _TOOL_POINTS_M = np.array([0.0, 0.05, 0.1, 0.15])
 _TOOL_RADIUS_M = 0.05
@@ -149,28 +149,34 @@ def cell_centres(height: int, width: int) -> np.ndarray:
 
 def cell_means(values: np.ndarray) -> np.ndarray:
     """(n, h, w, ...) -> (n, r, c, ...): mean over CELL_PX squares; incomplete ones at the border are dropped."""
-    r, c = values.shape[1] // CELL_PX, values.shape[2] // CELL_PX
-    cut = values[:, : r * CELL_PX, : c * CELL_PX].astype(np.float32)
+    n, height, width = values.shape[:3]
+    r, c = height // CELL_PX, width // CELL_PX
+    cut = np.ascontiguousarray(values[:, : r * CELL_PX, : c * CELL_PX], dtype=np.float32)
     # Rows of pixels first: whole rows are added, which is several times as fast as square by square.
-    rows = reduce(cut, "n (r down) ... -> n r ...", "sum", down=CELL_PX)
-    return reduce(rows, "n r (c across) ... -> n r c ...", "sum", across=CELL_PX) / np.float32(CELL_PX**2)
+    rows = cut.reshape(n, r, CELL_PX, -1).sum(axis=2)
+    return rows.reshape(n, r, c, CELL_PX, *values.shape[3:]).sum(axis=3) / np.float32(CELL_PX**2)
 
 
 def measured_motion(gray: np.ndarray, *, exact: bool = False) -> Motion:
     """Image motion of a view's small grey images (n, h, w); `exact` takes three times as long."""
+    if len(gray) < 2:
+        empty = np.zeros((0, gray.shape[1] // CELL_PX, gray.shape[2] // CELL_PX), dtype=np.float32)
+        return Motion(np.zeros((*empty.shape, 2), dtype=np.float32), empty, empty)
     preset = cv2.DISOPTICAL_FLOW_PRESET_FAST if exact else cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST
     engine = cv2.DISOpticalFlow.create(preset)
     engine.setFinestScale(0 if exact else 1)
+    parts: list[tuple[np.ndarray, ...]] = []
     # Cells alone are kept of an episode: flow of every pixel of some minutes would fill gigabytes.
-    size = max(0, len(gray) - 1), gray.shape[1] // CELL_PX, gray.shape[2] // CELL_PX
-    found = Motion(np.zeros((*size, 2), np.float32), *np.zeros((2, *size), np.float32))
-    edges = np.zeros((2, *gray.shape[1:]), np.uint8)
-    for i, (before, after) in enumerate(pairwise(gray)):
-        edges[0, :, :-1] = cv2.absdiff(before[:, 1:], before[:, :-1])
-        edges[1, :-1] = cv2.absdiff(before[1:], before[:-1])
-        found.flow[i] = cell_means(engine.calc(before, after, None)[None])[0]  # type: ignore[call-overload]
-        found.change[i], found.texture[i] = cell_means(np.stack([cv2.absdiff(before, after), edges.max(axis=0)]))
-    return found
+    for begin in range(0, len(gray) - 1, _STEPS_AT_ONCE):
+        part = gray[begin : begin + _STEPS_AT_ONCE + 1]
+        flow = np.stack([engine.calc(a, b, None) for a, b in pairwise(part)])  # type: ignore[call-overload]
+        across, down = np.zeros((2, *part[1:].shape), np.uint8)
+        across[:, :, :-1] = cv2.absdiff(part[:-1, :, 1:], part[:-1, :, :-1])
+        down[:, :-1] = cv2.absdiff(part[:-1, 1:], part[:-1, :-1])
+        change = cv2.absdiff(part[1:], part[:-1])
+        parts.append((cell_means(flow), cell_means(change), cell_means(np.maximum(across, down))))
+    flow, change, texture = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Motion(flow, change, texture)
 
 
 def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[ObservedArm, ...]:

@@ -34,8 +34,8 @@ class WorldModelConfig(StrictModel):
     head_dim: int = Field(default=64, ge=2)
     intermediate_size: int = Field(default=576, ge=1)
     fps: float | None = Field(default=None, gt=0)
-    """Where it is set, temporal positions advance by ``base_fps / fps`` per latent frame (Cosmos3's fps modulation), with the
-    rate of each clip itself where it is known. None counts latent frames, whatever the rate."""
+    """Rate of the video [1/s]: temporal positions advance by ``base_fps / fps`` per latent frame (Cosmos3's fps modulation).
+    A clip of known rate uses its own. None counts latent frames, whatever the rate."""
     base_fps: float = Field(default=24.0, gt=0)
 
     views: tuple[str, ...] = VIEWS

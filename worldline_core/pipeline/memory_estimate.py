@@ -59,6 +59,7 @@ USABLE = 0.92
 """Share of a device's memory that a stage may fill; the rest is for the driver, communication and fragmentation."""
 
 _MOMENT = "most"
+"""Beginning of the names of bytes held at different moments: the largest of them counts."""
 AnyStage = Stage1Config | Stage2Config | DistillConfig
 Before = tuple[int, Callable[[], Any]]
 

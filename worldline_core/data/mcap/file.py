@@ -95,7 +95,9 @@ class McapFile:
             for magic, (got, next_step) in _OTHER_FORMATS.items():
                 if begins.startswith(magic):
                     what = "Recording is in another format"
-                    raise RejectedInputError("unreadable", what, where=self.path, got=got, next_step=next_step)
+                    raise RejectedInputError(
+                        "unreadable", what, where=self.path, expected="MCAP", got=got, next_step=next_step
+                    )
             stream.seek(0)
             summary = SeekingReader(stream, record_size_limit=MAX_CHUNK_BYTES).get_summary()
             chunks = [] if summary is None else [index.chunk_start_offset for index in summary.chunk_indexes]

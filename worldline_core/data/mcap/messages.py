@@ -100,7 +100,8 @@ class EncodedImage:
         if not re.match(rb"\x00\x00+\x01", self.data):
             got = f"{self.data[:8].hex(' ')}, in AVCC the length of the unit"
             next_step = "write the packets through FFmpeg's bitstream filter h264_mp4toannexb or hevc_mp4toannexb"
-            raise refused("Video messages are not in Annex B", expected="00 00 01", got=got, next_step=next_step)
+            expected = "a start code (00 00 00 01) before every NAL unit"
+            raise refused("Video messages are not in Annex B", expected=expected, got=got, next_step=next_step)
 
 
 @dataclass(frozen=True, slots=True)

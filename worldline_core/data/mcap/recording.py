@@ -273,9 +273,11 @@ class _Recording:
             finite: np.ndarray = np.all(np.isfinite(values), axis=1)
             if not finite.all():
                 at_s = float((times[np.argmin(finite)] - grid[0]) / 1e9)
-                what, evidence = "Readings of a topic are not finite", {"at_s": at_s}
-                got = f"{int((~finite).sum())} of {len(finite)} messages, the first at {at_s:.3f} s"
-                raise RejectedInputError("nan_state", what, where=where, got=got, evidence=evidence)
+                raise RejectedInputError(
+                    "nan_state", "Readings of a topic are not finite", where=where, evidence={"at_s": at_s},
+                    expected="finite numbers between the episode's beginning and end",
+                    got=f"{int((~finite).sum())} of {len(finite)} messages, the first at {at_s:.3f} s",
+                )  # fmt: skip
             if readings is arm.gripper:  # which may be switched: it has no speed
                 check_alternation(times, arm.gripper.range.opening(values)[0], where)
                 continue

@@ -121,7 +121,9 @@ def in_order_with_values(times_ns: np.ndarray, values: np.ndarray, where: str) -
 
 def _conflict(what: str, where: str, got: str) -> RejectedInputError:
     next_step = "record the topic with one publisher, or declare another topic (a command that steps: resample: hold)"
-    return RejectedInputError("conflicting_messages", what, where=where, got=got, next_step=next_step)
+    return RejectedInputError(
+        "conflicting_messages", what, where=where, expected="one publisher", got=got, next_step=next_step
+    )
 
 
 @np.errstate(over="ignore")
