@@ -31,7 +31,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from benchmarks.harness import command_line
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.environment.environment import WorldLineVectorEnv, measured_success
+from worldline_core.environment.environment import MeasuredSuccess, WorldLineVectorEnv
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.evaluation.paired import paired_tests
 from worldline_core.evaluation.policy.evaluate_policy import policy_agreement
@@ -145,7 +145,7 @@ class Worlds:
         self.physics = SyncVectorEnv([lambda: world], autoreset_mode=AutoresetMode.DISABLED)
         self.starts = Starts(options.recordings, world, options.starts)
         self._target, self._instruction = world.target, lambda number: world.starts[number].instruction
-        self._judge = measured_success()
+        self._judge = MeasuredSuccess()
 
     def attempts(self, name: str, learned: LearnedPolicy | None, missing: list[int]) -> Iterator[dict[str, Any]]:
         """One policy at the starts that are missing, as many at a time as the simulator holds."""

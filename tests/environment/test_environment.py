@@ -1,11 +1,13 @@
 """The simulator as a Gymnasium environment."""
 
+import threading
 import warnings
 from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import SyncVectorEnv
 
@@ -13,7 +15,13 @@ from worldline_core import WorldLine
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment import ENVIRONMENT
-from worldline_core.environment.environment import RobotSpaces, WorldLineEnv, WorldLineVectorEnv, shipped_segmenter
+from worldline_core.environment.environment import (
+    RobotSpaces,
+    WorldLineEnv,
+    WorldLineVectorEnv,
+    _side_by_side,
+    shipped_segmenter,
+)
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.policy.measured_judge import soft_score
 from worldline_core.geometry.embodiment import load_embodiment
@@ -225,6 +233,17 @@ def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world, starts):
         assert np.isnan(list(facts.values())).any()
     with pytest.raises(DataError, match=r"(?s)no soft score.*named by its colour.*got: 'tidy up'"):
         soft_score(segmenter, replace(video, instruction="tidy up"))
+
+
+def test_videos_are_judged_side_by_side():
+    before, both = torch.get_num_threads(), threading.Barrier(2, timeout=10)
+    torch.set_num_threads(4)
+    try:
+        found = _side_by_side(lambda one: (one, torch.get_num_threads(), both.wait() < 2), range(2))
+        assert found == [(0, 2, True), (1, 2, True)]
+        assert torch.get_num_threads() == 4
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -28,6 +29,7 @@ from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -56,10 +58,14 @@ def shipped_segmenter() -> Segmenter:
     return open_segmenter("learned", learned=shipped_folder() / "models" / "segmenter", sam3=None)
 
 
-def measured_success() -> Success:
+class MeasuredSuccess:
     """The measured judge with the shipped segmenter: it tracks the thing that the instruction names by its colour."""
-    judge = MeasuredEvidenceJudge(shipped_segmenter())
-    return lambda trajectory: judge_trajectory(judge, trajectory).success
+
+    def __init__(self) -> None:
+        self._judge = MeasuredEvidenceJudge(shipped_segmenter())
+
+    def __call__(self, trajectory: Trajectory) -> bool:
+        return judge_trajectory(self._judge, trajectory).success
 
 
 class RobotSpaces:
@@ -284,7 +290,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         views: that are simulated, one of the sets that the model was trained on; by default the largest.
         episode_frames: steps of an episode.
         observe_every: steps between two observations of pictures, a divisor of the block's length; by default the block.
-        success: "measured" (`measured_success`), a function, or None: then nothing is a success.
+        success: "measured" (`MeasuredSuccess`), a function, or None: then nothing is a success.
         reward: "success", 1 at the end of an episode that is one; or "soft", at every new picture what it adds to the likelihood
             that the task is done (`soft_score`); then infos have this likelihood (``score``) and what is measured (``task_state``).
         start, frame: name of a recording and number of a frame at which every episode begins; a reset's ``options`` may name others.
@@ -348,7 +354,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         self.kinematics = ArmKinematics(load_embodiment(self.starts.embodiment))
         self.num_envs, self.episode_frames = num_envs, episode_frames
         self._limits, self._autoreset = limits, autoreset
-        self._succeeds = measured_success() if success == "measured" else success
+        self._succeeds = MeasuredSuccess() if success == "measured" else success
         self._segmenter = shipped_segmenter() if reward == "soft" else None
         self._usual_start = start, frame
         self.render_mode = render_mode
@@ -486,12 +492,9 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             for slot, (start, picture) in enumerate(zip(starts, simulation.pictures, strict=True))
         ]  # fmt: skip
         if self._segmenter is not None:
-            for slot, episode in enumerate(self._episodes):
-                episode.look(self._segmenter, episode.video, self._other_scores(slot))
+            self._look([episode.video for episode in self._episodes])
+            for episode in self._episodes:
                 episode.reward = 0.0
-
-    def _other_scores(self, slot: int) -> list[float]:
-        return [member._episodes[slot].score for member in self._members]
 
     def _video_so_far(self, start: RecordedStart, picture: dict[str, np.ndarray], points: np.ndarray) -> Trajectory:
         """The picture, as the model sees it, and where a judge will look at it, what was recorded before."""
@@ -515,20 +518,31 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         if not last and count % self.observe_every:
             return
         simulation, clips = running.predict()
+        videos = []
         for slot, (episode, clip) in enumerate(zip(self._episodes, clips, strict=True)):
             episode.picture = {view: video[-1] for view, video in clip.items()}
-            video = longer(episode.video, clip, simulated_points(simulation, slot)[:count])
+            videos.append(longer(episode.video, clip, simulated_points(simulation, slot)[:count]))
             if count == self.frames_per_step:
-                episode.video = video
-            if last and self._succeeds is not None:
-                found = self._succeeds(video)
+                episode.video = videos[-1]
+        if last and self._succeeds is not None:
+            # A function of others is called for one video after the other.
+            beside = isinstance(self._succeeds, MeasuredSuccess)
+            judged = _side_by_side(self._succeeds, videos) if beside else map(self._succeeds, videos)
+            for slot, (episode, found) in enumerate(zip(self._episodes, judged, strict=True)):
                 if not isinstance(found, bool | np.bool_ | None):
                     raise DataError("Not a judgement", where="success", expected="True, False or None", got=found)
                 episode.success = bool(found) and all(member._episodes[slot].success for member in self._members)
+        for episode in self._episodes:
             episode.reward = float(episode.success)
-            if self._segmenter is not None:
-                episode.look(self._segmenter, video, self._other_scores(slot))
+        if self._segmenter is not None:
+            self._look(videos)
+            for episode in self._episodes:
                 episode.doubted |= episode.disagreement > self._largest_disagreement
+
+    def _look(self, videos: Sequence[Trajectory]) -> None:
+        """Measure how far each episode is in its video so far."""
+        others = [[member._episodes[slot].score for member in self._members] for slot in range(self.num_envs)]
+        _side_by_side(RunningEpisode.look, self._episodes, [self._segmenter] * self.num_envs, videos, others)
 
     def _observed(self, slot: int) -> dict[str, Any]:
         episode = self._episodes[slot]
@@ -548,6 +562,18 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         for slot, info in enumerate(self.infos()):
             gathered = self._add_info(gathered, info, slot)
         return gathered
+
+
+def _side_by_side[T](work: Callable[..., T], *arguments: Sequence[Any]) -> list[T]:
+    """Results of ``map``, computed on as many threads as torch uses: one video does not fill the cores of a processor."""
+    threads = torch.get_num_threads()
+    count = min(threads, len(arguments[0]))
+    if count == 1:
+        return list(map(work, *arguments))
+    with ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(threads // count,)) as pool:
+        results = list(pool.map(work, *arguments))
+    torch.set_num_threads(threads)  # what a thread of the pool sets is also the default of threads that begin later
+    return results
 
 
 def _opened(model: Path | str | WorldLine, options: Mapping[str, Any]) -> WorldLine:

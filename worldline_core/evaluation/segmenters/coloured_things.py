@@ -98,7 +98,10 @@ def _projection(frames: np.ndarray, rgb: np.ndarray) -> np.ndarray:
     strength = max(float(np.linalg.norm(axis)), 1e-6)
     axis = axis / strength
     chroma = frames.astype(np.float32)
-    chroma -= chroma.mean(axis=-1, keepdims=True)
+    # numpy's reductions take four times as long over an axis of three.
+    chroma -= (chroma[..., :1] + chroma[..., 1:2] + chroma[..., 2:]) / np.float32(3)
     along = chroma @ axis
-    beside = np.linalg.norm(chroma - along[..., None] * axis, axis=-1)
+    chroma -= along[..., None] * axis
+    chroma *= chroma
+    beside = np.sqrt(chroma[..., 0] + chroma[..., 1] + chroma[..., 2])
     return (along - _OTHER_HUE * beside) / strength
