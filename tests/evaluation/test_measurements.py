@@ -33,7 +33,7 @@ def faded(frames, share):
 def lift_score(success, share):
     frames, masks, _ = make_film(success, seed=3)
     shown = {view: faded(video, share) for view, video in frames.items()}
-    return measured_judge.measure_lift(shown, CUBE, masks[-measured_judge.LATE_COUNT :]).score()
+    return measured_judge.measure_lift(shown, CUBE, masks[-measured_judge.LATE_COUNT :], 1).score()
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6, 0.45])
@@ -90,20 +90,39 @@ def test_a_button_that_lights_up_is_pressed_though_something_hides_a_part_of_it(
 
 
 @pytest.mark.parametrize("towards_the_camera", [True, False])
-def test_a_drawer_closes_away_from_the_camera_or_towards_it(towards_the_camera):
-    closed = slice(28, 30) if towards_the_camera else slice(10, 12)
-    frames = np.stack([painted((rows, slice(30, 45))) for rows in [slice(10, 30)] * 5 + [closed] * 3])
-    measured = measured_judge.measure_push(
-        {"head": frames}, things.ColouredThing("red", "drawer"), np.zeros((3, 48, 72), bool)
-    )
-    assert measured.remaining == pytest.approx(0.1, abs=0.02)
-    assert measured.retreat > 0.8
+@pytest.mark.parametrize(("rows", "closed"), [(2, True), (8, False)])
+def test_a_drawer_is_closed_when_little_of_it_is_left(towards_the_camera, rows, closed):
+    left = slice(30 - rows, 30) if towards_the_camera else slice(10, 10 + rows)
+    frames = np.stack([painted((shown, slice(30, 45))) for shown in [slice(10, 30)] * 5 + [left] * 3])
+    instruction = "push the red drawer closed"
+    measured = measured_judge.measure(ColourSegmenter(), instruction, route(instruction), {"head": frames}, None)
+    assert measured.remaining == pytest.approx(rows / 20, abs=0.02)
+    facts = measured_judge.facts(measured, instruction, "state_change")
+    assert establishes_success(facts) is (measured.score() > 0.5) is closed
+
+
+def test_a_drawer_that_the_robot_hides_is_not_closed():
+    frames = np.stack([painted((slice(10, 30), slice(30, 45)))] * 5 + [painted()] * 3)
+    robot = np.zeros((3, 48, 72), bool)
+    robot[:, 12:32, 30:45] = True
+    drawer = things.ColouredThing("red", "drawer")
+    assert measured_judge.measure_push({"head": frames}, drawer, robot).remaining is None
+    robot[:, 12:18] = False
+    assert measured_judge.measure_push({"head": frames}, drawer, robot).remaining == 0
+
+@pytest.mark.parametrize(("hands", "held"), [(1, 1.0), (2, 0.0)])
+def test_two_hands_touch_more_of_a_thing_than_one(hands, held):
+    frames = np.stack([painted((rows, slice(30, 40))) for rows in [slice(30, 40)] * 5 + [slice(10, 20)] * 3])
+    robot = np.zeros((3, 48, 72), bool)
+    robot[:, 8:22, 29:31] = True  # four of ten columns are within a third of the thing's size
+    measured = measured_judge.measure_lift({"head": frames}, things.ColouredThing("red", "block"), robot, hands)
+    assert measured.held == held
 
 
 def test_a_wide_thing_rises_in_units_of_its_height():
     frames = np.stack([painted((rows, slice(10, 60))) for rows in [slice(34, 38)] * 5 + [slice(24, 28)] * 3])
     measured = measured_judge.measure_lift(
-        {"head": frames}, things.ColouredThing("red", "tray"), np.zeros((3, 48, 72), bool)
+        {"head": frames}, things.ColouredThing("red", "tray"), np.zeros((3, 48, 72), bool), 2
     )
     assert measured.rise == pytest.approx(10 / 4, rel=0.35)
 

@@ -45,20 +45,21 @@ LATE_COUNT = 3
 _MIN_AREA_FRACTION = 0.0009  # of the frame: about 5.5 px at 64 x 96
 _VISIBLE = 0.12  # of the thing's largest area
 _CLEAR = 0.35  # of the thing's largest area: enough to measure its position
-HELD_TOUCH = 0.5  # of the thing's area is within a third of its size of the robot
+HELD_TOUCH = 0.27  # for each hand: of the thing's area is within a third of its size of the robot
 HELD_WRIST_SHARE = 0.065  # of a wrist frame
-MIN_RISE, RISE_WIDTH = 0.3, 0.25
+MIN_RISE, MIN_WIDE_RISE, RISE_WIDTH = 0.4, 0.3, 0.25
 MIN_VACATED = 0.6
 DROP_PEAK = 1.0
 MIN_HELD = 0.6
 MAX_DISTANCE, DISTANCE_WIDTH = 0.5, 0.12
-MAX_REMAINING, REMAINING_WIDTH = 0.56, 0.12
-MIN_RETREAT, RETREAT_WIDTH = 0.53, 0.12
+MAX_REMAINING, REMAINING_WIDTH = 0.28, 0.08
+MIN_EMPTIED = 0.2  # of where a thing stood: neither it nor the robot is seen there
 MIN_GROWTH, GROWTH_WIDTH = 1.7, 0.2
 UNSEEN_SCORE = 0.25
 
-# What is to be pressed; what is to be pushed in or closed.
+# What is to be pressed; what both hands are to hold; what is to be pushed in or closed.
 _PRESSING = re.compile(r"\bpress(es|ed|ing)?\b")
+_TWO_HANDS = re.compile(r"\b(both|two) (arms|hands|grippers)\b")
 _CLOSING = re.compile(r"\b(clos(e|ed|ing)|shut|push(ed|ing)?|slid(e|ing))\b")
 
 
@@ -116,24 +117,26 @@ class LiftMeasurement:
         peak: the most it ever rose.
         held: share of the late frames in which it is held.
         vacated: share of where it rested that late frames show empty: neither the thing nor the robot is there.
+        least_rise: from which on it is lifted.
     """
 
     rise: float | None
     peak: float | None
     held: float | None
     vacated: float | None = None
+    least_rise: float = MIN_RISE
 
     def score(self, unseen: float = UNSEEN_SCORE) -> float:
         hidden = max(unseen, 0.8 * (self.vacated or 0.0))
-        rise = hidden if self.rise is None else _above(self.rise, MIN_RISE, RISE_WIDTH)
+        rise = hidden if self.rise is None else _above(self.rise, self.least_rise, RISE_WIDTH)
         return rise * (unseen if self.held is None else 0.1 + 0.9 * self.held)
 
     def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
         held = None if self.held is None else self.held >= MIN_HELD
-        raised = None if self.rise is None else self.rise > MIN_RISE
+        raised = None if self.rise is None else self.rise > self.least_rise
         dropped = None
         if self.rise is not None and self.peak is not None:
-            dropped = self.peak > DROP_PEAK and self.rise < MIN_RISE / 2
+            dropped = self.peak > DROP_PEAK and self.rise < self.least_rise / 2
         elif self.rise is None and held and self.vacated is not None and self.vacated > MIN_VACATED:
             # Hidden behind the gripper in the head view, but in the hand of a wrist view, and gone from where it rested.
             raised, dropped = True, False
@@ -168,29 +171,19 @@ class PlaceMeasurement:
 
 @dataclass(frozen=True)
 class PushMeasurement:
-    """A thing that is pushed in; closed is one of which little is left and whose edge has retreated.
+    """Area of a thing that is pushed in, late against its largest; closed is one of which little is left.
 
-    Attributes:
-        remaining: late share of the visible area that no robot covers.
-        retreat: how far its near edge moved up or its far edge down (whichever is more, for a drawer closes away from the camera or
-            towards it), in sizes; None when nothing of it is visible any more.
+    None where it was not seen, or the robot may hide what is left.
     """
 
     remaining: float | None
-    retreat: float | None
 
     def score(self, unseen: float = UNSEEN_SCORE) -> float:
-        if self.remaining is None:
-            return unseen
-        retreat = 1.0 if self.retreat is None else _above(self.retreat, MIN_RETREAT, RETREAT_WIDTH)
-        return retreat * _above(-self.remaining, -MAX_REMAINING, REMAINING_WIDTH)
+        return unseen if self.remaining is None else _above(-self.remaining, -MAX_REMAINING, REMAINING_WIDTH)
 
     def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
-        done = None
-        if self.remaining is not None:
-            done = self.remaining < MAX_REMAINING and (self.retreat is None or self.retreat > MIN_RETREAT)
-        left, moved = _text(self.remaining), _text(self.retreat)
-        return _final_state(done, f"{names[0]}: {left} of it still visible, edge moved in by {moved} of its size")
+        words = f"{names[0]}: {_text(self.remaining)} of it still visible"
+        return _final_state(None if self.remaining is None else self.remaining < MAX_REMAINING, words)
 
 
 @dataclass(frozen=True)
@@ -223,12 +216,15 @@ def sight(frames: np.ndarray, thing: ColouredThing) -> Sighting:
     return Sighting(shares, area, u, v, own)
 
 
-def measure_lift(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_late: np.ndarray) -> LiftMeasurement:
+def measure_lift(
+    frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_late: np.ndarray, hands: int
+) -> LiftMeasurement:
     """Rise and hold.
 
     Args:
         frames: by view, chosen frames (n, h, w, 3) in order.
         robot_late: robot masks (LATE_COUNT, h, w) of the last frames of the head view.
+        hands: that hold the thing; what two of them hold is wide.
     """
     head = sight(frames[HEAD], thing)
     clear, visible = head.seen(_CLEAR), head.seen(_VISIBLE)
@@ -244,7 +240,8 @@ def measure_lift(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_l
             spot = head.shares[int(np.argmax(early))]
             taken = np.maximum(head.shares[-LATE_COUNT:], robot_late)
             vacated = 1.0 - float((spot * taken).sum(axis=(1, 2)).max()) / float(spot.sum())
-    return LiftMeasurement(rise, peak, _held(frames, thing, head, late & visible, robot_late), vacated)
+    held = _held(frames, thing, head, late & visible, robot_late, hands)
+    return LiftMeasurement(rise, peak, held, vacated, MIN_RISE if hands == 1 else MIN_WIDE_RISE)
 
 
 def measure_place(
@@ -270,17 +267,11 @@ def measure_push(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_l
     head = sight(frames[HEAD], thing)
     best = int(np.argmax(head.area))
     if not head.seen(_CLEAR)[best]:
-        return PushMeasurement(None, None)
-    late = head.area[-LATE_COUNT:]
+        return PushMeasurement(None)
+    late = float(head.area[-LATE_COUNT:].mean()) / float(head.area[best])
     covered = float((head.shares[best] * robot_late).sum(axis=(1, 2)).mean()) / float(head.area[best])
-    remaining = float(late.mean()) / float(head.area[best]) / max(1.0 - covered, 0.05)
-    shown = head.shares[-LATE_COUNT:][late > _MIN_AREA_FRACTION * head.shares[0].size]
-    retreat = None
-    if len(shown):
-        far, near = _edges(head.shares[best])
-        late_far, late_near = np.mean([_edges(share) for share in shown], axis=0)
-        retreat = float(max(near - late_near, late_far - far) / np.sqrt(head.area[best]))
-    return PushMeasurement(remaining, retreat)
+    hidden = late < MAX_REMAINING and late + covered > 1.0 - MIN_EMPTIED
+    return PushMeasurement(None if hidden else late)
 
 
 def measure_press(frames: Mapping[str, np.ndarray], thing: ColouredThing) -> PressMeasurement:
@@ -299,6 +290,7 @@ def _held(
     head: Sighting,
     late_visible: np.ndarray,
     robot_late: np.ndarray,
+    hands: int,
 ) -> float | None:
     """Share of late frames in which the thing touches the robot and fills a wrist camera as only a held thing does.
 
@@ -317,7 +309,7 @@ def _held(
         if view != HEAD
     ]
     in_hand = np.max(wrists, axis=0) / HELD_WRIST_SHARE if wrists else np.full(LATE_COUNT, np.nan)
-    signs = [np.minimum(values, 1.0) for values in (touching / HELD_TOUCH, in_hand) if not np.isnan(values).all()]
+    signs = [np.minimum(values, 1.0) for values in (touching / (HELD_TOUCH * hands), in_hand) if not np.isnan(values).all()]
     if not signs:
         return None
     # Both views have to agree where both can see: a gripper in front of a thing also touches it in the image.
@@ -347,7 +339,8 @@ def measure(
     if len(things) == 0 or HEAD not in frames or len(frames[HEAD]) < LATE_COUNT:
         return None
     if family in ("grasp", "lift"):
-        return measure_lift(frames, things[0], _robot_late(segmenter, frames[HEAD], points))
+        hands = 2 if _TWO_HANDS.search(instruction.lower()) else 1
+        return measure_lift(frames, things[0], _robot_late(segmenter, frames[HEAD], points), hands)
     if len(things) > 1:
         return measure_place(frames, things[0], things[1])
     if _PRESSING.search(instruction.lower()):
