@@ -110,13 +110,17 @@ def test_a_drawer_that_the_robot_hides_is_not_closed():
     robot[:, 12:18] = False
     assert measured_judge.measure_push({"head": frames}, drawer, robot).remaining == 0
 
-@pytest.mark.parametrize(("hands", "held"), [(1, 1.0), (2, 0.0)])
-def test_two_hands_touch_more_of_a_thing_than_one(hands, held):
-    frames = np.stack([painted((rows, slice(30, 40))) for rows in [slice(30, 40)] * 5 + [slice(10, 20)] * 3])
+
+@pytest.mark.parametrize(
+    ("touched", "hands", "held", "firmly"), [(6, 1, 0, 0), (9, 1, 1, 0), (12, 1, 1, 1), (9, 2, 0, 0), (12, 2, 1, 1)]
+)
+def test_two_hands_touch_more_of_a_thing_than_one_and_a_firm_hand_more_than_another(touched, hands, held, firmly):
+    """``touched`` of 20 columns are within a third of the thing's size, 5 pixels, of the robot."""
+    frames = np.stack([painted((rows, slice(30, 50))) for rows in [slice(30, 40)] * 5 + [slice(10, 20)] * 3])
     robot = np.zeros((3, 48, 72), bool)
-    robot[:, 8:22, 29:31] = True  # four of ten columns are within a third of the thing's size
+    robot[:, 8:22, 20 : 25 + touched] = True
     measured = measured_judge.measure_lift({"head": frames}, things.ColouredThing("red", "block"), robot, hands)
-    assert measured.held == held
+    assert (measured.held, measured.held_firmly) == (held, firmly)
 
 
 def test_a_wide_thing_rises_in_units_of_its_height():

@@ -45,9 +45,10 @@ LATE_COUNT = 3
 _MIN_AREA_FRACTION = 0.0009  # of the frame: about 5.5 px at 64 x 96
 _VISIBLE = 0.12  # of the thing's largest area
 _CLEAR = 0.35  # of the thing's largest area: enough to measure its position
-HELD_TOUCH = 0.27  # for each hand: of the thing's area is within a third of its size of the robot
+# By hands: of the thing's area is within a third of its size of the robot.
+HELD_TOUCH, FIRM_TOUCH = {1: 0.4, 2: 0.54}, {1: 0.5, 2: 0.54}
 HELD_WRIST_SHARE = 0.065  # of a wrist frame
-MIN_RISE, MIN_WIDE_RISE, RISE_WIDTH = 0.4, 0.3, 0.25
+MIN_RISE, RISE_WIDTH = {1: 0.4, 2: 0.3}, 0.25  # by hands
 MIN_VACATED = 0.6
 DROP_PEAK = 1.0
 MIN_HELD = 0.6
@@ -115,7 +116,9 @@ class LiftMeasurement:
     Attributes:
         rise: the least of the late heights against the resting height, in sizes or, of a wide thing, in its heights (up is positive).
         peak: the most it ever rose.
-        held: share of the late frames in which it is held.
+        held: share of the late frames in which it is held; 0 when not in the last one: a drop at the very end is a drop.
+        held_firmly: the same of a hand that touches more of it, for the score: a search for high scores finds hands beside the thing that
+            models show as holding it.
         vacated: share of where it rested that late frames show empty: neither the thing nor the robot is there.
         least_rise: from which on it is lifted.
     """
@@ -123,13 +126,14 @@ class LiftMeasurement:
     rise: float | None
     peak: float | None
     held: float | None
+    held_firmly: float | None
     vacated: float | None = None
-    least_rise: float = MIN_RISE
+    least_rise: float = MIN_RISE[1]
 
     def score(self, unseen: float = UNSEEN_SCORE) -> float:
         hidden = max(unseen, 0.8 * (self.vacated or 0.0))
         rise = hidden if self.rise is None else _above(self.rise, self.least_rise, RISE_WIDTH)
-        return rise * (unseen if self.held is None else 0.1 + 0.9 * self.held)
+        return rise * (unseen if self.held_firmly is None else 0.1 + 0.9 * self.held_firmly)
 
     def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
         held = None if self.held is None else self.held >= MIN_HELD
@@ -240,8 +244,9 @@ def measure_lift(
             spot = head.shares[int(np.argmax(early))]
             taken = np.maximum(head.shares[-LATE_COUNT:], robot_late)
             vacated = 1.0 - float((spot * taken).sum(axis=(1, 2)).max()) / float(spot.sum())
-    held = _held(frames, thing, head, late & visible, robot_late, hands)
-    return LiftMeasurement(rise, peak, held, vacated, MIN_RISE if hands == 1 else MIN_WIDE_RISE)
+    touching, in_hand = _signs(frames, thing, head, late & visible, robot_late)
+    held, firmly = (_held(touching / least, in_hand) for least in (HELD_TOUCH[hands], FIRM_TOUCH[hands]))
+    return LiftMeasurement(rise, peak, held, firmly, vacated, MIN_RISE[hands])
 
 
 def measure_place(
@@ -284,18 +289,14 @@ def measure_press(frames: Mapping[str, np.ndarray], thing: ColouredThing) -> Pre
     return PressMeasurement(float(head.area[-LATE_COUNT:].max()) / first)
 
 
-def _held(
+def _signs(
     frames: Mapping[str, np.ndarray],
     thing: ColouredThing,
     head: Sighting,
     late_visible: np.ndarray,
     robot_late: np.ndarray,
-    hands: int,
-) -> float | None:
-    """Share of late frames in which the thing touches the robot and fills a wrist camera as only a held thing does.
-
-    0 when it is not held in the last one: a drop at the very end is a drop.
-    """
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share of the thing near the robot, and how much of a wrist camera it fills [of what a held one does], in late frames; NaN where unseen."""
     touching = np.full(LATE_COUNT, np.nan)
     reach = max(1, round(head.size / 3))
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
@@ -308,12 +309,16 @@ def _held(
         for view in frames
         if view != HEAD
     ]
-    in_hand = np.max(wrists, axis=0) / HELD_WRIST_SHARE if wrists else np.full(LATE_COUNT, np.nan)
-    signs = [np.minimum(values, 1.0) for values in (touching / (HELD_TOUCH * hands), in_hand) if not np.isnan(values).all()]
-    if not signs:
+    return touching, np.max(wrists, axis=0) / HELD_WRIST_SHARE if wrists else np.full(LATE_COUNT, np.nan)
+
+
+def _held(*signs: np.ndarray) -> float | None:
+    """Share of late frames in which each sign is at least 1, 0 when not in the last one; None without any."""
+    known = [np.minimum(values, 1.0) for values in signs if not np.isnan(values).all()]
+    if not known:
         return None
     # Both views have to agree where both can see: a gripper in front of a thing also touches it in the image.
-    holds = np.nanmin(signs, axis=0) >= 1.0
+    holds = np.nanmin(known, axis=0) >= 1.0
     return float(holds.mean()) if holds[-1] else 0.0
 
 
