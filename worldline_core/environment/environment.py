@@ -525,7 +525,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             if count == self.frames_per_step:
                 episode.video = videos[-1]
         if last and self._succeeds is not None:
-            # A function of others is called for one video after the other.
+            # A user's function is called for one video at a time.
             beside = isinstance(self._succeeds, MeasuredSuccess)
             judged = _side_by_side(self._succeeds, videos) if beside else map(self._succeeds, videos)
             for slot, (episode, found) in enumerate(zip(self._episodes, judged, strict=True)):
@@ -565,7 +565,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
 
 def _side_by_side[T](work: Callable[..., T], *arguments: Sequence[Any]) -> list[T]:
-    """Results of ``map``, computed on as many threads as torch uses: one video does not fill the cores of a processor."""
+    """Map `work` over the arguments on as many threads as torch uses, because one video does not fill the cores."""
     threads = torch.get_num_threads()
     count = min(threads, len(arguments[0]))
     if count == 1:

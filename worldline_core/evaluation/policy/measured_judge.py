@@ -45,20 +45,20 @@ LATE_COUNT = 3
 _MIN_AREA_FRACTION = 0.0009  # of the frame: about 5.5 px at 64 x 96
 _VISIBLE = 0.12  # of the thing's largest area
 _CLEAR = 0.35  # of the thing's largest area: enough to measure its position
-# By hands: of the thing's area is within a third of its size of the robot.
+# Share of the thing's area within a third of its size of the robot, by the number of hands that hold it.
 HELD_TOUCH, FIRM_TOUCH = {1: 0.4, 2: 0.54}, {1: 0.5, 2: 0.54}
 HELD_WRIST_SHARE = 0.065  # of a wrist frame
-MIN_RISE, RISE_WIDTH = {1: 0.4, 2: 0.3}, 0.25  # by hands
+MIN_RISE, RISE_WIDTH = {1: 0.4, 2: 0.3}, 0.25  # by the number of hands
 MIN_VACATED = 0.6
 DROP_PEAK = 1.0
 MIN_HELD = 0.6
 MAX_DISTANCE, DISTANCE_WIDTH = 0.5, 0.12
 MAX_REMAINING, REMAINING_WIDTH = 0.28, 0.08
-MIN_EMPTIED = 0.2  # of where a thing stood: neither it nor the robot is seen there
+MIN_EMPTIED = 0.2  # share of where a thing stood that shows neither it nor the robot
 MIN_GROWTH, GROWTH_WIDTH = 1.7, 0.2
 UNSEEN_SCORE = 0.25
 
-# What is to be pressed; what both hands are to hold; what is to be pushed in or closed.
+# Instructions to press something, to use both hands, and to push something in or close it.
 _PRESSING = re.compile(r"\bpress(es|ed|ing)?\b")
 _TWO_HANDS = re.compile(r"\b(both|two) (arms|hands|grippers)\b")
 _CLOSING = re.compile(r"\b(clos(e|ed|ing)|shut|push(ed|ing)?|slid(e|ing))\b")
@@ -117,10 +117,10 @@ class LiftMeasurement:
         rise: the least of the late heights against the resting height, in sizes or, of a wide thing, in its heights (up is positive).
         peak: the most it ever rose.
         held: share of the late frames in which it is held; 0 when not in the last one: a drop at the very end is a drop.
-        held_firmly: the same of a hand that touches more of it, for the score: a search for high scores finds hands beside the thing that
+        held_firmly: the same by a stricter line for touching, for the score: a search for high scores finds grasps beside the thing, which
             models show as holding it.
         vacated: share of where it rested that late frames show empty: neither the thing nor the robot is there.
-        least_rise: from which on it is lifted.
+        least_rise: smallest rise that counts as lifted.
     """
 
     rise: float | None
@@ -175,9 +175,9 @@ class PlaceMeasurement:
 
 @dataclass(frozen=True)
 class PushMeasurement:
-    """Area of a thing that is pushed in, late against its largest; closed is one of which little is left.
+    """Late visible area of a thing that is pushed in, as a share of its largest; it is closed when little is left.
 
-    None where it was not seen, or the robot may hide what is left.
+    None where it was not seen, or where the robot may hide what is left.
     """
 
     remaining: float | None
@@ -228,7 +228,7 @@ def measure_lift(
     Args:
         frames: by view, chosen frames (n, h, w, 3) in order.
         robot_late: robot masks (LATE_COUNT, h, w) of the last frames of the head view.
-        hands: that hold the thing; what two of them hold is wide.
+        hands: number of hands that are to hold the thing; two hold a wide one.
     """
     head = sight(frames[HEAD], thing)
     clear, visible = head.seen(_CLEAR), head.seen(_VISIBLE)
@@ -296,7 +296,10 @@ def _signs(
     late_visible: np.ndarray,
     robot_late: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Share of the thing near the robot, and how much of a wrist camera it fills [of what a held one does], in late frames; NaN where unseen."""
+    """Share of the thing's area near the robot, and its share of a wrist frame as a multiple of `HELD_WRIST_SHARE`, in the late frames.
+
+    NaN where it is not seen.
+    """
     touching = np.full(LATE_COUNT, np.nan)
     reach = max(1, round(head.size / 3))
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
