@@ -299,7 +299,12 @@ def test_generation_is_greedy_bounded_and_sees_every_picture(opened, monkeypatch
     assert prompt.startswith("<|im_start|>user\nwhat?<|vision_start|><|image_pad|>")
     assert prompt.endswith("<|im_end|>\n<|im_start|>assistant\n")
     assert 1 <= calls.outputs[0].shape[1] - first["input_ids"].shape[1] <= 12
-    assert model.model.dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize(("native", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_weights_are_in_what_the_processor_computes_in(folder, monkeypatch, native, dtype):
+    monkeypatch.setattr("worldline_core.processor.processor_has_bfloat16", lambda: native)
+    assert vlm.open_vlm("qwen3_vl", VLMConfig(weights=folder)).model.dtype == dtype
 
 
 def test_chosen_frames_of_a_video_are_shown_as_they_are_at_their_times(opened, monkeypatch):

@@ -28,6 +28,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.http_exchange import IncompleteResponseError, UnreachableError, exchange
+from worldline_core.processor import bfloat16_by_default
 from worldline_core.untrusted_text import cut, visible, without_secret
 
 logger = logging.getLogger(__name__)
@@ -297,7 +298,7 @@ class Qwen3VLModel:
 
     @classmethod
     def load(cls, folder: Path) -> Qwen3VLModel:
-        """Open weights from a local folder in BF16; nothing is downloaded.
+        """Open weights from a local folder, in float32 on a processor without native bfloat16; nothing is downloaded.
 
         Raises: UnavailableError when the folder has no Qwen3-VL.
         """
@@ -310,12 +311,13 @@ class Qwen3VLModel:
             )
         from transformers import AutoProcessor, Qwen3VLForConditionalGeneration
 
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        dtype = torch.bfloat16 if bfloat16_by_default({"device": device}) else torch.float32
         try:
-            model = Qwen3VLForConditionalGeneration.from_pretrained(folder, dtype=torch.bfloat16, local_files_only=True)
+            model = Qwen3VLForConditionalGeneration.from_pretrained(folder, dtype=dtype, local_files_only=True)
             processor = AutoProcessor.from_pretrained(folder, local_files_only=True)
         except (OSError, ValueError) as error:
             raise UnavailableError("Qwen3-VL weights cannot be opened", where=folder, got=str(error)) from error
-        device = "cuda" if torch.cuda.is_available() else "cpu"
         return cls(cast(Any, model).to(device), processor, folder.name)
 
     @torch.inference_mode()
