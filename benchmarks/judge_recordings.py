@@ -9,7 +9,8 @@ prediction) is measured; with a segmenter, they are its masks of what is shown. 
 docs/recorded_worlds.md: (d) true latents, `--tokenizer`; (e) true latents noised to a level and denoised by a Stage II
 model under the recording's own controls, `--model` with `--level` (and `--steps`); (f) samples, level 1 or `--rollouts`.
 Per task the area under the curve of the
-judge's score, the same within banks with its 95 % interval over banks, and the share of outcomes that its rules tell rightly.
+judge's score, the same within banks with its 95 % interval over banks, and the shares of outcomes that its rules tell rightly, of
+failures that they call done, and of successes that they call failed.
 """
 
 from __future__ import annotations
@@ -185,6 +186,8 @@ def main() -> None:
             "area": round(area(values, success), 3),
             "area_within_banks": asdict(bootstrap_mean(within, seed=42)) if within else None,
             "rules_right": round(float((done == success).mean()), 3),
+            "failures_called_done": round(float(done[~success].mean()), 3) if not success.all() else None,
+            "successes_called_failed": round(float((~done[success]).mean()), 3) if success.any() else None,
         }
     print(json.dumps(table, indent=1))
 
