@@ -303,6 +303,7 @@ def test_generation_is_greedy_bounded_and_sees_every_picture(opened, monkeypatch
 
 @pytest.mark.parametrize(("native", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
 def test_weights_are_in_what_the_processor_computes_in(folder, monkeypatch, native, dtype):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr("worldline_core.processor.processor_has_bfloat16", lambda: native)
     assert vlm.open_vlm("qwen3_vl", VLMConfig(weights=folder)).model.dtype == dtype
 
