@@ -64,7 +64,9 @@ def overrides_of(
 ) -> tuple[str, ...]:
     """The options as changes of a configuration, as it was read."""
     changes: list[str] = []
-    shares = {name: share for name, share in SHARES.items() if config.get(name.partition(".")[0]) is not None}
+    names, last = list(SHARES), f"distill.{(config.get('distill') or {}).get('last_step')}"
+    names = names[: names.index(last) + 1] if last in names else names
+    shares = {name: SHARES[name] for name in names if config.get(name.partition(".")[0]) is not None}
     if minutes is not None:
         whole = sum(shares.values())
         changes += [f"{name}.trainer.steps=null" for name in shares]

@@ -111,6 +111,18 @@ def test_three_steps_give_a_causal_checkpoint(finished, monkeypatch):
     assert distill(config(), finished.inputs, output) == counts
 
 
+@pytest.mark.parametrize("last", ["teacher_forcing", "trajectory_regression"])
+def test_the_last_step_gives_the_result(finished, tmp_path, last):
+    """The same model as in a whole distillation; what comes after it is not done."""
+    counts = distill(config(last_step=last), finished.inputs, tmp_path)
+    found, whole = read_checkpoint_info(tmp_path), read_checkpoint_info(finished.output / last)
+    assert (found.metadata["distillation"], found.weights_sha256) == (last, whole.weights_sha256)
+    assert list(counts["steps"])[-1] == last and not (tmp_path / last / "checkpoint.json").exists()
+    assert read_json_lines(tmp_path / last / "metrics.jsonl")[-1]["validation/rollout_error"] > 0
+    assert (tmp_path / "run" / "trajectories").exists() == (last == "trajectory_regression")
+    assert not (tmp_path / "distribution_matching").exists()
+
+
 def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_result(inputs, tmp_path, monkeypatch):
     """Blocks of two latent frames, no recent block, nodes of two steps: distilled, saved, rolled out and timed so."""
     trajectories = {"clips": 2, "clips_per_shard": 2, "substeps": [1, 2]}

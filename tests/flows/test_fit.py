@@ -62,6 +62,15 @@ def test_minutes_are_shared_out_and_a_gpu_does_all_of_the_work(own: Path, preset
     assert set(predicted) == {"cuda"}
 
 
+def test_trainings_that_are_left_out_get_no_minutes(own: Path) -> None:
+    own.write_text(own.read_text() + "\ndistill: {last_step: teacher_forcing}\n")
+    changes = overrides_of(8.0, None, None, read_config(None, own))
+    config = PipelineConfig.load(None, own, changes)
+    stages = (config.train_stage1, config.train_stage2, config.distill.teacher_forcing)
+    assert sum(stage.trainer.minutes or 0 for stage in stages if stage is not None) == pytest.approx(8.0)
+    assert not any("trajectory_regression" in change or "distribution_matching" in change for change in changes)
+
+
 def test_cameras_are_estimated_where_a_robot_is_known_and_no_file_is_named(own: Path, here: Path) -> None:
     config = PipelineConfig.load(None, own)
     assert EstimateConfig.of(config.curate, {}) is not None

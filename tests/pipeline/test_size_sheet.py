@@ -81,6 +81,15 @@ def test_distribution_matching_is_planned_by_models_that_are_deep_enough():
     assert training.estimate(8) == replace(training, shallow=(5, 6)).estimate(8)
 
 
+def test_steps_of_a_distillation_that_are_left_out_are_not_planned():
+    config = PipelineConfig.load("edge-80gb", overrides=["distill.last_step=teacher_forcing"])
+    trained = SizeSheet.model_validate({"config": config, "project": "."})._trainings()
+    assert [one.title for one in trained if one.title.startswith("distill")] == ["distill: teacher forcing"]
+    changed = {key.partition("=")[0] for made in smaller_settings(config) for key in made}
+    assert "distill.teacher_forcing.trainer.weights" in changed
+    assert "distill.distribution_matching.trainer.weights" not in changed
+
+
 def test_precision_goes_before_clips_and_pictures_and_adapters_come_last():
     def load(changes):
         return PipelineConfig.load("edge-80gb", overrides=changes)

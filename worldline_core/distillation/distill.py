@@ -22,7 +22,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance, PerceptualLoss
 from worldline_core.distillation.causal_objective import CausalObjective
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
-from worldline_core.distillation.distill_config import DistillConfig
+from worldline_core.distillation.distill_config import STEPS, DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
 from worldline_core.distillation.trajectory_regression import (
     INDEX,
@@ -66,7 +66,6 @@ from worldline_core.training.training_config import TrainerConfig
 
 logger = logging.getLogger(__name__)
 
-STEPS = ("teacher_forcing", "trajectory_regression", "distribution_matching")
 TRAJECTORIES = "trajectories"
 LPIPS_OFF = "off: no LPIPS weights configured"
 
@@ -84,13 +83,15 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
     """
     torch.manual_seed(config.teacher_forcing.trainer.seed)
     run = DistillationRun(config, inputs, output)
-    metrics = {**run.teacher_forcing(), **run.trajectory_regression(), **run.distribution_matching()}
+    metrics: dict[str, float] = {}
+    for step in config.trainers:
+        metrics |= getattr(run, step)()
     kept = sum(row.split in config.splits for row in run.rows)
     return {
         "found": len(run.rows),
         "kept": kept,
         "left_out": {"in other splits": len(run.rows) - kept},
-        "steps": {name: read_checkpoint_info(run.folder(name)).metadata["step"] for name in STEPS},
+        "steps": {name: read_checkpoint_info(run.folder(name)).metadata["step"] for name in config.trainers},
         "lpips": run.lpips,
         "episodes": kept,
         **metrics,
@@ -107,8 +108,8 @@ class DistillationRun:
     def __init__(self, config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> None:
         device = config.teacher_forcing.trainer.device
         join_processes(device)
-        for step in STEPS:
-            require_one_process(getattr(config, step).trainer, {"distill.lora": config.lora is not None})
+        for trainer in config.trainers.values():
+            require_one_process(trainer, {"distill.lora": config.lora is not None})
         self.config, self.output, self.stage2 = config, output, Path(inputs["stage2"])
         self.info = info = read_checkpoint_info(self.stage2)
         self.start = Path(inputs.get("causal", self.stage2))
@@ -138,7 +139,7 @@ class DistillationRun:
 
     def folder(self, step: str) -> Path:
         """Folder of a step's checkpoint; the last step's is the result itself."""
-        return self.output if step == STEPS[-1] else self.output / step
+        return self.output if step == self.config.last_step else self.output / step
 
     def _known(self, rows: Sequence[ClipRow]) -> list[ClipRow]:
         """Episodes whose views, and whose robot's control vectors, the Stage II model knows; all where it knows the views of none."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
@@ -21,6 +21,8 @@ from worldline_core.training.training_config import (
     TrainerConfig,
 )
 
+DistillStep = Literal["teacher_forcing", "trajectory_regression", "distribution_matching"]
+STEPS: tuple[DistillStep, ...] = get_args(DistillStep)
 CYCLE = 6
 """Iterations of one cycle of distribution matching: five updates of the fake score, then one of the student."""
 
@@ -141,6 +143,8 @@ class DistillConfig(StrictModel):
     ``block_size`` counts latent frames (4 in the paper: 16 video frames). ``sigmas``: nodes of the few-step sampler.
     ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` the recordings' frames, which
     are encoded when the teacher sees them; the trajectories keep the latents of their clips.
+    ``last_step``: those after it are left out. Teacher forcing alone makes a good model of one step a block, ``sigmas: [1, 0]``
+    (docs/experiments.md).
     ``action_following``: measured in each of the three steps; null measures nothing.
     ``lora``: each step trains adapters on the model before it, and distribution matching also on the score that follows the student,
     which then shares its other weights with the real score; null: all weights.
@@ -154,6 +158,7 @@ class DistillConfig(StrictModel):
     block_size: int = Field(default=4, ge=1)
     window: WindowConfig = WindowConfig()
     sigmas: tuple[float, ...] = CAUSAL_SIGMAS
+    last_step: DistillStep = "distribution_matching"
     action_following: ActionFollowingConfig | None = None
     lora: LoRAConfig | None = None
     teacher_forcing: TeacherForcingConfig = TeacherForcingConfig()
@@ -181,12 +186,17 @@ class DistillConfig(StrictModel):
                 f"window.anchor_blocks {self.window.anchor_blocks}: the longest clip has {blocks} blocks; train on longer clips"
             )
         steps, substeps = self.spec.steps, self.trajectory_regression.trajectories.substeps
-        if len(substeps) != steps:
+        if len(substeps) != steps and self.last_step != "teacher_forcing":
             raise ValueError(f"trajectories.substeps {substeps}: one number per interval of sigmas is needed, {steps}")
         return self
 
     def weights_read(self) -> Mapping[str, Path | None]:
         return {"lpips": self.lpips_weights}
+
+    @property
+    def trainers(self) -> dict[DistillStep, TrainerConfig]:
+        """The training of each step, up to the last one."""
+        return {name: getattr(self, name).trainer for name in STEPS[: STEPS.index(self.last_step) + 1]}
 
     @property
     def first_clips(self) -> ClipSampling:

@@ -23,7 +23,7 @@ from worldline_core.config import StrictModel
 from worldline_core.distillation.auxiliary_losses import PerceptualLoss
 from worldline_core.distillation.causal_objective import maps_of
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
-from worldline_core.distillation.distill_config import CYCLE, DistillConfig
+from worldline_core.distillation.distill_config import CYCLE, DistillConfig, DistillStep
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
 from worldline_core.distillation.trajectory_regression import TrajectoryBatch, TrajectoryObjective, teacher_trajectories
 from worldline_core.errors import ConfigError
@@ -289,15 +289,20 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
     model = model.model_copy(update={"towers": "generation"})
     alternating = ((0, 1 - 1 / CYCLE), (CYCLE - 1, 1 / CYCLE))
     shallow = (4, 5)  # at lower depths a score's worst moment can be another one
-    parts = {
-        "teacher forcing": (config.teacher_forcing.trainer,),
-        f"trajectories (a shard of {clips} clips)": (shard, ((0, passes),)),
-        "trajectory regression": (config.trajectory_regression.trainer,),
-        "distribution matching": (config.distribution_matching.trainer, alternating, shallow),
+    parts: dict[DistillStep, dict[str, tuple[Any, ...]]] = {
+        "teacher_forcing": {"teacher forcing": (config.teacher_forcing.trainer,)},
+        "trajectory_regression": {
+            f"trajectories (a shard of {clips} clips)": (shard, ((0, passes),)),
+            "trajectory regression": (config.trajectory_regression.trainer,),
+        },
+        "distribution_matching": {
+            "distribution matching": (config.distribution_matching.trainer, alternating, shallow)
+        },
     }
     return [
         Training(f"distill: {part}", trainer, model, partial(_distillation, part, config, source, trainer), *settings)
-        for part, (trainer, *settings) in parts.items()
+        for step in config.trainers
+        for part, (trainer, *settings) in parts[step].items()
     ]
 
 

@@ -22,7 +22,7 @@ def smaller_settings(config: PipelineConfig) -> list[list[str]]:
     """Changes of a configuration, each list with all those before it: first what costs time alone, then precision, the length of
     clips, the size of pictures, and last all weights but adapters."""
     stages = [name for name in ("train_stage1", "train_stage2") if getattr(config, name) is not None]
-    parts = [f"distill.{part}" for part in ("teacher_forcing", "trajectory_regression", "distribution_matching")]
+    parts = [f"distill.{step}" for step in config.distill.trainers]
     trainers = [f"{name}.trainer" for name in (*stages, *parts)]
     steps = [
         [f"{one}.sharding.checkpointing=block" for one in trainers]
