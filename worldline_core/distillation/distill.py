@@ -22,7 +22,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance, PerceptualLoss
 from worldline_core.distillation.causal_objective import CausalObjective
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
-from worldline_core.distillation.distill_config import STEPS, DistillConfig
+from worldline_core.distillation.distill_config import STEPS, DistillConfig, DistillStep
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
 from worldline_core.distillation.trajectory_regression import (
     INDEX,
@@ -83,9 +83,14 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
     """
     torch.manual_seed(config.teacher_forcing.trainer.seed)
     run = DistillationRun(config, inputs, output)
+    steps: dict[DistillStep, Callable[[], dict[str, float]]] = {
+        "teacher_forcing": run.teacher_forcing,
+        "trajectory_regression": run.trajectory_regression,
+        "distribution_matching": run.distribution_matching,
+    }
     metrics: dict[str, float] = {}
-    for step in config.trainers:
-        metrics |= getattr(run, step)()
+    for name in config.trainers:
+        metrics |= steps[name]()
     kept = sum(row.split in config.splits for row in run.rows)
     return {
         "found": len(run.rows),
@@ -135,7 +140,8 @@ class DistillationRun:
         )  # fmt: skip
         self.tokenizer = Path(inputs["tokenizer"])
         self.perceptual = _perceptual(config, self.tokenizer, device)
-        self.lpips = "on" if self.perceptual is not None else LPIPS_OFF
+        unused = LPIPS_OFF if config.lpips_weights is None else "off: teacher forcing does not use it"
+        self.lpips = "on" if self.perceptual is not None else unused
 
     def folder(self, step: str) -> Path:
         """Folder of a step's checkpoint; the last step's is the result itself."""
@@ -357,7 +363,10 @@ class DistillationRun:
 
 
 def _perceptual(config: DistillConfig, tokenizer: Path, device: str) -> PerceptualDistance | None:
-    wanted = config.trajectory_regression.auxiliary.lpips or config.distribution_matching.auxiliary.lpips
+    if config.last_step == "teacher_forcing":
+        return None
+    last = config.last_step == "distribution_matching" and config.distribution_matching.auxiliary.lpips
+    wanted = config.trajectory_regression.auxiliary.lpips or last
     if config.lpips_weights is None:
         if wanted:
             logger.warning("The perceptual auxiliary is %s; it is left out of the loss.", LPIPS_OFF)

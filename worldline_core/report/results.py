@@ -19,6 +19,7 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.frames import VideoFrames
+from worldline_core.distillation.distill_config import STEPS
 from worldline_core.evaluation.metric_registry import METRICS, metric_of
 from worldline_core.evaluation.paired import EVALUATIONS
 from worldline_core.model.model_card import DESCRIPTIONS, Measurement, model_card, model_facts
@@ -324,7 +325,7 @@ STAGES = {
     "train_stage2": "Stage II: action-driven",
     "distill": "Distillation",
 }
-PHASES = ("", "teacher_forcing", "trajectory_regression", "distribution_matching")
+PHASES = ("", *STEPS)
 METRICS_FILE = "metrics.jsonl"
 PARTS = 60
 """A training loss is drawn as the means of so many parts of the run."""
