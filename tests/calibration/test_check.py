@@ -105,8 +105,8 @@ def test_a_bad_episode_is_listed_and_the_rest_goes_on(episode: Episode, images: 
     found = check_calibration(given, tmp_path)
     reasons = ["truncated_video", "length_mismatch", "nan_state", None, None]
     assert [episode.reason for episode in found.episodes] == reasons
-    assert "no_such_robot" in found.episodes[3].notes[0]
-    assert "ur5e_pair" in found.episodes[4].notes[0]
+    assert "no_such_robot" in found.episodes[3].diagnosis.notes[-1]
+    assert "ur5e_pair" in found.episodes[4].diagnosis.notes[-1]
     assert not found.consistent
     assert "truncated_video: The file ends early; expected 24; got 12" in check.table_text(found)
     stored = json.loads((tmp_path / "diagnoses.json").read_text())
@@ -131,7 +131,7 @@ def test_one_episode_that_cannot_be_judged_makes_the_check_inconsistent() -> Non
     fine = check.EpisodeCheck("a", "s", Diagnosis(verdict="consistent", camera_errors=(error,)))
     healthy = check.CalibrationCheck((fine,), (), Path("out"))
     assert healthy.consistent  # the command's exit status
-    crashed = check.EpisodeCheck("b", "s", None, "crashed", "a stride is negative")
+    crashed = check.EpisodeCheck("b", "s", Diagnosis(verdict="not_judged"), "crashed")
     assert not replace(healthy, episodes=(fine, crashed)).consistent
 
 
@@ -139,21 +139,23 @@ def made_up() -> check.CalibrationCheck:
     """Three verdicts, with names that would break a page that does not escape them."""
     none = Explanation(RecordedConventions(), np.nan, {})
     best = Explanation(RecordedConventions(camera_axes="opengl"), -1.0, {})
-    broken = Diagnosis(verdict="explained", best=best, ranked=(best, none), notes=("a note",))
-    fine = Diagnosis(verdict="consistent", best=none, ranked=(none,))
+    lines = "line one", "line two"
+    broken = Diagnosis(verdict="explained", best=best, ranked=(best, none), notes=("a note",), config_lines=lines)
+    fine = Diagnosis(verdict="consistent", best=none, ranked=(none,), notes=("set Y",))
+    unread = Diagnosis(verdict="unreadable", notes=(f"why {HOSTILE}",))
     summed = SourceDiagnosis(
         source="s", num_episodes=2, verdict="explained", best=best, ranked=(best, none),
-        votes={"camera_axes": 1, "consistent": 1}, notes=("of the set",), config_lines=("line three",),
+        notes=("of the set",), config_lines=("line three",),
     )  # fmt: skip
     episodes = (
-        check.EpisodeCheck(f"a {HOSTILE}", "s", fine, picture="pictures/a.jpg", notes=("set Y",)),
-        check.EpisodeCheck("b", "s", broken, config_lines=("line one", "line two")),
-        check.EpisodeCheck("c", "s", None, "missing_file", f"why {HOSTILE}\n" + 40 * "   where: /x "),
+        check.EpisodeCheck(f"a {HOSTILE}", "s", fine, picture="pictures/a.jpg"),
+        check.EpisodeCheck("b", "s", broken),
+        check.EpisodeCheck("c", "s", unread, "missing_file"),
     )
     return check.CalibrationCheck(episodes, (summed,), Path("out"))
 
 
-def test_the_page_escapes_what_it_shows_and_json_holds_only_its_own_numbers() -> None:
+def test_the_page_escapes_what_it_shows_and_json_is_plain() -> None:
     html = check.page(made_up())
     assert HOSTILE not in html
     assert html.count("&lt;script&gt;") >= 3
@@ -162,8 +164,7 @@ def test_the_page_escapes_what_it_shows_and_json_holds_only_its_own_numbers() ->
     assert {"    line one", "    line two", "    line three"} <= set(text.splitlines())
     assert max(map(len, text.splitlines())) < 250
     content = json.loads(json.dumps(check.as_json(made_up()), allow_nan=False))
-    shown = [content["episodes"][1][name] for name in ("mistake", "score", "score_as_recorded")]
-    assert shown == ["camera_axes", -1, None]
+    assert [content["episodes"][1][name] for name in ("mistake", "verdict")] == ["camera_axes", "explained"]
     assert content["sources"][0]["config_lines"] == ["line three"]
 
 

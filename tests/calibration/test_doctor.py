@@ -125,7 +125,7 @@ def test_evidence_adds_up_over_the_episodes_of_a_source() -> None:
     gain = sum(min(value, MAX_GAIN) for value in gains)
     none = next(e for e in found.ranked if e.mistake == "none")
     assert found.best.score - none.score == pytest.approx(gain)
-    assert sum(found.votes.values()) == found.num_episodes == len(items)
+    assert found.num_episodes == len(items)
     clean = [diagnose(item.joints, item.gray, item.kinematics) for item in items]
     assert diagnose_source("source", clean).verdict == "consistent"
     assert diagnose_source("source", []).verdict == "too_little_evidence"
@@ -172,7 +172,6 @@ def test_agibot_v2_wrist_extrinsics_follow_the_action(shared_data: Path, agibot:
     for episode, frames in agibot("agibot_gesim_v2"):
         diagnosis = diagnose(episode, frames, kinematics)
         assert diagnosis.verdict == "consistent"
-        assert any(note.startswith("right_wrist: the camera poses follow the commands") for note in diagnosis.notes)
         assert any("may follow the commands" in note for note in diagnose(episode, frames, None).notes)
         spoiled = corrupt(episode, RecordedConventions(euler="moving_xyz"))
         assert diagnose(spoiled, frames, kinematics).best.mistake == "euler"

@@ -25,6 +25,7 @@ from tasks.execution.run_page import write_progress_page
 from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImports]
 from worldline_core.calibration.check import CalibrationCheck, EpisodeCheck
 from worldline_core.calibration.check import page as check_page
+from worldline_core.calibration.diagnosis import Diagnosis
 from worldline_core.config import ConfigError, load_config
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
@@ -83,7 +84,8 @@ def progress(name: str, folder: Path) -> str:
 
 
 def checked(name: str, folder: Path) -> str:
-    return check_page(CalibrationCheck((EpisodeCheck(name, name, None, reason=name, detail=name),), (), folder))
+    unread = Diagnosis(verdict="unreadable", notes=(name,))
+    return check_page(CalibrationCheck((EpisodeCheck(name, name, unread, reason=name),), (), folder))
 
 
 MARKDOWN = MarkdownIt("commonmark").enable("table").render

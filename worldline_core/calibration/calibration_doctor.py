@@ -33,7 +33,6 @@ from worldline_core.calibration.evidence import (
     hand_eye_log_likelihood,
     image_terms,
     not_judged,
-    notes_on,
     observable_views,
     pose_terms,
     rms_hand_eye,
@@ -51,8 +50,6 @@ PAIRED_MISTAKES = 4
 """Number of the best single mistakes that are also tried in pairs."""
 MIN_TRAVEL_M = 0.02
 """A tool that moves less over the episode leaves no trace of a mistake."""
-EXCHANGED_DOUBT = 3.0
-"""Wrist videos that fit worse by more in exchanged places are in their own."""
 INTRINSICS_SNAP, SAME_INTRINSICS_SIZE = 0.02, 0.1
 """Relative distance within which a usual image size is taken; log distance within which the size is as recorded."""
 MIN_TOOL_OFFSET_M, MAX_TOOL_OFFSET_M = 0.01, 0.5
@@ -99,7 +96,8 @@ def diagnose(
     if quick and (fine := search.unsuspicious()) is not None:
         diagnosis = Diagnosis(verdict="consistent", best=fine, ranked=(fine,), not_judged=blind)
         return diagnosis.with_camera_errors(estimate_camera_errors(observation, recorded))
-    as_recorded, notes = search.as_recorded, notes_on(observation, recorded)
+    as_recorded, judged = search.as_recorded, gripper_terms(observation, recorded)
+    notes = [] if judged else ["no gripper is seen to move: polarity is not judged"]
     ranked = sorted([as_recorded, *search.singles()], key=lambda e: -e.score)
     if bad_terms(as_recorded):
         limits = ((value, TERM_LIMITS.get(name.split(" ")[0], 0.0)) for name, value in ranked[0].evidence.items())
@@ -182,18 +180,11 @@ class _Search:
             gains = [_of_view(other, view) - _of_view(images, view) for view in self.recorded.cameras]
             if sum(other.values()) > sum(images.values()) or max(gains) > MIN_MARGIN:
                 return None
-        return None if self.fits_exchanged_wrists(images) else found
-
-    def fits_exchanged_wrists(self, images: Mapping[str, float]) -> bool:
-        """True if the pictures fit better with exchanged wrist videos; flow is compared where the rest leaves doubt."""
-        exchanged = self.observation.with_exchanged_wrists()
-        if exchanged is None:
-            return False
-        quick = image_terms(exchanged, self.recorded, wrist_flow=False)
-        if sum(quick.values()) < sum(images.values()) - EXCHANGED_DOUBT:
-            return False
-        other, own = (sum(image_terms(each, self.recorded).values()) for each in (exchanged, self.observation))
-        return other > own
+        if (exchanged := observation.with_exchanged_wrists()) is not None:
+            other, own = (sum(image_terms(each, self.recorded).values()) for each in (exchanged, observation))
+            if other > own:
+                return None
+        return found
 
     def read(self, conventions: RecordedConventions) -> Reading | None:
         """The episode under these conventions; None where they do not apply."""

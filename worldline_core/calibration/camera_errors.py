@@ -617,8 +617,3 @@ def combine(episodes: Sequence[Sequence[CameraError]]) -> tuple[CameraError, ...
 def significant(errors: Sequence[CameraError], *, together: bool = False) -> tuple[CameraError, ...]:
     """The cameras that are certainly off; `together`: the errors are those of a source, not of one episode."""
     return tuple(error for error in errors if error.squares > (SQUARES_TOGETHER if together else SQUARES_ALONE))
-
-
-def corrected_camera(camera: CameraTrack, error: CameraError) -> CameraTrack:
-    """The camera without the estimated error."""
-    return moved_camera(camera, error.estimate / SCALE)

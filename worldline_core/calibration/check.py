@@ -7,7 +7,6 @@ into the head view: beside the arm it is the plainest sign of a wrong calibratio
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,20 +14,18 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
-from markupsafe import Markup
-from pydantic import ConfigDict, TypeAdapter
 
 from worldline_core.actions.action_tracks import project_tools, tracks_of_projection
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
 from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.camera_errors import corrected_camera
-from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SourceDiagnosis, diagnose_source
+from worldline_core.calibration.camera_errors import SCALE, moved_camera
+from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SourceDiagnosis, VerdictName, diagnose_source
 from worldline_core.config import apply_overrides, load_config, read_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.recorded_episode import check_camera, check_times, check_values
@@ -43,17 +40,14 @@ from worldline_core.data.sources.open import GuardedSource, SourceConfig
 from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
-from worldline_core.pages.page import Table, render, words
+from worldline_core.pages.page import render, words
 from worldline_core.pictures import (
-    INK,
-    MUTED,
     Picture,
     SheetRow,
     contact_sheet,
     draw_tag,
     evenly_spaced,
     jpeg_bytes,
-    text_strip,
 )
 from worldline_core.progress import Progress
 from worldline_core.scale.account import crash_evidence
@@ -62,18 +56,6 @@ from worldline_core.store.artifact_files import verify_artifact
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 OUTPUT_ROOT = Path("artifacts") / "calibration"
-MEANINGS = {
-    "unexplained": "the recording disagrees with its calibration, and under no usual mistake it agrees",
-    "explained": "one usual mistake explains what is wrong; the line repairs it",
-    "off": "a camera is off: which one, in what and by how much is said beside it",
-    "unreadable": "the episode cannot be read",
-    "not_judged": "judging it failed",
-    "too_little_evidence": "too little moves, or too little is calibrated, to judge",
-    "consistent": "the recording agrees with its calibration, within what is said beside it",
-}
-"""By verdict, the worst first."""
-TONES = dict.fromkeys(MEANINGS, "bad") | {"too_little_evidence": "", "consistent": "good"}
-COLUMNS = ("Episode", "Verdict", "Best explanation")
 TILE_HEIGHT, MIN_WIDTH, MOMENTS = 256, 760, 3
 SIGMA_PX_REF = 18.0
 """Wide enough to be seen at tile size, narrow enough to leave the gripper visible."""
@@ -81,30 +63,13 @@ SIGMA_PX_REF = 18.0
 
 @dataclass(frozen=True)
 class EpisodeCheck:
-    """A diagnosis, or a reason code with its `detail`; `picture` is relative to the output folder."""
+    """A diagnosis; `reason`: the code where none could be made. `picture` is relative to the output folder."""
 
     episode_id: str
     source: str
-    diagnosis: Diagnosis | None
+    diagnosis: Diagnosis
     reason: str | None = None
-    detail: str = ""
-    config_lines: tuple[str, ...] = ()
     picture: str | None = None
-    notes: tuple[str, ...] = ()
-
-    @property
-    def verdict(self) -> str:
-        if self.diagnosis is not None:
-            return self.diagnosis.verdict
-        return "not_judged" if self.reason == "crashed" else "unreadable"
-
-    @property
-    def row(self) -> tuple[str, str, str]:
-        """Cells of COLUMNS."""
-        if self.diagnosis is not None:
-            return self.episode_id, verdict_text(self.diagnosis), self.diagnosis.best.mistake
-        why = textwrap.shorten(f"{self.reason}: {self.detail}", 160, placeholder=" ...")
-        return self.episode_id, self.verdict, why
 
 
 @dataclass(frozen=True)
@@ -118,17 +83,11 @@ class CalibrationCheck:
     @property
     def consistent(self) -> bool:
         """True if some episode is consistent by its pictures, and nothing is wrong with any other."""
-        verdicts = {episode.verdict for episode in self.episodes}
-        seen = any(e.diagnosis is not None and e.diagnosis.camera_errors for e in self.episodes)
+        verdicts = {episode.diagnosis.verdict for episode in self.episodes}
+        seen = any(episode.diagnosis.camera_errors for episode in self.episodes)
         sound = not verdicts & {"off", "explained", "unexplained", "unreadable", "not_judged"}
         together = all(s.verdict not in ("off", "explained", "mixed") for s in self.sources)
         return sound and seen and "consistent" in verdicts and together
-
-    @property
-    def counted(self) -> dict[str, int]:
-        """Episodes by verdict, the worst first."""
-        counts = Counter(episode.verdict for episode in self.episodes)
-        return {name: counts[name] for name in MEANINGS if counts[name]}
 
 
 @dataclass(frozen=True)
@@ -208,8 +167,8 @@ def check_calibration(
                     raise
                 evidence = crash_evidence(error)
                 detail = f"{evidence['type']}: {evidence['message']} ({evidence['trace'][-1]}); report this bug"
-                checked.append(EpisodeCheck(item.episode_id, item.source, None, "crashed", detail))
-            progress.advance(verdict=checked[-1].verdict)
+                checked.append(_without_diagnosis(item, "not_judged", "crashed", detail))
+            progress.advance(verdict=checked[-1].diagnosis.verdict)
     check = CalibrationCheck(tuple(checked), tuple(_sum_up(listed, checked)), output)
     write_json_atomic(output / "diagnoses.json", as_json(check))
     write_bytes_atomic(output / "index.html", page(check).encode())
@@ -226,19 +185,23 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName) 
             check_camera(episode, camera)
         frames = {view: episode_images(loaded, view) for view in loaded.views}
         arms, notes = _kinematics_of(episode, kinematics)
-        diagnosis = diagnose(episode, frames, arms)
+        found = diagnose(episode, frames, arms)
     except DataError as error:
         reason = error.reason if isinstance(error, RejectedInputError) else "unreadable"
         details = [f"{name} {value}" for name in ("expected", "got") if (value := getattr(error, name)) is not None]
-        said = "; ".join([error.what, *details])
-        return EpisodeCheck(item.episode_id, item.source, None, reason, said)
+        return _without_diagnosis(item, "unreadable", reason, "; ".join([error.what, *details]))
     picture: str | None = f"pictures/{safe_stem(episode.episode_id)}.jpg"
     try:
-        write_bytes_atomic(output / picture, jpeg_bytes(diagnosis_picture(diagnosis, episode, frames, arms)))
+        write_bytes_atomic(output / picture, jpeg_bytes(diagnosis_picture(found, episode, frames, arms)))
     except DataError as error:
         picture, notes = None, (*notes, f"no picture: {error.what}")
-    lines = repairing_lines(item, diagnosis.best)
-    return EpisodeCheck(item.episode_id, item.source, diagnosis, config_lines=lines, picture=picture, notes=notes)
+    found = replace(found, notes=found.notes + notes, config_lines=repairing_lines(item, found.best))
+    return EpisodeCheck(item.episode_id, item.source, found, picture=picture)
+
+
+def _without_diagnosis(item: ListedEpisode, verdict: VerdictName, reason: str, detail: str) -> EpisodeCheck:
+    why = textwrap.shorten(f"{reason}: {detail}", 160, placeholder=" ...")
+    return EpisodeCheck(item.episode_id, item.source, Diagnosis(verdict=verdict, notes=(why,)), reason)
 
 
 def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmKinematics | None, tuple[str, ...]]:
@@ -274,7 +237,7 @@ def _sum_up(listed: Sequence[ListedEpisode], checked: Sequence[EpisodeCheck]) ->
     for item in listed:
         first.setdefault(item.source, item)
     for source, item in first.items():
-        diagnoses = [f.diagnosis for f in checked if f.source == source and f.diagnosis is not None]
+        diagnoses = [f.diagnosis for f in checked if f.source == source and f.reason is None]
         if len(diagnoses) > 1:
             summed = diagnose_source(source, diagnoses)
             yield replace(summed, config_lines=repairing_lines(item, summed.best))
@@ -314,10 +277,14 @@ def check_command(
 
 
 def verdict_text(found: Diagnosis) -> str:
-    """The verdict, with the cameras that are off or what could have gone unseen, and the views that nothing judges."""
+    """The verdict: what explains it, the cameras that are off or what could have gone unseen, and the views that nothing judges."""
     said = words(found.verdict)
     if found.verdict == "off":
         said = f"off: {', '.join(map(str, found.off))}"
+    elif found.verdict == "explained":
+        said = f"explained by {found.best.text}"
+    elif found.verdict == "mixed":
+        said = "mixed: its episodes were not written the same way, no line is right for all of them"
     elif found.verdict == "consistent" and found.camera_errors:
         # How far the robot may be from its place in the picture; of a wrist camera, by how much it may be turned.
         shown = [(e.view, e.kinds[-1] if e.shown is not None else e.kinds[0]) for e in found.camera_errors]
@@ -328,112 +295,75 @@ def verdict_text(found: Diagnosis) -> str:
 
 
 def table_text(check: CalibrationCheck) -> str:
-    """The table of episodes, the conclusion over each source, and the lines that repair it."""
-    rows = [tuple(name.lower() for name in COLUMNS), *(episode.row for episode in check.episodes)]
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    """A line for each episode, with what its source's conclusion does not say, and the conclusions."""
+    together = {found.source: found for found in check.sources}
+    width = max((len(episode.episode_id) for episode in check.episodes), default=0)
+    lines = []
+    for episode in check.episodes:
+        own, summed = episode.diagnosis, together.get(episode.source)
+        lines.append(f"{episode.episode_id:<{width}}  {verdict_text(own)}")
+        told = own.verdict in ("consistent", "off", "too_little_evidence")
+        if summed is None or (not told and (own.verdict, own.config_lines) != (summed.verdict, summed.config_lines)):
+            lines += detail_lines(own)
     return "\n".join([*lines, "", *conclusion_lines(check), "", f"pictures: {check.output / 'index.html'}"])
 
 
+def detail_lines(found: Diagnosis) -> list[str]:
+    """Notes, what comes nearest, and what repairs it in the configuration of the source."""
+    lines = [f"note: {note}" for note in found.notes] + [f"near: {near}" for near in found.nearest]
+    return [f"    {line}" for line in (*lines, *found.config_lines)]
+
+
 def conclusion_lines(check: CalibrationCheck) -> list[str]:
-    """Conclusions over each source, then over the episodes that these do not cover."""
-    parts = [f"{count} {words(name)}" for name, count in check.counted.items()]
+    """Numbers of episodes by verdict, then the conclusion over each source."""
+    counts = Counter(episode.diagnosis.verdict for episode in check.episodes)
+    parts = [f"{counts[name]} {words(name)}" for name in get_args(VerdictName) if counts[name]]
     lines = [f"{len(check.episodes)} episodes: {', '.join(parts)}"]
     for found in check.sources:
-        said = verdict_text(found)
-        if found.verdict == "mixed":
-            said += ": its episodes were not written the same way, no line is right for all of them"
-        elif found.verdict == "explained":
-            said += f" by {found.best.mistake if found.best.other is None else found.best.text}"
-        lines += ["", f"source {found.source}, {found.num_episodes} episodes together: {said}"]
-        votes = sorted(found.votes.items(), key=lambda item: (-item[1], item[0]))
-        lines.append(f"  single episodes say: {', '.join(f'{words(n)} {count}' for n, count in votes) or 'nothing'}")
+        lines += ["", f"source {found.source}, {found.num_episodes} episodes together: {verdict_text(found)}"]
         for error in found.camera_errors:
             bounds = [f"{each.kind} {each.bound:.1f} {each.unit}" for each in error.kinds]
-            lines.append(f"  {error.view} within: {', '.join(bounds)}")
+            lines.append(f"    {error.view} within: {', '.join(bounds)}")
             if error.contradicting:
-                lines.append(f"  {error.view}: {error.contradicting} of {error.episodes} episodes say otherwise")
-        lines += [f"  {view} not judged: {why}" for view, why in found.not_judged.items()]
-        own = [note for episode in check.episodes if episode.source == found.source for note in episode.notes]
-        lines += [f"  note: {note}" for note in dict.fromkeys((*found.notes, *own))]
-        lines += [f"  near: {near}" for near in found.nearest]
-        if found.config_lines:
-            lines += ["  what repairs it, in the configuration of this source:"]
-            lines += [f"    {line}" for line in found.config_lines]
-    return [*lines, *_single_episodes(check)]
-
-
-def _single_episodes(check: CalibrationCheck) -> list[str]:
-    """Episodes that the conclusion over their source does not cover: what repairs them, what comes nearest, and notes."""
-    together = {found.source: found for found in check.sources}
-    lines = []
-    for episode in check.episodes:
-        found, diagnosis = together.get(episode.source), episode.diagnosis
-        if diagnosis is None or (found is not None and diagnosis.verdict not in ("explained", "unexplained")):
-            continue
-        if found is not None and (found.verdict, found.config_lines) == (diagnosis.verdict, episode.config_lines):
-            continue
-        notes = (*diagnosis.notes, *episode.notes) if found is None else ()  # else printed with the source
-        own = [f"    note: {note}" for note in notes]
-        own += [f"    near: {near}" for near in diagnosis.nearest]
-        own += [f"    {line}" for line in episode.config_lines]
-        lines += [f"  {episode.episode_id}:", *own] if own else []
-    header = ["", "single episodes (give those that differ a source of their own, by `include`):"]
-    return [*header, *lines] if lines else []
+                lines.append(f"    {error.view}: {error.contradicting} of {error.episodes} episodes say otherwise")
+        lines += [f"    {view} not judged: {why}" for view, why in found.not_judged.items()]
+        lines += detail_lines(found)
+    return lines
 
 
 def as_json(check: CalibrationCheck) -> dict[str, Any]:
-    """Everything in plain values; numbers that are not finite become null."""
-    episodes = []
-    for each in check.episodes:
-        content = {} if each.diagnosis is None else _conclusion_json(each.diagnosis)
-        content["notes"] = (*content.get("notes", ()), *each.notes)
-        names = ("episode_id", "source", "verdict", "reason", "detail", "config_lines", "picture")
-        episodes.append({name: getattr(each, name) for name in names} | content)
-    names = ("source", "num_episodes", "votes", "config_lines")
-    sources = [{name: getattr(found, name) for name in names} | _conclusion_json(found) for found in check.sources]
-    content = {"consistent": check.consistent, "episodes": episodes, "sources": sources}
-    return json.loads(TypeAdapter(Any, config=ConfigDict(ser_json_inf_nan="null")).dump_json(content))
+    """Verdicts, bounds and lines of all episodes and sources in plain values."""
+    names = ("episode_id", "source", "reason", "picture")
+    episodes = [
+        {name: getattr(each, name) for name in names} | _diagnosis_json(each.diagnosis) for each in check.episodes
+    ]
+    sources = [{"source": s.source, "num_episodes": s.num_episodes} | _diagnosis_json(s) for s in check.sources]
+    return {"consistent": check.consistent, "episodes": episodes, "sources": sources}
 
 
-def _conclusion_json(found: Diagnosis) -> dict[str, Any]:
-    return {
-        "verdict": found.verdict,
-        "mistake": found.best.mistake,
-        "score": found.best.score,
-        "score_as_recorded": found.as_recorded.score,
-        "notes": found.notes,
-        "nearest": found.nearest,
-        "camera_errors": [
-            {"view": e.view, "off": e in found.off, "kind": each.kind, "unit": each.unit, "bound": each.bound}
-            for e in found.camera_errors
-            for each in e.kinds
-        ],
-        "not_judged": found.not_judged,
-    }
+def _diagnosis_json(found: Diagnosis) -> dict[str, Any]:
+    bounds = [
+        {"view": e.view, "off": e in found.off, "kind": each.kind, "unit": each.unit, "bound": each.bound}
+        for e in found.camera_errors
+        for each in e.kinds
+    ]
+    names = ("verdict", "notes", "nearest", "not_judged", "config_lines")
+    plain = {name: getattr(found, name) for name in names}
+    return {**plain, "mistake": found.best.mistake, "camera_errors": bounds}
 
 
 def page(check: CalibrationCheck) -> str:
-    """The page: conclusions first, then a table, then a picture of each episode, the worst first."""
-    order = list(MEANINGS)
-    episodes = sorted(check.episodes, key=lambda episode: (order.index(episode.verdict), episode.episode_id))
+    """The page: conclusions first, then a picture of each episode, the worst first."""
+    order = get_args(VerdictName)
+    episodes = sorted(check.episodes, key=lambda e: (order.index(e.diagnosis.verdict), e.episode_id))
     return render(
         "calibration/check_page.html",
         title="Calibration check",
         subtitle=f"{len(episodes)} episodes, judged by what they show.",
-        check=check,
         episodes=episodes,
-        meanings=MEANINGS,
-        tones=TONES,
+        verdict_text=verdict_text,
         conclusions="\n".join(conclusion_lines(check)),
-        table=Table(COLUMNS, [_page_row(episode) for episode in episodes]),
     )
-
-
-def _page_row(episode: EpisodeCheck) -> list[object]:
-    name, verdict, *rest = episode.row
-    tag = Markup('<span class="tag {}">{}</span>').format(TONES[episode.verdict], verdict)
-    return [name if episode.diagnosis is None else Markup('<a href="#{0}">{0}</a>').format(name), tag, *rest]
 
 
 # Pictures
@@ -449,12 +379,11 @@ def diagnosis_picture(
 
     Raises: DataError when nothing can be drawn in any view.
     """
-    best, verdict = diagnosis.best, verdict_text(diagnosis)
-    conventions, repaired = best.conventions, None
+    conventions, repaired = diagnosis.best.conventions, None
     if conventions.departures:
         repaired = apply_conventions(recorded, conventions)
     elif diagnosis.verdict == "off":
-        cameras = {e.view: corrected_camera(recorded.cameras[e.view], e) for e in diagnosis.off}
+        cameras = {e.view: moved_camera(recorded.cameras[e.view], e.estimate / SCALE) for e in diagnosis.off}
         repaired = replace(recorded, cameras={**recorded.cameras, **cameras})
     left: list[SheetRow] = []
     right: list[SheetRow] = []
@@ -476,17 +405,11 @@ def diagnosis_picture(
     if not left:
         expected = "a calibrated view with images"
         raise DataError("Nothing to draw", where=f"episode {recorded.episode_id}", expected=expected)
-    titles = "as recorded", f"repaired: {best.text if best.departures else verdict}"
-    rows = [each for each in zip((left, right), titles, strict=True) if each[0]]
-    sheets = [contact_sheet(row, tile_height=TILE_HEIGHT, title=title, min_width=MIN_WIDTH) for row, title in rows]
+    sides = {f"{recorded.episode_id}, as recorded": left, f"repaired ({verdict_text(diagnosis)})": right}
+    drawn = [(title, rows) for title, rows in sides.items() if rows]
+    sheets = [contact_sheet(rows, tile_height=TILE_HEIGHT, title=title, min_width=MIN_WIDTH) for title, rows in drawn]
     body = np.concatenate(sheets, axis=1)
-    width, heading = body.shape[1], f"{verdict} {best.mistake if best.departures else ''}"
-    return np.concatenate([
-        text_strip(f"{recorded.episode_id}  ·  {recorded.embodiment}", width, 34, size_px=21, ink=INK),
-        text_strip(heading, width, 24, size_px=15, ink=MUTED),
-        body,
-        legend_strip(arms, width, outline=HEAD_VIEW in frames),
-    ])  # fmt: skip
+    return np.concatenate([body, legend_strip(arms, body.shape[1], outline=HEAD_VIEW in frames)])
 
 
 def recorded_tracks(episode: Episode, view: str, kinematics: ArmKinematics | None) -> EpisodeTracks:

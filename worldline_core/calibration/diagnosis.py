@@ -20,7 +20,10 @@ from worldline_core.calibration.evidence import (
 )
 from worldline_core.data.episodes.conventions import RecordedConventions
 
-VerdictName = Literal["consistent", "off", "explained", "unexplained", "mixed", "too_little_evidence"]
+VerdictName = Literal[
+    "unexplained", "explained", "off", "mixed", "unreadable", "not_judged", "too_little_evidence", "consistent"
+]
+"""The worst first; unreadable episodes and those that could not be judged come from `check`."""
 
 MIN_MARGIN = 2.5
 """Log-likelihood by which a mistake must beat the recording as written."""
@@ -49,7 +52,7 @@ FEWEST_TOGETHER = 5
 """From this many episodes on, their scatter measures their common uncertainty."""
 ESTIMATED = {"intrinsics_size", "tool_offset_z_m", "embodiment"}
 """Tried only where an episode suggests them: one that fits as written and does not is evidence against them."""
-NEAREST_SHOWN, TERMS_SHOWN = 3, 3
+NEAREST_SHOWN = 3
 MAX_LAG_FRAMES = 6
 """Lags are tried up to this one, which explains nothing: the true one may be larger."""
 
@@ -113,9 +116,10 @@ class Diagnosis:
         best: the reading to believe; the recording as written unless the verdict is explained.
         ranked: all readings that were tried, best score first; of a source the one as written.
         notes: limits of the evidence, and other facts for a person.
-        nearest: without an explanation, the best readings and what is still wrong under each.
+        nearest: without an explanation, the best readings and what is most wrong under each.
         camera_errors: the error of each camera under `best` whose pictures show it; `off`: the significant ones.
         not_judged: by view, why its pictures say nothing.
+        config_lines: what repairs it, in the source's configuration.
     """
 
     verdict: VerdictName
@@ -126,6 +130,7 @@ class Diagnosis:
     camera_errors: tuple[CameraError, ...] = ()
     off: tuple[CameraError, ...] = ()
     not_judged: Mapping[str, str] = field(default_factory=dict)
+    config_lines: tuple[str, ...] = ()
 
     @property
     def as_recorded(self) -> Explanation:
@@ -143,12 +148,10 @@ class Diagnosis:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceDiagnosis(Diagnosis):
-    """Conclusion over a source, with summed scores; `votes`: verdicts and mistakes of its episodes, counted."""
+    """Conclusion over a source, with summed scores."""
 
     source: str
     num_episodes: int
-    votes: Mapping[str, int]
-    config_lines: tuple[str, ...] = ()
 
 
 def bad_terms(explanation: Explanation, as_recorded: Explanation | None = None) -> dict[str, float]:
@@ -179,16 +182,14 @@ def unjudged_gain(explanation: Explanation, as_recorded: Explanation) -> float:
 
 
 def nearest_texts(ranked: Iterable[Explanation], as_recorded: Explanation) -> tuple[str, ...]:
-    """The best readings without a common mistake, each with what is still wrong under it."""
+    """The best readings without a common mistake, each with what is most wrong under it."""
     texts: list[str] = []
     shown: set[str] = set()
     for found in ranked:
         if found.score > as_recorded.score and not shown & set(found.departures):
             shown |= set(found.departures)
-            bad = sorted(bad_terms(found, as_recorded).items(), key=lambda item: item[1])
-            remains = ", ".join(f"{name} {value:.1f}" for name, value in bad[:TERMS_SHOWN]) or "nothing"
-            more = f" and {len(bad) - TERMS_SHOWN} more" if len(bad) > TERMS_SHOWN else ""
-            texts.append(f"{found.text} (score {found.score:.1f}): still wrong {remains}{more}")
+            bad = bad_terms(found, as_recorded)
+            texts.append(f"{found.text}: still wrong {min(bad, key=lambda name: bad[name], default='nothing')}")
     return tuple(texts[:NEAREST_SHOWN])
 
 
@@ -223,18 +224,17 @@ def tolerated_episodes(count: int) -> float:
     return max(CONTRADICTING_SHARE * count, 1.0 if count >= FEWEST_TOGETHER else 0.0)
 
 
-def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagnosis:
+def diagnose_source(source: str, diagnoses: Sequence[Diagnosis]) -> SourceDiagnosis:
     """The reading of a source: better than the recordings as written, and healthy in most of them.
 
     One episode contributes MAX_GAIN at most for or against a reading: a few broken recordings are no habit of their
     source. A reading that breaks episodes which fit by themselves is not believed: such a source is mixed.
     """
     listed = [d for d in diagnoses if d.verdict != "too_little_evidence"]
-    count = len(listed)
-    votes = Counter(d.best.mistake if d.verdict == "explained" else d.verdict for d in listed)
+    notes = tuple(dict.fromkeys(note for d in diagnoses for note in d.notes))
     if not listed:
-        notes = ("No episode can be judged",)
-        return SourceDiagnosis(verdict="too_little_evidence", notes=notes, source=source, num_episodes=0, votes={})
+        return SourceDiagnosis(verdict="too_little_evidence", notes=notes, source=source, num_episodes=0)
+    count, verdicts = len(listed), Counter(d.verdict for d in listed)
     readings = _source_readings(listed)
     as_recorded = _summed([d.as_recorded for d in listed], sum(d.as_recorded.score for d in listed))
     sound = [r for r in readings if r.wins and r.contradicting <= CONTRADICTING_SHARE * count]
@@ -244,16 +244,15 @@ def diagnose_source(source: str, diagnoses: Iterable[Diagnosis]) -> SourceDiagno
     best = as_recorded
     if sound and not rivals and not sound[0].tried[0].lag_at_edge:
         verdict, best = "explained", _summed(sound[0].tried, as_recorded.score + sound[0].gain)
-    elif sound or votes["unexplained"] > count / 2:
+    elif sound or verdicts["unexplained"] > count / 2:
         verdict = "unexplained"
-    elif count - votes["consistent"] - votes["off"] <= tolerated_episodes(count):
+    elif count - verdicts["consistent"] - verdicts["off"] <= tolerated_episodes(count):
         verdict = "consistent"
-    notes = tuple(dict.fromkeys(note for d in listed for note in d.notes))
     nearest = _nearest(readings, count) if verdict == "unexplained" else ()
     in_none = {view: why for view, why in listed[0].not_judged.items() if all(view in d.not_judged for d in listed)}
     found = SourceDiagnosis(
         verdict=verdict, best=best, ranked=(as_recorded,), notes=notes, nearest=nearest, not_judged=in_none,
-        source=source, num_episodes=count, votes=dict(votes),
+        source=source, num_episodes=count,
     )  # fmt: skip
     if best.other is not None:
         return found

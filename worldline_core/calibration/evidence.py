@@ -36,8 +36,6 @@ MAX_REACH_M, MAX_CAMERA_M, MAX_WRIST_CAMERA_M = 2.5, 5.0, 0.5
 """Tool from base, camera from base, wrist camera from its tool."""
 FOLLOWS_COMMANDS_COST = 2.0
 """Camera poses may follow the commands rather than the states."""
-COMMANDS_FIT_RATIO, NOTICEABLE_M = 3.0, 0.001
-"""Camera poses follow the commands when their residual against the states is larger by this ratio, and noticeable."""
 FACING_DEG, FACING_SPREAD_DEG = 45.0, 10.0
 """Between a wrist camera's axis and the direction to its tool."""
 
@@ -433,23 +431,3 @@ def stopped_share(reading: Reading, arm: int) -> float | None:
     still = np.maximum(np.abs(np.gradient(opening)), np.abs(np.gradient(command))) < STOPPED_STEP
     rests = still & (np.abs(gap) > STOPPED_GAP)
     return float((gap[rests] > 0).mean()) if rests.sum() >= 4 else None
-
-
-def notes_on(observation: Observation, recorded: Reading) -> list[str]:
-    """Limits of the evidence, and other facts for a person."""
-    notes: list[str] = []
-    for view, i in observation.wrists.items():
-        camera, commands = recorded.cameras.get(view), recorded.action_tools
-        if camera is None or commands is None:
-            continue
-        arms = recorded.tools[:, i], commands[:, i]
-        states_m, commands_m = (rms_hand_eye(tools, camera.T_base_camera)[1] for tools in arms)
-        if states_m > NOTICEABLE_M and states_m > COMMANDS_FIT_RATIO * commands_m:
-            fits = f"follow the commands ({1e3 * commands_m:.1f} mm), not the states ({1e3 * states_m:.1f} mm)"
-            notes.append(f"{view}: the camera poses {fits}")
-    if recorded.gripper is None:
-        return [*notes, "gripper: the state names no gripper columns, polarity is not judged"]
-    for i, arm in enumerate(observation.arms):
-        if finger_flow(observation, recorded, i) is None and stopped_share(recorded, i) is None:
-            notes.append(f"gripper {arm.name}: does not move enough to be seen, polarity is not judged")
-    return notes
