@@ -76,7 +76,7 @@ def trained(
         add_adapters(model, config.lora, 0)
     place_model(model, sharding, precision=trainer.precision, device=device, weights=trainer.weights).train()
     batch = source.largest(
-        model_config, trainer, config.first_clips if distilled else config.clips,
+        model_config, trainer.batch_size, config.first_clips if distilled else config.clips,
         config.views if distilled else model_config.views,
     )  # fmt: skip
     batch = replace(

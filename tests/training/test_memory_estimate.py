@@ -19,7 +19,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model_config import MixtureConfig, WanConfig
 from worldline_core.pipeline import memory_estimate, memory_trace
-from worldline_core.pipeline.memory_estimate import Estimate, Sources, Training, Work, outlined, trainings
+from worldline_core.pipeline.memory_estimate import Estimate, Sources, Training, outlined, trainings
 from worldline_core.pipeline.memory_trace import Held
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import SizeSheet
@@ -55,7 +55,7 @@ objective = partial(FlowMatchingObjective, sigma=SigmaSampling(), weighting=Loss
 def training_of(config, frames=33, lora=None, **trainer):
     def work(config):
         batch, model = SOURCE.batch(config, 1, config.views, frames), outlined(config, lora)
-        return Work(partial(objective(model).loss, batch, torch.Generator()), [model])
+        return [model], [(1, partial(objective(model).loss, batch, torch.Generator(), 0))], {}
 
     return Training("stage", TrainerConfig.model_validate({"steps": 2, "batch_size": 1, **trainer}), config, work)
 
@@ -108,7 +108,7 @@ def test_estimated_memory_is_what_the_allocator_hands_out(size, values, tmp_path
 @pytest.mark.slow
 def test_a_deep_model_holds_what_two_shallow_ones_predict(monkeypatch):
     # The backward pass of deep models holds most where shallow ones do before it.
-    for depths in (memory_trace.SHALLOW, (1, 2)):
+    for depths in ((2, 3), (1, 2)):
         found = memory_trace.extrapolated(lambda layers: {"before": 10 + layers, "after": 2 * layers}, 36, depths)
         assert found == {"before": 46, "after": 72}
     config = MixtureConfig(towers="generation", num_layers=10)
@@ -124,7 +124,7 @@ def test_operations_are_those_that_torch_counts():
         objective(model).loss(batch, torch.Generator(), 0)[0].backward()
     tokens, width = 3 * 5 * 4 * 6, config.num_heads * config.head_dim
     attention = config.num_layers * 14 * tokens**2 * width  # two products on the way there and five on the way back
-    figures = training_of(config, 17, precision="fp32").figures(config.num_layers, shards=1)
+    figures = training_of(config, 17, precision="fp32").figures(config.num_layers, sharded=False)
     assert figures["operations"] == sum(counter.get_flop_counts()["Global"].values()) + attention
 
 
@@ -141,7 +141,7 @@ def test_parts_are_shared_out_but_for_what_is_frozen_and_whole(monkeypatch):
 
     def work(config):
         models = [build_world_model(config), build_world_model(config).requires_grad_(False)]
-        return Work(lambda _: None, models, {"tokenizer": torch.nn.Linear(1, 1)})
+        return models, [(1, lambda: None)], {"decoder": torch.nn.Linear(1, 1)}
 
     count = sum(value.numel() for value in build_world_model(TWO_LAYERS).parameters())
 
@@ -150,11 +150,11 @@ def test_parts_are_shared_out_but_for_what_is_frozen_and_whole(monkeypatch):
 
     whole = {"weights": 4, "moments": 8, "average": 4, "frozen scores": 4, "gradients": 4}
     assert parts(1, accumulation=2) == {name: size * count for name, size in whole.items()} | {
-        "tokenizer": 8, "activations": 100,
+        "decoder": 8, "activations": 100,
     }  # fmt: skip
     block = sum(value.numel() for value in build_world_model(TWO_LAYERS).layers[0].parameters())
     assert parts(4) == {name: size * count / 4 for name, size in whole.items()} | {
-        "tokenizer": 8, "gathered": 10 * block, "activations": 100,
+        "decoder": 8, "gathered": 10 * block, "activations": 100,
     }  # fmt: skip
     # Micro-steps follow from a global batch; their gradients are whole unless each is summed at once.
     assert [parts(n, global_batch=8)["gradients"] for n in (4, 8)] == [4 * count, count / 2]

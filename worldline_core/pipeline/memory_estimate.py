@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +23,7 @@ from worldline_core.config import StrictModel
 from worldline_core.distillation.auxiliary_losses import PerceptualLoss
 from worldline_core.distillation.causal_objective import maps_of
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
-from worldline_core.distillation.distill_config import CYCLE, DistillConfig, DistillStep
+from worldline_core.distillation.distill_config import CYCLE, DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
 from worldline_core.distillation.trajectory_regression import TrajectoryBatch, TrajectoryObjective, teacher_trajectories
 from worldline_core.errors import ConfigError
@@ -33,9 +33,9 @@ from worldline_core.model.networks import build_world_model
 from worldline_core.model.tokenizers import spatial_compression, tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WanConfig, WorldModelConfig
-from worldline_core.pipeline.memory_trace import SHALLOW, extrapolated, traced
-from worldline_core.training.adapters import add_adapters, share_frozen
-from worldline_core.training.clip_config import JOINT, SUBSET, ClipSampling, FrameInput
+from worldline_core.pipeline.memory_trace import extrapolated, traced
+from worldline_core.training.adapters import add_adapters
+from worldline_core.training.clip_config import JOINT, SUBSET, ClipInput, ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.clip_source import LatentStore
@@ -46,22 +46,16 @@ from worldline_core.training.relational import RelationalTerm, common_shape, sim
 from worldline_core.training.resident import track_bytes
 from worldline_core.training.stage2 import stage2_model_config
 from worldline_core.training.trainer import autocast
-from worldline_core.training.training_config import (
-    LoRAConfig,
-    ShardingConfig,
-    Stage1Config,
-    Stage2Config,
-    TrainerConfig,
-)
+from worldline_core.training.training_config import LoRAConfig, Stage1Config, Stage2Config, TrainerConfig
 from worldline_core.training.video_teacher import teacher_outline
 
 USABLE = 0.92
 """Share of a device's memory that a stage may fill; the rest is for the driver, communication and fragmentation."""
-
-_MOMENT = "most"
-"""Beginning of the names of bytes held at different moments: the largest of them counts."""
 AnyStage = Stage1Config | Stage2Config | DistillConfig
-Before = tuple[int, Callable[[], Any]]
+Pass = tuple[float, Callable[[], Any]]
+"""How often a micro-step does a computation, and the computation, which gives a loss first where something is trained."""
+Work = tuple[Sequence[WorldModel], Sequence[Pass], Mapping[str, nn.Module]]
+"""World models (the averaged one, others that are trained, frozen scores), passes, and models that every device has whole."""
 
 
 def gigabytes(size: float) -> str:
@@ -99,17 +93,21 @@ class Sources:
         return replace(batch, text_ids=tokens, text_mask=mask)
 
     def largest(
-        self, model: WorldModelConfig, trainer: TrainerConfig, clips: ClipSampling, views: Sequence[str], text: int = 0
+        self, model: WorldModelConfig, batch_size: int, clips: ClipSampling, views: Sequence[str], text: int = 0
     ) -> Batch:
         """The largest micro-batch, of the longest clips: in all views where steps are joint, else in one."""
         joint = clips.view_weights is None or {JOINT, SUBSET} & clips.view_weights.keys()
         count, views = (1, views) if joint else (clips.single_view_factor, views[:1])
-        return self.batch(model, count * trainer.batch_size, views, max(clips.lengths), text)
+        return self.batch(model, count * batch_size, views, max(clips.lengths), text)
 
-    def encoder(self, batch: Batch) -> tuple[nn.Module, Before]:
-        """The tokenizer, and its encoding of a batch, one view of a clip after the other."""
+    def encoder(self, reading: ClipInput, batch: Batch) -> tuple[dict[str, nn.Module], list[Pass]]:
+        """The tokenizer of clips that are read as frames, and its encoding of a batch, one view of a clip after the other."""
+        if not isinstance(reading, FrameInput):
+            return {}, []
         tokenizer, size = tokenizer_outline(self.tokenizer), (1, 3, batch.clips[0].num_frames, *self.image_size)
-        return tokenizer, (len(batch.clips) * len(batch.views), lambda: tokenizer.encode(torch.empty(size)))
+        return {"encoder": tokenizer}, [
+            (len(batch.clips) * len(batch.views), lambda: tokenizer.encode(torch.empty(size)))
+        ]
 
 
 @dataclass(frozen=True)
@@ -142,22 +140,6 @@ class Estimate:
         return ", ".join(f"{name} {gigabytes(size)}" for name, size in self.parts.items())
 
 
-class Work(NamedTuple):
-    """A device's repeated work.
-
-    Attributes:
-        run: by the step's number; where something is trained, its loss comes first.
-        models: world models: the one that is averaged, others that are trained, frozen scores.
-        whole: other models that are not trained, whole on every device.
-        before: what is done before ``run``, and how often: clips are encoded, a teacher looks at them.
-    """
-
-    run: Callable[[int], Sequence[Any]]
-    models: Sequence[WorldModel]
-    whole: Mapping[str, nn.Module] = {}
-    before: Sequence[Before] = ()
-
-
 def outlined(config: WorldModelConfig, lora: LoRAConfig | None = None) -> WorldModel:
     """A model without values, with adapters where they are asked for; call it within a FakeTensorMode."""
     with unset_fake_temporarily(), torch.device("meta"):  # peft moves adapters from device to device
@@ -167,87 +149,59 @@ def outlined(config: WorldModelConfig, lora: LoRAConfig | None = None) -> WorldM
     return model._apply(lambda one: torch.empty(one.shape, dtype=one.dtype))
 
 
-def _weight_bytes(models: Sequence[nn.Module]) -> int:
-    """Bytes of models' weights; those that share a storage count once."""
-    weights = [value for model in models for value in model.parameters()]
-    return sum({value.untyped_storage()._cdata: value.nbytes for value in weights}.values())
-
-
-def _hold(models: Sequence[WorldModel], trainer: TrainerConfig, weights: Literal["fp32", "bf16"]) -> None:
-    """Give models the weights that a device computes with."""
-    for one in models:
-        hold_weights(one, trainer.precision, weights)
-    if len(models) > 2:  # what the fake score does not train is the real one's
-        share_frozen(*models[1:])
-
-
-def _moment_bytes(parameter: Tensor, trainer: TrainerConfig) -> float:
-    eight_bits = trainer.optimizer.moments == "8bit" and in_eight_bits(parameter)
-    return 2 * parameter.numel() * (1 + 4 / BLOCK if eight_bits else 4)
-
-
 @dataclass(frozen=True, eq=False)
 class Training:
     """One training, by its configuration alone.
 
     Attributes:
-        work: a step of the model, whose depth may be another one, made without values.
-        turns: numbers of steps, one of each kind that the training takes (distribution matching alternates), and their shares.
-        shallow: depths that the line of a deeper model goes through.
+        work: that of the model, whose depth may be another one, made without values.
+        shallow: depths that the line of a deeper model goes through; at lower ones its worst moment can be another one.
     """
 
     title: str
     trainer: TrainerConfig
     model: WorldModelConfig
     work: Callable[[WorldModelConfig], Work]
-    turns: Sequence[tuple[int, float]] = ((0, 1.0),)
-    shallow: tuple[int, int] = SHALLOW
+    shallow: tuple[int, int] = (2, 3)
 
-    def figures(self, layers: int, shards: int) -> dict[str, float]:
-        """Bytes on each of so many devices, and operations of a micro-step, of a model of so many layers.
+    def figures(self, layers: int, *, sharded: bool) -> dict[str, float]:
+        """Bytes before they are shared out, and operations of a micro-step, of a model of so many layers.
 
-        Each grows by as much with every layer. Gradients and operations are those of one micro-step; the most bytes before and
-        after the loss are apart, for each kind of step.
+        Each grows by as much with every layer; therefore the most bytes before and after the loss of each pass are apart.
         """
         trainer = self.trainer.model_copy(update={"device": "cpu"})  # tensors without values follow a CPU's paths
         with FakeTensorMode():
-            work = self.work(self.model.model_copy(update={"num_layers": layers}))
-            if shards == 1:
-                _hold(work.models, trainer, trainer.weights)
-            trained = [[value for value in model.parameters() if value.requires_grad] for model in work.models]
+            models, passes, whole = self.work(self.model.model_copy(update={"num_layers": layers}))
+            for one in models:
+                hold_weights(one, trainer.precision, "bf16" if sharded else trainer.weights)
+                one.checkpointing = trainer.sharding.checkpointing
+            trained = [[value for value in one.parameters() if value.requires_grad] for one in models]
             weights = [value for values in trained for value in values]
-            counts = [sum(value.numel() for value in values) for values in trained]
-            block = sum(value.numel() for value in work.models[0].layers[0].parameters())
-            scores = _weight_bytes([one for one, count in zip(work.models[1:], counts[1:], strict=True) if not count])
+            for value in weights:
+                value.register_post_accumulate_grad_hook(lambda one: setattr(one, "grad", None))
+            # What later models do not train is a frozen score, or shared with one.
+            own = [*models[0].parameters(), *(value for values in trained[1:] for value in values)]
+            scores = [one for one, values in zip(models[1:], trained[1:], strict=True) if not values]
+            short = trainer.optimizer.moments == "8bit"
+
+            def size(values: Iterable[Tensor]) -> int:
+                return sum(4 * value.numel() if sharded else value.nbytes for value in values)
+
             found = {
-                "parameters": sum(counts) or sum(value.numel() for value in work.models[0].parameters()),
-                "weights": (_weight_bytes(work.models) - scores) / shards,
-                "moments": sum(_moment_bytes(value, trainer) for value in weights) / shards,
-                "average": (trainer.average == "device") * 4 * counts[0] / shards,
-                **{name: sum(value.nbytes for value in one.state_dict().values()) for name, one in work.whole.items()},
-                "frozen scores": scores / shards,
-                # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
-                "gathered": 0 if shards == 1 else block * (2 * 2 + 2 + 4),
-                "gradients": max(sum(value.nbytes for value in values) for values in trained),
+                "parameters": sum(value.numel() for value in weights or models[0].parameters()),
+                "weights": size(own),
+                "moments": sum((2 + 8 / BLOCK if short and in_eight_bits(one) else 8) * one.numel() for one in weights),
+                "average": sum(4 * value.numel() for value in trained[0]) if trainer.average == "device" else 0,
+                **{name: sum(value.nbytes for value in one.state_dict().values()) for name, one in whole.items()},
+                "frozen scores": size(value for one in scores for value in one.parameters()),
+                # Two blocks are gathered at a time in bfloat16, and the gradients of one are summed, in bfloat16 and float32.
+                "gathered": 10 * sum(value.numel() for value in models[0].layers[0].parameters()) if sharded else 0,
+                "gradients": max(size(values) for values in trained),
                 "operations": 0.0,
             }
-            if shards > 1:
-                _hold(work.models, trainer, "bf16")  # shards are kept in float32
-            for one in work.models:
-                one.checkpointing = trainer.sharding.checkpointing
-
-            def loss(step: int) -> Tensor:
-                with autocast(trainer):
-                    return work.run(step)[0]
-
-            for step, share in self.turns:
-                held = traced(partial(loss, step), weights)
-                found |= {f"{_MOMENT} in {step}": held.forward, f"{_MOMENT} after {step}": held.backward}
-                found["operations"] += share * held.operations
-            for number, (times, look) in enumerate(work.before):
-                with torch.no_grad(), autocast(trainer):
-                    held = traced(look)
-                found[f"{_MOMENT} before, {number}"] = held.forward
+            for number, (times, run) in enumerate(passes):
+                held = traced(run, autocast(trainer))
+                found |= {f"activations of {number}": held.forward, f"activations after {number}": held.backward}
                 found["operations"] += times * held.operations
         return found
 
@@ -256,19 +210,17 @@ class Training:
         trainer, sharding = self.trainer, self.trainer.sharding
         shards, clips = min(sharding.shards or devices, devices), trainer.batch_size * devices
         micro_steps = trainer.accumulation if trainer.global_batch is None else -(-trainer.global_batch // clips)
-        parts = extrapolated(partial(self.figures, shards=shards), self.model.num_layers, self.shallow)
+        parts = extrapolated(partial(self.figures, sharded=shards > 1), self.model.num_layers, self.shallow)
+        shared_out = ["weights", "moments", "average", "frozen scores"]
         if micro_steps == 1 or sharding.reduce_every_micro_step:
-            parts["gradients"] /= shards
-        parts["activations"] = max(parts.pop(name) for name in list(parts) if name.startswith(_MOMENT))
-        operations = parts.pop("operations")
-        return Estimate(
-            self.title,
-            parameters=round(parts.pop("parameters")),
-            parts={name: size for name, size in parts.items() if size},
-            operations=micro_steps * operations if trainer.precision == "bf16" else None,
-            steps=trainer.steps,
-            minutes=trainer.minutes,
-        )
+            shared_out.append("gradients")
+        for name in shared_out:
+            parts[name] /= shards
+        parts["activations"] = max(parts.pop(name) for name in list(parts) if name.startswith("activations"))
+        count, operations = round(parts.pop("parameters")), micro_steps * parts.pop("operations")
+        parts = {name: size for name, size in parts.items() if size}
+        in_bfloat16 = trainer.precision == "bf16"
+        return Estimate(self.title, count, parts, operations if in_bfloat16 else None, trainer.steps, trainer.minutes)
 
 
 def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> list[Training]:
@@ -277,50 +229,33 @@ def trainings(config: AnyStage, model: WorldModelConfig, source: Sources) -> lis
         title = "stage II" if isinstance(config, Stage2Config) else {"base": "base", "stage1": "stage I"}[config.kind]
         return [Training(title, config.trainer, model, partial(_flow_matching, config, source))]
     steps = config.trajectory_regression.trajectories
-    clips = min(steps.clips, steps.clips_per_shard)
-    shard = TrainerConfig(
-        steps=-(-steps.clips // clips),
-        batch_size=clips,
-        precision=config.trajectory_regression.trainer.precision,
-        sharding=ShardingConfig(shards=1),
+    clips, precision = min(steps.clips, steps.clips_per_shard), config.trajectory_regression.trainer.precision
+    shard = TrainerConfig.model_validate(
+        {"steps": -(-steps.clips // clips), "batch_size": clips, "precision": precision, "sharding": {"shards": 1}}
     )
-    # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
-    passes = (1 + sum(steps.substeps)) / (1 + config.spec.steps)
-    model = model.model_copy(update={"towers": "generation"})
-    alternating = ((0, 1 - 1 / CYCLE), (CYCLE - 1, 1 / CYCLE))
-    shallow = (4, 5)  # at lower depths a score's worst moment can be another one
-    parts: dict[DistillStep, dict[str, tuple[Any, ...]]] = {
-        "teacher_forcing": {"teacher forcing": (config.teacher_forcing.trainer,)},
-        "trajectory_regression": {
-            f"trajectories (a shard of {clips} clips)": (shard, ((0, passes),)),
-            "trajectory regression": (config.trajectory_regression.trainer,),
-        },
-        "distribution_matching": {
-            "distribution matching": (config.distribution_matching.trainer, alternating, shallow)
-        },
-    }
-    return [
-        Training(f"distill: {part}", trainer, model, partial(_distillation, part, config, source, trainer), *settings)
-        for step in config.trainers
-        for part, (trainer, *settings) in parts[step].items()
-    ]
+    trainers: list[tuple[str, TrainerConfig]] = [*config.trainers.items()]
+    if len(trainers) > 1:
+        trainers.insert(1, (f"trajectories (a shard of {clips} clips)", shard))
+    model, made = model.model_copy(update={"towers": "generation"}), list[Training]()
+    for part, trainer in trainers:
+        work = partial(_distillation, part, trainer.batch_size, config, source)
+        shallow = (4, 5) if part == "distribution_matching" else (2, 3)
+        made.append(Training(f"distill: {part.replace('_', ' ')}", trainer, model, work, shallow))
+    return made
 
 
 def _flow_matching(config: Stage1Config | Stage2Config, source: Sources, model: WorldModelConfig) -> Work:
-    """A step of Stage I or II."""
-    trainer, first = config.trainer, config if isinstance(config, Stage1Config) else None
+    """Stage I or II."""
+    first = config if isinstance(config, Stage1Config) else None
     stored = first is not None and first.text_tower == "stored"
     network = outlined(model.model_copy(update={"towers": "generation"}) if stored else model, config.lora)
     if first is not None and config.lora is None:
         read = () if first.text_tower == "trained" else network.text_parameters()
         for _, value in (*network.action_parameters(), *read):
             value.requires_grad_(False)
-    text = 0 if first is None else first.text.max_length
-    batch = source.largest(model, trainer, config.clips, model.views, text)
-    whole, before, term = dict[str, nn.Module](), list[Before](), None
-    if isinstance(config.input, FrameInput):
-        whole["tokenizer"], encode = source.encoder(batch)
-        before.append(encode)
+    text, size = 0 if first is None else first.text.max_length, config.trainer.batch_size
+    batch = source.largest(model, size, config.clips, model.views, text)
+    (whole, passes), term = source.encoder(config.input, batch), None
     if isinstance(config, Stage2Config) and config.relational is not None:
         relational = config.relational.model_copy(update={"student_layer": None})  # all are held, whichever it is
         whole["teacher"], look = teacher_outline(source.teacher)
@@ -328,61 +263,57 @@ def _flow_matching(config: Stage1Config | Stage2Config, source: Sources, model: 
         term.targets = lambda batch, grid: similarity_matrices(
             torch.empty(*batch.latents.shape[:2], *grid, 1), common_shape(relational, grid)
         )
-        size = len(model.views), 3, max(config.clips.lengths), *source.image_size
-        before.append((trainer.batch_size, lambda: look(torch.empty(size))))
+        clip = len(model.views), 3, max(config.clips.lengths), *source.image_size
+        passes.append((size, lambda: look(torch.empty(clip))))
     objective = FlowMatchingObjective(network, sigma=config.sigma, weighting=config.weighting, relational=term)
     if stored:
         reader = hold_weights(outlined(model), "bf16", "bf16")
         objective.encode_text = torch.no_grad()(reader.encode_text)
-    return Work(partial(objective.loss, batch, torch.Generator()), [network], whole=whole, before=before)
+    return [network], [(1, partial(objective.loss, batch, torch.Generator(), 0)), *passes], whole
 
 
-def _distillation(
-    part: str, config: DistillConfig, source: Sources, trainer: TrainerConfig, model: WorldModelConfig
-) -> Work:
+def _distillation(part: str, size: int, config: DistillConfig, source: Sources, model: WorldModelConfig) -> Work:
     """A step of one of the trainings of Stage III, or a shard of trajectories, whose clips are made together."""
-    making, forcing = part.startswith("trajectories"), part == "teacher forcing"
-    batch = source.largest(model, trainer, config.first_clips if forcing else config.clips, config.views)
-    whole, before, distance = dict[str, nn.Module](), list[Before](), None
-    if isinstance(config.input, FrameInput):  # it stays, though the later steps use the latents of the trajectories
-        whole["encoder"], encode = source.encoder(batch)
-        before = [encode] if making or forcing else []
-    network = outlined(model, None if making else config.lora)
-    if making:
-        network.requires_grad_(False)
+    spec, first = config.spec, part == "teacher_forcing"
+    batch = source.largest(model, size, config.first_clips if first else config.clips, config.views)
+    whole, passes = source.encoder(config.input, batch)
+    if part.startswith("trajectories"):
+        teacher = outlined(model).requires_grad_(False)
 
-        def run(_: int) -> Sequence[Tensor]:
-            noise, spec = torch.empty_like(batch.latents), config.spec
-            given = network, batch.latents, maps_of(batch), noise
-            return [teacher_trajectories(*given, views=batch.views, spec=spec, substeps=(1,) * spec.steps)]
+        def run() -> Tensor:
+            given = teacher, batch.latents, maps_of(batch), torch.empty_like(batch.latents)
+            return teacher_trajectories(*given, views=batch.views, spec=spec, substeps=(1,) * spec.steps)
 
-        return Work(run, [network], whole=whole, before=before)
-    models = [network]
-    if forcing:
+        # A pass of each Euler step and one that writes the cache, of equal length; only the first kind is repeated.
+        times = (1 + sum(config.trajectory_regression.trajectories.substeps)) / (1 + spec.steps)
+        return [teacher], [(times, run), *passes], whole
+    models, distance = [outlined(model, config.lora)], None
+    if first:
         if config.teacher_forcing.teacher_share:
             models.append(outlined(model).requires_grad_(False))
-        objective: Any = TeacherForcingObjective(network, config, *models[1:])
-        return Work(partial(objective.loss, batch, torch.Generator()), models, whole, before)
-    shown, views, channels, frames, *grid = batch.latents.shape
-    nodes = torch.empty(shown, config.spec.steps + 1, views, channels, frames - 1, *grid)
-    mask = torch.ones(shown, views, frames, *grid)
-    batch = TrajectoryBatch(**vars(batch), nodes=nodes, history=batch.latents, mask=mask)
+        loss = partial(TeacherForcingObjective(models[0], config, *models[1:]).loss, batch, torch.Generator())
+        return models, [(1, partial(loss, 0)), *passes], whole
+    # The encoder stays, though these steps use the latents of the trajectories.
+    clips, views, channels, frames, *grid = batch.latents.shape
+    nodes = torch.empty(clips, spec.steps + 1, views, channels, frames - 1, *grid)
+    batch = TrajectoryBatch(**vars(batch), nodes=nodes, history=batch.latents, mask=batch.latents[:, :, 0])
     if config.lpips_weights is not None:
         decoder, lpips = tokenizer_outline(source.tokenizer), LPIPS().requires_grad_(False)
         if config.perceptual.bfloat16:
             for parameter in decoder.parameters():
                 parameter.data = parameter.data.bfloat16()
-        whole |= {"tokenizer": decoder, "lpips": lpips}
+        whole |= {"decoder": decoder, "lpips": lpips}
         compared = 1 + config.perceptual.latent_frames
         perceptual = PerceptualLoss(decoder, lpips, config.perceptual.latent_frames)
         # One view after the other, and what comes before the compared frames without gradients: neither adds up.
         distance = lambda a, b: perceptual(a[:1, :1, :, -compared:], b[:1, :1, :, -compared:])  # noqa: E731
-    if part == "trajectory regression":
-        objective = TrajectoryObjective(network, config, distance)
-    else:
-        models += [outlined(model, config.lora), outlined(model).requires_grad_(False)]
-        objective = DistributionMatchingObjective(network, models[2], models[1], config, distance)
-    return Work(partial(objective.loss, batch, torch.Generator()), models, whole, before)
+    if part == "trajectory_regression":
+        loss = partial(TrajectoryObjective(models[0], config, distance).loss, batch, torch.Generator())
+        return models, [(1, partial(loss, 0))], whole
+    models += [outlined(model, config.lora), outlined(model).requires_grad_(False)]
+    objective = DistributionMatchingObjective(models[0], models[2], models[1], config, distance)
+    loss = partial(objective.loss, batch, torch.Generator())
+    return models, [(1 - 1 / CYCLE, partial(loss, 0)), (1 / CYCLE, partial(loss, CYCLE - 1))], whole
 
 
 def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
@@ -393,13 +324,12 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
     """
     if not isinstance(config, AnyStage):
         return
-    device = (config.teacher_forcing if isinstance(config, DistillConfig) else config).trainer.device
-    memory, frames = device_memory(device), isinstance(config.input, FrameInput)
-    if memory is None or ("tokenizer" if frames else "latents") not in inputs:
+    reading, first = config.input, config.teacher_forcing if isinstance(config, DistillConfig) else config
+    memory, folders = device_memory(first.trainer.device), (inputs.get("tokenizer"), inputs.get("teacher"))
+    if memory is None or ("tokenizer" if isinstance(reading, FrameInput) else "latents") not in inputs:
         return  # the training itself names the input that is missing
-    folders = inputs.get("tokenizer"), inputs.get("teacher")
-    if isinstance(config.input, FrameInput):
-        source = Sources.of(*folders, config.input.image_size)
+    if isinstance(reading, FrameInput):
+        source = Sources.of(*folders, reading.image_size)
     else:
         latents = LatentStore.open(inputs["latents"])
         source = Sources(*folders, latents.image_size, latents.latent_shape[1:])
@@ -415,7 +345,7 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
         if not need.fits(memory):
             raise ConfigError(
                 "This training does not fit the device's memory.",
-                where=f"{need.title} on {device}",
+                where=f"{need.title} on {first.trainer.device}",
                 expected=f"at most {gigabytes(USABLE * memory)} GB",
                 got=f"{gigabytes(need.total)} GB ({need.describe_parts()})",
                 next_step=f"{'set input.resident to false, ' if resident else ''}take more devices or what `worldline plan --fit` "

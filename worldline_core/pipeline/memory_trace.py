@@ -1,27 +1,22 @@
 """Bytes held and operations done by a computation, from the shapes of its tensors alone.
 
-torch's MemTracker gives the same bytes within 0.4 % for a single pass, but refuses modules that are called several times before a
-backward pass, as the tokenizers and Stage III do.
+torch's MemTracker agrees within 0.4 %, but refuses modules that are called several times before a backward pass, as in Stage III.
 """
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterable, Mapping
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from torch import Tensor, nn
-from torch._guards import detect_fake_mode
+from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor
+from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-WHOLE = 8
-"""Most layers of a model that is traced as it is."""
-SHALLOW = (2, 3)
-"""Depths that the line of a deeper model goes through: with one layer its worst moment can be another one."""
 _ATEN: Any = torch.ops.aten
 _DEVICE: Any = torch.ops.prim.device.default
 _FLASH = "_scaled_dot_product_flash_attention"
@@ -31,8 +26,7 @@ _COUNTS: dict[Any, Callable[..., int]] = flop_registry | {
 
 
 class Held(NamedTuple):
-    """Most bytes held at once until the loss is there, and from then on, without gradients of parameters; operations of both:
-    multiplications and additions of products of matrices, convolutions and attention."""
+    """Most bytes held before and in the backward pass, without gradients of parameters, and operations (two a multiply-add)."""
 
     forward: float
     backward: float
@@ -46,73 +40,35 @@ class _Tracker(TorchDispatchMode):
     tensors of some shapes is kept for the next time: tracing takes more than twice as long with FakeTensorMode's own memory.
     """
 
-    _known: ClassVar[dict[Any, tuple[list[Callable[[_Tracker, list[FakeTensor]], Any]], bool, int]]] = {}
+    _known: ClassVar[dict[Any, tuple[list[Callable[[Sequence[FakeTensor]], Any]], bool, int]]] = {}
 
     def __init__(self) -> None:
         super().__init__()
         self.live = self.most = self.operations = 0
-        mode: Any = detect_fake_mode()
-        # Fields that FakeTensor's constructor gives to a tensor on a device; the constructor itself takes three times as long.
-        self._fields = cache(lambda device: vars(FakeTensor(mode, torch.empty(0, device="meta"), device)))
 
-    @classmethod
-    def _should_skip_dynamo(cls) -> bool:
-        return False  # nothing is compiled here, and the guard against it takes a tenth of the time
-
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None) -> Any:
         if func is _DEVICE:  # more than half of all calls
             return args[0].fake_device
         if func is _ATEN._local_scalar_dense.default:
             return True if args[0].dtype == torch.bool else 0.5 if args[0].is_floating_point() else 1
         kwargs, given = kwargs or {}, list[FakeTensor]()
         key = func, _described((*args, *kwargs.items()), given)
-        if (known := self._known.get(key)) is not None:
+        if (known := self._known.get(key)) is None:
+            returned, count = func(*args, **kwargs), _COUNTS.get(func._overloadpacket)
+            values, several = (returned, True) if isinstance(returned, list | tuple) else ([returned], False)
+            operations = 0 if count is None else count(*args, **kwargs, out_val=returned)
+            if given and torch.Tag.inplace_view not in func.tags:
+                self._known[key] = [_maker(value, given) for value in values], several, operations
+        else:
             makers, several, operations = known
-            self.operations += operations
-            values = [make(self, given) for make in makers]
-            return values if several else values[0]
-        returned = func(*args, **kwargs)
-        several, count = isinstance(returned, list | tuple), _COUNTS.get(func._overloadpacket)
-        makers = [self._maker(value, given) for value in (returned if several else (returned,))]
-        operations = 0 if count is None else count(*args, **kwargs, out_val=returned)
+            values = [make(given) for make in makers]
         self.operations += operations
-        if torch.Tag.inplace_view not in func.tags:
-            self._known[key] = makers, several, operations
-        return returned
-
-    def _maker(self, value: Any, given: list[FakeTensor]) -> Callable[[_Tracker, list[FakeTensor]], Any]:
-        """Return a function that makes a result again: a value that is no tensor, an argument, a view of one, or a new tensor."""
-        if not isinstance(value, FakeTensor):
-            return lambda *_: value
-        if (same := next((n for n, one in enumerate(given) if one is value), None)) is not None:
-            return lambda _, given: given[same]
-        storage = value.untyped_storage()._cdata
-        shared = next((n for n, one in enumerate(given) if one.untyped_storage()._cdata == storage), None)
-        if shared is None:
-            self._hold(value.untyped_storage())
-        shape, stride, offset, dtype = value.shape, value.stride(), value.storage_offset(), value.dtype
-        device = value.fake_device
-
-        def make(tracker: _Tracker, given: list[FakeTensor]) -> FakeTensor:
-            with torch._C._DisableTorchDispatch():
-                tensor = torch.empty_strided(shape, stride, dtype=dtype, device="meta")
-                if shared is not None:
-                    tensor.set_(given[shared].untyped_storage(), offset, shape, stride)
-                made = Tensor._make_subclass(
-                    FakeTensor, tensor, False, dispatch_device=True, device_for_backend_keys=device
-                )
-            vars(made).update(tracker._fields(device))
-            if shared is None:
-                tracker._hold(made.untyped_storage())
-            return made
-
-        return make
-
-    def _hold(self, storage: torch.UntypedStorage) -> None:
-        self._add(storage.nbytes())
-        weakref.finalize(storage, self._add, -storage.nbytes())
+        before = {one.untyped_storage()._cdata for one in given}
+        for value in values:
+            if isinstance(value, FakeTensor) and (storage := value.untyped_storage())._cdata not in before:
+                self._add(storage.nbytes())
+                weakref.finalize(storage, self._add, -storage.nbytes())
+        return values if several else values[0]
 
     def _add(self, size: int) -> None:
         self.live += size
@@ -129,28 +85,44 @@ def _described(value: Any, given: list[FakeTensor]) -> Any:
     return type(value), value
 
 
-def traced(work: Callable[[], Any], parameters: Iterable[nn.Parameter] = ()) -> Held:
-    """Bytes that ``work`` holds and, with `parameters` that are trained, the backward pass of the loss that it returns.
+def _maker(value: Any, given: Sequence[FakeTensor]) -> Callable[[Sequence[FakeTensor]], Any]:
+    """Return a function that makes a result again: a value that is no tensor, a tensor with an argument's storage, or a new one."""
+    if not isinstance(value, FakeTensor):
+        return lambda _: value
+    storage, dtype, device = value.untyped_storage()._cdata, value.dtype, value.fake_device
+    shape, stride, offset = value.shape, value.stride(), value.storage_offset()
+    base = next((n for n, one in enumerate(given) if one.untyped_storage()._cdata == storage), None)
+
+    def make(given: Sequence[FakeTensor]) -> FakeTensor:
+        with no_dispatch():
+            tensor = torch.empty_strided(shape, stride, dtype=dtype, device="meta")
+            if base is not None:
+                tensor.set_(given[base].untyped_storage(), offset, shape, stride)
+        return FakeTensor(given[0].fake_mode, tensor, device)
+
+    return make
+
+
+def traced(work: Callable[[], Any], forward: AbstractContextManager[object] | None = None) -> Held:
+    """Bytes that ``work`` holds, in a context of its own, and the backward pass of a loss that it returns, alone or first.
 
     Call it within a FakeTensorMode; what exists before (the weights) is not counted.
     """
-    trained = [parameter for parameter in parameters if parameter.requires_grad]
-    for parameter in trained:
-        parameter.register_post_accumulate_grad_hook(lambda one: setattr(one, "grad", None))
     with _Tracker() as tracker:
-        loss = work()
-        forward, tracker.most = tracker.most, tracker.live
-        if trained:
+        with forward or nullcontext():
+            returned = work()
+        held, tracker.most = tracker.most, tracker.live
+        loss = returned[0] if isinstance(returned, tuple) else returned
+        if isinstance(loss, Tensor) and loss.requires_grad:
             loss.backward()
-    return Held(forward, tracker.most, tracker.operations)
+    return Held(held, tracker.most, tracker.operations)
 
 
 def extrapolated(
     figures: Callable[[int], Mapping[str, float]], layers: int, shallow: tuple[int, int]
 ) -> dict[str, float]:
-    """Return ``figures(layers)``. A deep model's are extrapolated by a straight line through two adjacent shallow depths, because
-    its layers are equal."""
-    if layers <= WHOLE:
+    """Return ``figures(layers)``, of a deep model by a straight line through two adjacent shallow depths: its layers are equal."""
+    if layers <= shallow[1]:
         return {**figures(layers)}
     first, second = (figures(depth) for depth in shallow)
     return {name: value + (second[name] - value) * (layers - shallow[0]) for name, value in first.items()}

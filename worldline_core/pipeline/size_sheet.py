@@ -142,12 +142,12 @@ class SizeSheet(StrictModel):
         return [made[number] for number in sorted(made)]
 
     def _processes(self) -> Executor:
-        """Processes that find imported what all of them need, and never search it for garbage."""
+        """Processes that find imported what all of them need, and never search for garbage."""
         FakeTensorMode()  # imports half of torch
         if any(stage is not None and stage.lora for stage in (self.config.train_stage2, self.config.distill)):
             load_peft()
         context = multiprocessing.get_context("fork")
-        return ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=gc.freeze)
+        return ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=gc.disable)
 
     def as_text(self, rows: Iterable[Estimate], rollouts: Iterable[BlockCost] = ()) -> str:
         """The sheet as a Markdown table; then the rollouts."""
