@@ -26,7 +26,7 @@ from worldline_core.training.encode_latents import (
     encode_latents,
     stored_latent_frames,
 )
-from worldline_core.training.train_tokenizer import train_tokenizer
+from worldline_core.training.train_tokenizer import edge_strength, train_tokenizer
 from worldline_core.training.training_config import TokenizerConfig
 
 CONFIG = TokenizerConfig(
@@ -82,6 +82,29 @@ def test_a_small_decoder_is_trained_for_the_latents_of_an_existing_tokenizer(wor
     tokenizer = PatchTokenizer.load(trained)
     assert SmallDecoder.load(tmp_path / "4", tokenizer, tokenizer.encoder_digest[:16]).config.width == 4
     assert not (tmp_path / "4" / "tokenizer.json").exists()
+
+
+def test_a_decoder_is_trained_further_for_the_same_codes(world, trained, tmp_path):
+    inputs = {"episodes": world.episodes, "start": trained}
+    tokenizer_task.check_inputs(inputs)
+    config = CONFIG.model_copy(update={"channels": 12, "refinement_width": 8})  # those of `start` stay
+    train_tokenizer(config, inputs, tmp_path)
+    before, after = PatchTokenizer.load(trained), PatchTokenizer.load(tmp_path)
+    assert (after.config, after.encoder_digest) == (before.config, before.encoder_digest)
+    assert not torch.equal(after.refinement.leave.weight, before.refinement.leave.weight)
+    with pytest.raises(ConfigError, match="encoder"):
+        train_tokenizer(CONFIG, {**inputs, "encoder": trained}, tmp_path / "both")
+
+
+def test_blurred_edges_are_weaker_and_dots_are_no_edges():
+    step = torch.zeros(1, 3, 2, 32, 32)
+    step[..., 14:] = 1.0
+    blurred = torch.nn.functional.avg_pool3d(step, (1, 5, 5), stride=1, padding=(0, 2, 2), count_include_pad=False)
+    dots = 0.2 * (-1.0) ** (torch.arange(32)[:, None] + torch.arange(32))
+    strongest = edge_strength(step).max()
+    assert edge_strength(blurred).max() < 0.8 * strongest
+    # Patterns that alternate from pixel to pixel would be the cheapest way to look sharp.
+    torch.testing.assert_close(edge_strength(step + dots), edge_strength(step), rtol=0, atol=1e-5)
 
 
 def test_a_wan_autoencoder_gets_one_too(world, tmp_path):

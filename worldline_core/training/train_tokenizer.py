@@ -20,6 +20,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import ConfigError
 from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig, windows
 from worldline_core.model.tokenizers import (
     DESCRIPTION,
@@ -143,26 +144,40 @@ def decode_windows(
     return rearrange(frames, "b t c h w -> b c t h w")
 
 
+def edge_strength(video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "n 1 y x"]:
+    """Mean size of the Laplacian of the grey picture within 4 x 4 pixels, for each frame but the first.
+
+    The picture is averaged over 2 x 2 pixels before, which takes out what alternates from pixel to pixel: a decoder gains
+    nothing by drawing dots where it does not know the edge.
+    """
+    grey = rearrange(video[:, :, 1:], "b c t h w -> (b t) c h w").mean(dim=1, keepdim=True)
+    laplacian = video.new_tensor([[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]])
+    return F.avg_pool2d(F.conv2d(F.avg_pool2d(grey, 2, stride=1), laplacian[None, None]).abs(), 4, stride=2)
+
+
 class DecoderObjective(Objective[DecoderBatch]):
-    """L1 and L2 on pixels, L1 on their differences between neighbours, heavier where the scene has changed.
+    """L1 and L2 on pixels, L1 on their differences between neighbours, heavier where the scene has changed; and L1 on the
+    strength of edges, wherever they are: an edge whose place is uncertain is not drawn weaker.
 
     Args:
         decode: of what a batch gives and the observed frames, or None, the frames.
+        edge_weight: of the last term.
     """
 
-    def __init__(self, decode: Callable[[Tensor, Tensor | None], Tensor]) -> None:
-        self.decode = decode
+    def __init__(self, decode: Callable[[Tensor, Tensor | None], Tensor], edge_weight: float) -> None:
+        self.decode, self.edge_weight = decode, edge_weight
 
     def loss(self, batch: DecoderBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """Loss of one batch."""
         del generator, step
         video = batch.video
-        decoded = self.decode(batch.given, batch.observed)
+        decoded = self.decode(batch.given, batch.observed).float()
         weight = 1.0 + 3.0 * ((video - video[:, :, :1]).abs().amax(dim=1, keepdim=True) > 0.1).float()
-        error = (decoded.float() - video) * weight
+        error = (decoded - video) * weight
         edges_h = (error[..., 1:, :] - error[..., :-1, :]).abs().mean()
         edges_w = (error[..., 1:] - error[..., :-1]).abs().mean()
-        return error.abs().mean() + error.square().mean() + 0.5 * (edges_h + edges_w), {}
+        loss = error.abs().mean() + error.square().mean() + 0.5 * (edges_h + edges_w)
+        return loss + self.edge_weight * (edge_strength(decoded) - edge_strength(video)).abs().mean(), {}
 
 
 def train_decoder(
@@ -179,13 +194,13 @@ def train_decoder(
         decode, begun["decoder"] = partial(decode_windows, decoder), decoder.config.model_dump(mode="json")
     else:
         own = cast("PatchTokenizer", tokenizer)
-        decode, begun["encoder"] = own.refine, own.encoder_digest
+        decode, begun["encoder"], begun["start"] = own.refine, own.encoder_digest, own.weights_sha256
     decoder.train().requires_grad_(True)
     if config.steps:
         result = train(
             config.trainer,
             groups=[ParameterGroup("decoder", dict(decoder.named_parameters()))],
-            objective=DecoderObjective(decode),
+            objective=DecoderObjective(decode, config.edge_weight),
             load=partial(decoder_batch, tokenizer, views, config, small=small),
             output=output,
             identity={"config": config.model_dump(mode="json"), **begun},
@@ -259,13 +274,23 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     It is measured on the held-out splits of that set, or of ``inputs["held_out"]`` when that is given. With
     ``inputs["encoder"]``, any tokenizer, only a small decoder of its latents is trained and written
     (``decoder.safetensors``, ``decoder.json``), and what the tokenizer's own decoder reaches is measured beside it.
+    With ``inputs["start"]``, a patch tokenizer, its decoder is trained further; its codes, and models of them, stay valid.
 
     Writes ``tokenizer.safetensors``, ``tokenizer.json``, ``metrics.jsonl`` (the losses) and ``metrics.json`` into
     ``output``; an interrupted call continues where it stopped and ends with the same bytes.
 
     Returns:
         reconstruction metrics on held-out scenes; {"found", "kept", "left_out"} count the episodes.
+
+    Raises:
+        ConfigError: both ``encoder`` and ``start`` are given.
     """
+    if {"encoder", "start"} <= inputs.keys():
+        raise ConfigError(
+            "A decoder begins either way",
+            expected="encoder (a small decoder) or start (the tokenizer's own)",
+            got="both",
+        )
     encoder = load_tokenizer(Path(inputs["encoder"]), config.device) if "encoder" in inputs else None
     episodes = EpisodeSet.open(inputs["episodes"])
     rows = episodes.rows
@@ -287,11 +312,14 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
         decoder.save(output, metadata)
         measured = {"held_out": SmallDecoder.load(output, encoder, name, config.device), "own_decoder": encoder}
     else:
-        tokenizer = _fitted(config, views, output / BASES)
-        torch.manual_seed(config.seed)
-        tokenizer.refinement = Refinement(
-            tokenizer.temporal_compression, config.refinement_width, config.refinement_depth
-        )
+        if "start" in inputs:
+            tokenizer = PatchTokenizer.load(Path(inputs["start"]))
+        else:
+            tokenizer = _fitted(config, views, output / BASES)
+            torch.manual_seed(config.seed)
+            tokenizer.refinement = Refinement(
+                tokenizer.temporal_compression, config.refinement_width, config.refinement_depth
+            )
         train_decoder(tokenizer.to(config.device).refinement, tokenizer, views, config, output)
         tokenizer.save(output, metadata)
         measured = {"held_out": PatchTokenizer.load(output).to(config.device)}
