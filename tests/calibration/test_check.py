@@ -94,7 +94,7 @@ def test_a_full_disk_ends_the_check(episode, images, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_bad_episode_is_listed_and_the_rest_goes_on(episode: Episode, images: Images, tmp_path: Path) -> None:
     def refuse() -> LoadedEpisode:
-        raise RejectedInputError("truncated_video", "The file ends early", expected=24, got=12)
+        raise RejectedInputError("truncated_video", "The file\nends early", expected=24, got=f"{200 * '-'} 12")
 
     broken = ListedEpisode("synthetic/broken", "synthetic", refuse)
     short = listed(episode, {view: clip[:5] for view, clip in images.items()}, "synthetic/short")
@@ -108,8 +108,10 @@ def test_a_bad_episode_is_listed_and_the_rest_goes_on(episode: Episode, images: 
     assert "no_such_robot" in found.episodes[3].diagnosis.notes[-1]
     assert "ur5e_pair" in found.episodes[4].diagnosis.notes[-1]
     assert not found.consistent
-    assert "truncated_video: The file ends early; expected 24; got 12" in check.table_text(found)
+    why = f"truncated_video: The file ends early; expected 24; got {200 * '-'} 12"  # whole, in one line
+    assert why in check.table_text(found)
     stored = json.loads((tmp_path / "diagnoses.json").read_text())
+    assert stored["episodes"][0]["notes"] == [why]
     assert [entry["reason"] for entry in stored["episodes"]] == reasons
 
 

@@ -7,7 +7,6 @@ into the head view: beside the arm it is the plainest sign of a wrong calibratio
 
 from __future__ import annotations
 
-import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -200,7 +199,7 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName) 
 
 
 def _without_diagnosis(item: ListedEpisode, verdict: VerdictName, reason: str, detail: str) -> EpisodeCheck:
-    why = textwrap.shorten(f"{reason}: {detail}", 160, placeholder=" ...")
+    why = " ".join(f"{reason}: {detail}".split())  # one line of the table
     return EpisodeCheck(item.episode_id, item.source, Diagnosis(verdict=verdict, notes=(why,)), reason)
 
 

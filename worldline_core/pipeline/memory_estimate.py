@@ -53,9 +53,9 @@ USABLE = 0.92
 """Share of a device's memory that a stage may fill; the rest is for the driver, communication and fragmentation."""
 AnyStage = Stage1Config | Stage2Config | DistillConfig
 Pass = tuple[float, Callable[[], Any]]
-"""How often a micro-step does a computation, and the computation, which gives a loss first where something is trained."""
+"""A computation, and how many times a micro-step runs it. A computation that trains returns its loss first."""
 Work = tuple[Sequence[WorldModel], Sequence[Pass], Mapping[str, nn.Module]]
-"""World models (the averaged one, others that are trained, frozen scores), passes, and models that every device has whole."""
+"""World models (the averaged one, then other trained ones, then frozen scores), passes, and models that are not sharded."""
 
 
 def gigabytes(size: float) -> str:

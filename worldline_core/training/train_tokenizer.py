@@ -287,7 +287,7 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     """
     if {"encoder", "start"} <= inputs.keys():
         raise ConfigError(
-            "A decoder begins either way",
+            "Two decoders to train are given",
             expected="encoder (a small decoder) or start (the tokenizer's own)",
             got="both",
         )
