@@ -14,13 +14,14 @@ from worldline_core.calibration.camera_errors import (
     KINDS,
     PARAMETERS,
     SCALE,
+    SQUARES_ALONE,
+    SQUARES_TOGETHER,
     CameraError,
     KindOfError,
     StillView,
     WristView,
     combine,
     moved_camera,
-    significant,
 )
 from worldline_core.calibration.check import diagnosis_picture
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation, diagnose_source
@@ -167,9 +168,9 @@ def test_many_episodes_say_more_than_one_and_a_broken_one_does_not_speak_for_the
     alone = camera_error(8.0)
     assert together.kinds[2].half_interval < alone.kinds[2].half_interval / 2
     assert together.kinds[2].bound < alone.kinds[2].bound
-    assert significant([together], together=True) == (together,)
+    assert together.squares > SQUARES_TOGETHER
     assert together.named == ("focal length",)
-    assert significant([alone]) == ()
+    assert alone.squares < SQUARES_ALONE
     (spoiled_by_one,) = combine([(camera_error(value),) for value in (*values, 90.0)])
     assert spoiled_by_one.estimate == pytest.approx(together.estimate, abs=1.0)
     assert (together.contradicting, spoiled_by_one.contradicting) == (0, 1)

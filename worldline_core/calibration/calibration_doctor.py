@@ -30,12 +30,11 @@ from worldline_core.calibration.evidence import (
     WORST_TERM,
     frozen_views,
     gripper_terms,
-    hand_eye_log_likelihood,
+    hand_eye,
     image_terms,
     not_judged,
     observable_views,
     pose_terms,
-    rms_hand_eye,
 )
 from worldline_core.calibration.observation import Observation, Reading, arms_of, observe, read
 from worldline_core.data.episodes.conventions import RecordedConventions, applicable
@@ -372,8 +371,8 @@ def _camera_lag_scores(observation: Observation, recorded: Reading, tools: np.nd
     for view, i in observation.wrists.items():
         if (camera := recorded.cameras.get(view)) is not None and camera.moving:
             for lag in range(-largest, largest + 1):
-                _, metres, degrees = rms_hand_eye(*lagged(tools[:, i], camera.T_base_camera, lag))
-                scores[lag] = scores.get(lag, 0.0) + hand_eye_log_likelihood(metres, degrees)
+                _, rigid = hand_eye(*lagged(tools[:, i], camera.T_base_camera, lag))
+                scores[lag] = scores.get(lag, 0.0) + rigid
     return scores
 
 
@@ -410,7 +409,7 @@ def tool_offset(observation: Observation, recorded: Reading) -> float | None:
     else:
         for i, arm in enumerate(observation.arms):
             if arm.T_tool_mount is not None and (camera := recorded.cameras.get(arm.wrist_view)) is not None:
-                mount, _, _ = rms_hand_eye(recorded.tools[:, i], camera.T_base_camera)
+                mount, _ = hand_eye(recorded.tools[:, i], camera.T_base_camera)
                 offsets.append(float(mount[2, 3] - arm.T_tool_mount[2, 3]))
     offset = float(np.median(offsets)) if offsets else 0.0
     return round(offset, 4) if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None

@@ -288,13 +288,20 @@ class StillView:
                 gradient[:size] += weight * (slope.T @ residual)
                 gradient[gain_index] += weight * float(scaled @ residual)
         information[size:, :size] = information[:size, size:].T
-        samples = SAMPLE_CELLS_STILL
-        return _without_nuisance(Equations(information / samples, gradient / samples, likelihood / samples))
+        information, gradient = information / SAMPLE_CELLS_STILL, gradient / SAMPLE_CELLS_STILL
+        # The nuisance parameters are eliminated (Schur complement).
+        a, b = slice(0, PARAMETERS), slice(PARAMETERS, None)
+        known = information[b, b] + np.diag(NUISANCE_PRIOR**-2)
+        solved = np.linalg.solve(known, np.c_[information[b, a], gradient[b]])
+        return Equations(
+            information[a, a] - information[a, b] @ solved[:, :-1],
+            gradient[a] - information[a, b] @ solved[:, -1],
+            likelihood / SAMPLE_CELLS_STILL + float(gradient[b] @ solved[:, -1]) / 2,
+        )
 
     def agreement(self, lag: float, blur: float) -> np.ndarray:
         """(3,) sums over all cells and steps: predicted times measured flow, predicted squared, measured squared."""
-        theta = np.zeros(PARAMETERS)
-        theta[LAG] = lag
+        theta = np.append(np.zeros(LAG), lag)
         maps, trust = (self.measured, self._predicted(theta)[0]), np.sqrt(self.certainty)[..., None]
         seen, value = (trust * _blurred(each, blur)[..., :2] for each in maps)
         return np.array([(value * seen).sum(), (value**2).sum(), (seen**2).sum()], dtype=np.float64)
@@ -387,19 +394,6 @@ def _blurred(maps: np.ndarray, cells: float) -> np.ndarray:
     return np.stack([cv2.GaussianBlur(image, (0, 0), cells, borderType=cv2.BORDER_CONSTANT) for image in maps])
 
 
-def _without_nuisance(equations: Equations) -> Equations:
-    """Equations of the PARAMETERS alone: the nuisance parameters are eliminated (Schur complement)."""
-    a, b = slice(0, PARAMETERS), slice(PARAMETERS, None)
-    information, gradient = equations.information, equations.gradient
-    known = information[b, b] + np.diag(NUISANCE_PRIOR**-2)
-    solved = np.linalg.solve(known, np.c_[information[b, a], gradient[b]])
-    return Equations(
-        information[a, a] - information[a, b] @ solved[:, :-1],
-        gradient[a] - information[a, b] @ solved[:, -1],
-        equations.likelihood + float(gradient[b] @ solved[:, -1]) / 2,
-    )
-
-
 class WristView:
     """A wrist view: the measured flow of the scene, in cells with an edge and a change.
 
@@ -449,9 +443,7 @@ class WristView:
         """(2,) sums over all cells of the logarithms of errors: with the predicted flow, and with none."""
         if len(self.step) < MIN_CELLS:
             return np.zeros(2)
-        theta = np.zeros(PARAMETERS)
-        theta[LAG] = lag
-        seen = self._seen(theta)
+        seen = self._seen(np.append(np.zeros(LAG), lag))
         left = self._errors(seen, self._depth(seen))[3]
         none = (self.flow * (self.certainty @ self.flow[..., None])[..., 0]).sum(-1)
         return np.array([self.share @ np.log1p(left), self.share @ np.log1p(none)])
@@ -612,8 +604,3 @@ def combine(episodes: Sequence[Sequence[CameraError]]) -> tuple[CameraError, ...
         shared = max(m.shared for m in members)
         found.append(CameraError(view, mean, total / scatter, shared, shown, len(members), contradicting))
     return tuple(found)
-
-
-def significant(errors: Sequence[CameraError], *, together: bool = False) -> tuple[CameraError, ...]:
-    """The cameras that are certainly off; `together`: the errors are those of a source, not of one episode."""
-    return tuple(error for error in errors if error.squares > (SQUARES_TOGETHER if together else SQUARES_ALONE))

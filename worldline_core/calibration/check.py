@@ -40,14 +40,7 @@ from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pages.page import render, words
-from worldline_core.pictures import (
-    Picture,
-    SheetRow,
-    contact_sheet,
-    draw_tag,
-    evenly_spaced,
-    jpeg_bytes,
-)
+from worldline_core.pictures import Picture, SheetRow, contact_sheet, draw_tag, evenly_spaced, jpeg_bytes
 from worldline_core.progress import Progress
 from worldline_core.scale.account import crash_evidence
 from worldline_core.scale.mapping import ends_the_run
@@ -378,35 +371,32 @@ def diagnosis_picture(
 
     Raises: DataError when nothing can be drawn in any view.
     """
-    conventions, repaired = diagnosis.best.conventions, None
+    conventions, sides = diagnosis.best.conventions, {f"{recorded.episode_id}, as recorded": recorded}
+    after = f"repaired ({verdict_text(diagnosis)})"
     if conventions.departures:
-        repaired = apply_conventions(recorded, conventions)
+        sides[after] = apply_conventions(recorded, conventions)
     elif diagnosis.verdict == "off":
         cameras = {e.view: moved_camera(recorded.cameras[e.view], e.estimate / SCALE) for e in diagnosis.off}
-        repaired = replace(recorded, cameras={**recorded.cameras, **cameras})
-    left: list[SheetRow] = []
-    right: list[SheetRow] = []
+        sides[after] = replace(recorded, cameras={**recorded.cameras, **cameras})
+    rows: dict[str, list[SheetRow]] = {title: [] for title in sides}
     arms: Sequence[str] = ()
     for view in (view for view in frames if view in recorded.cameras):
-        before = recorded_tracks(recorded, view, kinematics)
-        after = before if repaired is None else recorded_tracks(repaired, view, kinematics)
+        tracks = [recorded_tracks(episode, view, kinematics) for episode in sides.values()]
         # Image m belongs to state m as recorded, and to state m - lag of the repaired episode.
-        lag = frames_with_all(recorded.num_frames, conventions)[0] + conventions.image_lag(view)
-        common = [n for n in range(min(len(frames[view]), before.num_frames)) if 0 <= n - lag < after.num_frames]
-        chosen = [common[i] for i in evenly_spaced(len(common), 2 * MOMENTS if repaired is None else MOMENTS)]
+        lags = (0, frames_with_all(recorded.num_frames, conventions)[0] + conventions.image_lag(view))[: len(sides)]
+        both = list(zip(tracks, lags, strict=True))
+        common = [n for n in range(len(frames[view])) if all(0 <= n - lag < each.num_frames for each, lag in both)]
+        chosen = [common[i] for i in evenly_spaced(len(common), 2 * MOMENTS // len(sides))]
         if not chosen:
             continue
-        arms = before.arms
+        arms = tracks[0].arms
         shown = {n: image for n, image in enumerate(islice(frames[view], max(chosen) + 1)) if n in chosen}
-        left.append(SheetRow(words(view), _drawn(shown, before, view, 0)))
-        if repaired is not None:
-            right.append(SheetRow(words(view), _drawn(shown, after, view, lag)))
-    if not left:
+        for title, (each, lag) in zip(sides, both, strict=True):
+            rows[title].append(SheetRow(words(view), _drawn(shown, each, view, lag)))
+    if not arms:
         expected = "a calibrated view with images"
         raise DataError("Nothing to draw", where=f"episode {recorded.episode_id}", expected=expected)
-    sides = {f"{recorded.episode_id}, as recorded": left, f"repaired ({verdict_text(diagnosis)})": right}
-    drawn = [(title, rows) for title, rows in sides.items() if rows]
-    sheets = [contact_sheet(rows, tile_height=TILE_HEIGHT, title=title, min_width=MIN_WIDTH) for title, rows in drawn]
+    sheets = [contact_sheet(r, tile_height=TILE_HEIGHT, title=t, min_width=MIN_WIDTH) for t, r in rows.items()]
     body = np.concatenate(sheets, axis=1)
     return np.concatenate([body, legend_strip(arms, body.shape[1], outline=HEAD_VIEW in frames)])
 

@@ -11,7 +11,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from worldline_core.calibration.camera_errors import CameraError, combine, significant
+from worldline_core.calibration.camera_errors import SQUARES_ALONE, SQUARES_TOGETHER, CameraError, combine
 from worldline_core.calibration.evidence import (
     ARM_FLOW,
     correlation_log_likelihood,
@@ -139,7 +139,8 @@ class Diagnosis:
     def with_camera_errors(self, errors: tuple[CameraError, ...], *, together: bool = False) -> Self:
         """With the cameras' errors; consistent becomes `off` where one is significant (`together`: over a source), and
         `mixed` where the episodes of a source contradict each other."""
-        off, verdict = significant(errors, together=together), self.verdict
+        least, verdict = SQUARES_TOGETHER if together else SQUARES_ALONE, self.verdict
+        off = tuple(error for error in errors if error.squares > least)
         if verdict == "consistent":
             mixed = any(e.contradicting > tolerated_episodes(e.episodes) for e in errors)
             verdict = "mixed" if mixed else "off" if off else verdict

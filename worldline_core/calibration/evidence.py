@@ -101,10 +101,10 @@ def pose_terms(observation: Observation, reading: Reading) -> dict[str, float]:
     return terms
 
 
-def rms_hand_eye(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Mean mount (4, 4), and root mean square deviation from it, [m] and [deg]."""
-    mount, metres, degrees = hand_eye_residual(T_base_tool, T_base_camera)
-    return mount, float(np.sqrt((metres**2).mean())), float(np.sqrt((degrees**2).mean()))
+def hand_eye(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, float]:
+    """Mean mount (4, 4) of a wrist camera on its tool, and the log-likelihood of the deviations from it."""
+    mount, *deviations = hand_eye_residual(T_base_tool, T_base_camera)
+    return mount, hand_eye_log_likelihood(*(float(np.sqrt((each**2).mean())) for each in deviations))
 
 
 def hand_eye_log_likelihood(metres: float, degrees: float) -> float:
@@ -119,11 +119,9 @@ def _quadratic(*ratios: float) -> float:
 
 def _wrist(observation: Observation, reading: Reading, camera: CameraTrack) -> dict[str, float]:
     view, i = camera.view, observation.wrists[camera.view]
-    mount, metres, degrees = rms_hand_eye(reading.tools[:, i], camera.T_base_camera)
-    rigid = hand_eye_log_likelihood(metres, degrees)
+    mount, rigid = hand_eye(reading.tools[:, i], camera.T_base_camera)
     if reading.action_tools is not None:
-        _, *by_action = rms_hand_eye(reading.action_tools[:, i], camera.T_base_camera)
-        rigid = max(rigid, hand_eye_log_likelihood(*by_action) - FOLLOWS_COMMANDS_COST)
+        rigid = max(rigid, hand_eye(reading.action_tools[:, i], camera.T_base_camera)[1] - FOLLOWS_COMMANDS_COST)
     terms = {f"hand-eye {view}": rigid}
     if (stated := observation.arms[i].T_tool_mount) is not None:
         offset, turned = mount_offset(mount, stated)
@@ -347,15 +345,18 @@ def gripper_terms(observation: Observation, reading: Reading) -> dict[str, float
     terms: dict[str, float] = {}
     if reading.gripper is None:
         return terms
-    signs = ("fingers", finger_flow, FINGERS), ("finger links", finger_agreement, FINGER_LINKS)
     for i, arm in enumerate(observation.arms):
-        # A few moving steps may coincide with something else; the weight is the same for all readings.
-        moving = np.abs(np.diff(reading.gripper[:, i])) > MIN_OPENING_STEP
-        weight = min(1.0, float(moving.sum()) / FULL_OPENING_STEPS)
-        for name, measure, (typical, spread) in signs:
-            if (found := measure(observation, reading, i)) is not None:
-                deviations = min(((found - typical) / spread) ** 2, LARGEST_DEVIATIONS**2)
-                terms[f"{name} {arm.wrist_view}"] = -0.5 * weight * deviations
+        view, opening = arm.wrist_view, reading.gripper[:, i]
+        seen = view in reading.cameras and len(observation.gray.get(view, ())) > MIN_IMAGE_PAIRS
+        if seen and np.ptp(opening) >= MIN_OPENING_RANGE:
+            # A few moving steps may coincide with something else; the weight is the same for all readings.
+            steps = np.diff(opening)
+            weight = min(1.0, float((np.abs(steps) > MIN_OPENING_STEP).sum()) / FULL_OPENING_STEPS)
+            flow, links = finger_flow(observation, reading, i, steps), finger_agreement(observation, reading, i)
+            for name, found, (typical, spread) in (("fingers", flow, FINGERS), ("finger links", links, FINGER_LINKS)):
+                if found is not None:
+                    deviations = min(((found - typical) / spread) ** 2, LARGEST_DEVIATIONS**2)
+                    terms[f"{name} {view}"] = -0.5 * weight * deviations
         if (stopped := stopped_share(reading, i)) is not None:
             terms[f"stopped gripper {arm.name}"] = STOPPED_TERM * (1 - stopped)
     return terms
@@ -365,8 +366,6 @@ def finger_agreement(observation: Observation, reading: Reading, arm: int) -> fl
     """Correlation (-1..1) of measured flow in the wrist view with that of the finger links by kinematics, None if unknown."""
     view, kinematics = observation.arms[arm].wrist_view, observation.kinematics
     if kinematics is None or not kinematics.embodiment.arms[arm].gripper.finger_joints or reading.shape == "hands":
-        return None
-    if not _moves(observation, reading, arm):
         return None
     states, images = reading.steps(observation.num_images, view)
     name, camera, flow = f"fingers {arm}", reading.cameras[view], observation.motion(view).flow[images]
@@ -384,22 +383,11 @@ def finger_agreement(observation: Observation, reading: Reading, arm: int) -> fl
     return cosine(flow[moving], predicted[moving])
 
 
-def _moves(observation: Observation, reading: Reading, arm: int) -> bool:
-    """Returns whether a gripper moves in front of its own camera."""
-    view = observation.arms[arm].wrist_view
-    if reading.gripper is None or view not in observation.gray or view not in reading.cameras:
-        return False
-    return bool(np.ptp(reading.gripper[:, arm]) >= MIN_OPENING_RANGE) and len(observation.gray[view]) > MIN_IMAGE_PAIRS
-
-
-def finger_flow(observation: Observation, reading: Reading, arm: int) -> float | None:
-    """Correlation (-1..1) of the flow away from the projected tool point, near it, with the growth of the opening."""
+def finger_flow(observation: Observation, reading: Reading, arm: int, opening: np.ndarray) -> float | None:
+    """Correlation (-1..1) of the flow away from the projected tool point, near it, with the steps (n - 1,) of the opening."""
     view, kinematics = observation.arms[arm].wrist_view, observation.kinematics
     if kinematics is not None and len(kinematics.embodiment.arms[arm].gripper.finger_joints) == 1:
         return None  # one jaw moves, so flow is not away from the middle
-    if reading.gripper is None or not _moves(observation, reading, arm):
-        return None
-    opening = np.diff(reading.gripper[:, arm])
     states, images = reading.steps(observation.num_images, view)
     motion, camera = observation.motion(view), reading.cameras[view]
     uv, depth = project_points(reading.tools[:, arm, :3, 3], camera.K, camera.T_base_camera)

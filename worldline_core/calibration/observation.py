@@ -308,8 +308,10 @@ def _moved_arms(observation: Observation, kinematics: ArmKinematics, episode: Ep
         links = kinematics.link_poses(both, kinematics.embodiment.noted_posture(observation.episode.conventions))
         fk = kinematics.tools_of(links).numpy()
         links = {name: poses[: episode.num_frames] for name, poses in links.items()}
-        capsules, radius = robot_capsules(kinematics, links)
-        points, radii = along = _sampled(capsules.numpy(), radius.numpy())
+        capsules, radius = (each.numpy() for each in robot_capsules(kinematics, links))
+        share = _CAPSULE_SAMPLES[:, None]
+        points = capsules[:, :, None, 0] * (1 - share) + capsules[:, :, None, 1] * share
+        points, radii = along = points.reshape(len(capsules), -1, 3), np.repeat(radius, len(share))
         if _has_surfaces(kinematics):
             points, radii = placed_surfaces(kinematics.surfaces, links)
         observation.moved_arms[key] = fk[: episode.num_frames], fk[episode.num_frames :], points, radii, *along
@@ -334,13 +336,6 @@ def _has_surfaces(kinematics: ArmKinematics) -> bool:
         if shaped < MIN_SHAPED_LINKS:
             return False
     return True
-
-
-def _sampled(capsules: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points along capsules (n, s, 2, 3)."""
-    t = _CAPSULE_SAMPLES[:, None]
-    points = capsules[:, :, None, 0] * (1 - t) + capsules[:, :, None, 1] * t
-    return points.reshape(len(capsules), -1, 3), np.repeat(radii, len(t))
 
 
 def predict_motion(points: np.ndarray, radii: np.ndarray, camera: CameraTrack) -> np.ndarray:

@@ -23,7 +23,6 @@ from worldline_core.data.mcap.resampling import (
     in_order,
     in_order_with_values,
     instants,
-    median_step_ns,
     nearest,
     resampled,
     resampled_poses,
@@ -233,7 +232,8 @@ class _Recording:
     def track(self, view: str, grid: np.ndarray) -> ImageTrack:
         """The nearest image of each instant, none of which is a video frame that depends on a lost message."""
         config, (times, order) = self.config, self.images[view]
-        stream, fps, step_ns = self.streams[config.views[view].image], config.fps, median_step_ns(times)
+        stream, fps = self.streams[config.views[view].image], config.fps
+        step_ns = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         where = self.at(stream.topic)
         if step_ns * fps > 1.25e9:
             raise RejectedInputError(

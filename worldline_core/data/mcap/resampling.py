@@ -81,11 +81,6 @@ def _without_time(stream: Stream) -> int:
     return 0 if stream.kind == "calibration" else stream.stamps_ns.count(0)
 
 
-def median_step_ns(times_ns: np.ndarray) -> float:
-    """Between ascending times (n,); 0 for a single one."""
-    return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
-
-
 def in_order(times_ns: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Strictly ascending times (n,) of those given in the order of the file, and the index of each; the first of one time is kept.
 
