@@ -14,7 +14,7 @@ import numpy as np
 
 from worldline_core.data.sources.lerobot import AngleUnit
 from worldline_core.discovery.findings import named
-from worldline_core.geometry.embodiment import Arm, Embodiment, embodiment_files, load_embodiment
+from worldline_core.geometry.embodiment import Arm, embodiment_files, load_embodiment
 
 Side = Literal["left", "right"]
 Part = Literal["joint", "gripper", "finger", "other"]
@@ -108,6 +108,12 @@ class ArmColumns:
     @property
     def joint_words(self) -> list[tuple[str, ...]]:
         return [plain(column.words) for column in self.joints]
+
+    def arrange(self, wanted: Sequence[tuple[str, ...]]) -> None:
+        """Bring the joints into an order by their words; they stay as they come where the words differ or repeat."""
+        own = self.joint_words
+        if sorted(own) == sorted(wanted) and len(set(own)) == len(own):
+            self.joints = [self.joints[own.index(words)] for words in wanted]
 
 
 def columns_of(feature: str, names: Sequence[str], width: int, prefix: str) -> list[Column]:
@@ -468,15 +474,11 @@ def _joint_names_agree(arms: Sequence[ArmColumns], described: Sequence[Arm]) -> 
     return True
 
 
-def joint_order(arm: ArmColumns, robot: Embodiment, number: int) -> list[int]:
-    """Places of the robot's joints among the arm's columns: by name where all agree, otherwise as they come."""
-    theirs = [plain(words_of(joint)) for joint in robot.arms[number].joints]
-    own = arm.joint_words
-    return (
-        [own.index(joint) for joint in theirs]
-        if sorted(own) == sorted(theirs) and len(set(own)) == len(own)
-        else list(range(len(own)))
-    )
+def follow_robot(arms: Sequence[ArmColumns], name: str) -> None:
+    """Give the arms the sides, and their joints the order, of a described robot."""
+    for arm, described in zip(arms, load_embodiment(name).arms, strict=True):
+        arm.arrange([plain(words_of(joint)) for joint in described.joints])
+        arm.side = described.name  # type: ignore[assignment]
 
 
 def _within_limits(

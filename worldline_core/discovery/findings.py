@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import yaml
 
@@ -63,6 +63,11 @@ class Discovery:
     head_camera: bool = False
     trains: bool = True
     notes: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, kind: str, root: AnyPath, about: str, evidence: str, **known: Any) -> Self:
+        """Recordings of a kind of source, by this evidence."""
+        return cls(kind, about, {"kind": kind, "path": str(root)}, {("kind",): evidence}, **known)
 
     def say(self, place: Place, value: Any, evidence: str) -> None:
         """Set a value of the source, with its evidence."""

@@ -30,9 +30,9 @@ from worldline_core.discovery.arms import (
     Side,
     columns_of,
     find_arms,
+    follow_robot,
     gripper_readings,
     is_lerobot_arm,
-    joint_order,
     joint_unit,
     match_robot,
     words_of,
@@ -183,10 +183,7 @@ class ArmDescription:
             self._found.notes.append("angle_unit: deg and range_m100_100 both fit: compare a few poses with pictures.")
         if match is not None:
             self._found.say(("embodiment",), match.name, match.evidence)
-            robot = load_embodiment(match.name)
-            for number, arm in enumerate(self._arms):
-                arm.joints = [arm.joints[i] for i in joint_order(arm, robot, number)]
-                arm.side = robot.arms[number].name  # type: ignore[assignment]
+            follow_robot(self._arms, match.name)
         elif others:
             choices = f"{', '.join(others[:10])}; or none, or the path of a description (docs/embodiments.md)"
             self._found.say(
@@ -274,12 +271,7 @@ def _commands(sample: Sample, arms: list[ArmColumns], action: list[Column]) -> t
     if [len(arm.joints) for arm in found] != [len(arm.joints) for arm in arms]:
         return [], "the action has another number of joints than the state, which it repeats"
     for command, arm in zip(found, arms, strict=True):
-        order = (
-            [command.joint_words.index(words) for words in arm.joint_words]
-            if sorted(command.joint_words) == sorted(arm.joint_words) and len(set(arm.joint_words)) == len(arm.joints)
-            else range(len(arm.joints))
-        )
-        command.joints = [command.joints[i] for i in order]
+        command.arrange(arm.joint_words)
         if command.gripper is None and arm.gripper is not None:
             command.gripper = next((c for c in command.fingers if c.words == arm.gripper.words), None) or next(
                 (c for c in command.fingers if "index" in c.words), None

@@ -13,7 +13,7 @@ from pathlib import Path
 from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, relative_name
 from worldline_core.data.lerobot.dataset import DATA_PATH, VIDEO_PATH, LeRobotV3Dataset, LeRobotV21Dataset, read_info
-from worldline_core.discovery.findings import Discovery, name_calibration, named
+from worldline_core.discovery.findings import Discovery, name_calibration, named, stated_licence
 from worldline_core.discovery.lerobot import discover_collection, discover_lerobot
 from worldline_core.discovery.mcap import discover_mcap
 from worldline_core.discovery.recordings import (
@@ -198,6 +198,9 @@ def look(folder: Path) -> Discovery:
     """`discover`, in this process."""
     kind, root = recognise(folder)
     found = _LOOKS[kind](root)
+    says_itself = kind in ("episode_set", "lerobot", "lerobot_collection")
+    if not says_itself and (licence := stated_licence(root if root.is_dir() else root.parent)) is not None:
+        found.say(("license",), *licence)
     if kind in ("mcap", "robomind", "unitree_h5", "droid_annotation") and found.cameras == "none":
         name_calibration(found, root)
     return found

@@ -21,15 +21,14 @@ from worldline_core.discovery.arms import (
     Column,
     Side,
     find_arms,
+    follow_robot,
     gripper_readings,
-    joint_order,
     match_robot,
     words_of,
 )
 from worldline_core.discovery.cameras import name_views
-from worldline_core.discovery.findings import Discovery, Question, named, stated_licence
+from worldline_core.discovery.findings import Discovery, Question, named
 from worldline_core.errors import DataError
-from worldline_core.geometry.embodiment import load_embodiment
 
 _SECONDS = 30
 _BY_HAND = "write the source by hand: configs/sources/mcap_ros2.yaml"
@@ -65,8 +64,8 @@ def _of_this_project(root: AnyPath, files: Sequence[AnyPath], episode_id: str) -
     loaded = read_exported_episode(_first_readable(files))
     episode = loaded.episode
     about = f"MCAP files of this project: {len(files)} episodes of {named([episode.embodiment])} at {episode.fps:g} fps"
-    found = Discovery("mcap", about, {"kind": "mcap", "path": str(root)}, views=list(loaded.views), fps=episode.fps)
-    found.evidence["kind",] = f"the first file is the episode {named([episode_id])}"
+    why = f"the first file is the episode {named([episode_id])}"
+    found = Discovery.of("mcap", root, about, why, views=list(loaded.views), fps=episode.fps)
     found.state_size = episode.state.shape[1] or None
     found.count_cameras(episode.cameras)
     return found
@@ -90,19 +89,13 @@ def _of_topics(root: AnyPath, files: Sequence[AnyPath], file: McapFile) -> Disco
     wanted: dict[str, tuple[Kind, ...]] = {topic: (kinds[topic],) for topic in [*pictures, *joints]}
     wanted |= {topic: (kind,) for topic, kind in kinds.items() if kind in others}
     streams = file.streams(wanted, start, start + _SECONDS * 10**9)
-    found = Discovery(
-        "mcap_topics",
-        f"MCAP of {named(sorted(set(file.topics.values())), 4)}: {len(files)} files",
-        {"kind": "mcap_topics", "path": str(root)},
-    )
-    found.evidence["kind",] = f"{len(file.topics)} topics in {file.path.name}"
+    about = f"MCAP of {named(sorted(set(file.topics.values())), 4)}: {len(files)} files"
+    found = Discovery.of("mcap_topics", root, about, f"{len(file.topics)} topics in {file.path.name}")
     _rate(found, [streams[topic] for topic in pictures if topic in streams])
     state_topic, arms = _state(found, [streams[topic] for topic in joints if topic in streams])
     _views(found, pictures, kinds, streams, [arm.side for arm in arms])
     _arms(found, state_topic, arms, streams, [topic for topic in kinds if topic != state_topic])
     _episodes(found, kinds, streams)
-    if (licence := stated_licence(root if root.is_dir() else root.parent)) is not None:
-        found.say(("license",), *licence)
     return found
 
 
@@ -209,10 +202,7 @@ def _arms(
     match, choices, said = match_robot(" ".join(column.name for arm in arms for column in arm.joints), arms, angles)
     if match is not None and all(arm.gripper for arm in arms):
         found.say(("embodiment",), match.name, match.evidence)
-        robot = load_embodiment(match.name)
-        for number, arm in enumerate(arms):
-            arm.joints = [arm.joints[i] for i in joint_order(arm, robot, number)]
-            arm.side = robot.arms[number].name  # type: ignore[assignment]
+        follow_robot(arms, match.name)
     elif choices:
         which = f"which robot: {', '.join(choices[:10])}; or none, or the path of a description"
         found.say(("embodiment",), Question("embodiment", which), said)
@@ -247,7 +237,7 @@ def _command_topics(
             arm.gripper for arm in found
         ):
             for command, arm in zip(found, arms, strict=True):
-                command.joints = [command.joints[command.joint_words.index(words)] for words in arm.joint_words]
+                command.arrange(arm.joint_words)
             return streams[topic], found
     return None
 

@@ -19,7 +19,7 @@ from worldline_core.data.sources.unitree_h5 import ROBOTS, check_columns
 from worldline_core.data.video.clip import video_size
 from worldline_core.discovery.arms import Side, gripper_readings
 from worldline_core.discovery.cameras import name_views
-from worldline_core.discovery.findings import Discovery, Question, named, stated_licence
+from worldline_core.discovery.findings import Discovery, Question, named
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 
@@ -35,15 +35,8 @@ def discover_episode_set(root: AnyPath) -> Discovery:
     views = [view for view in VIEWS if all(view in row.views for row in rows)] or list(rows[0].views)
     robots = sorted({row.embodiment for row in rows})
     about = f"EpisodeSet of {named(robots)}: {len(rows)} episodes at {rows[0].fps:g} fps"
-    found = Discovery(
-        "episode_set",
-        about,
-        {"kind": "episode_set", "path": str(root)},
-        views=views,
-        fps=rows[0].fps,
-        episodes=len(rows),
-    )
-    found.evidence["kind",] = "index.parquet and manifest.json of this project"
+    why = "index.parquet and manifest.json of this project"
+    found = Discovery.of("episode_set", root, about, why, views=views, fps=rows[0].fps, episodes=len(rows))
     episodes = [opened.episode(i) for i in _spread(rows, _FILES)]
     if episodes[0].state_kind != "none":
         found.state_size = max(episode.state.shape[1] for episode in episodes)
@@ -65,9 +58,8 @@ def discover_videos(root: AnyPath) -> Discovery:
         )
     same = len(set(rates)) == 1
     about = f"{len(videos)} videos at " + (f"{rates[0]:g} fps" if same else f"{min(rates):g} to {max(rates):g} fps")
-    source = {"kind": "video_folder", "path": str(root)}
-    found = Discovery("video_folder", about, source, views=["head"], episodes=len(videos))
-    found.evidence["kind",] = "mp4 files, and nothing that a reader of robots' recordings knows"
+    why = "mp4 files, and nothing that a reader of robots' recordings knows"
+    found = Discovery.of("video_folder", root, about, why, views=["head"], episodes=len(videos))
     found.fps = rates[0] if same else None
     captions = [path for path in find_files(root, "*.txt") if is_file(path.with_suffix(".mp4"))]
     tables = [path for pattern in ("*.jsonl", "*.csv") for path in find_files(root, pattern) if path.parent == root]
@@ -84,10 +76,9 @@ def discover_droid(root: AnyPath) -> Discovery:
     files = find_files(root, "annotation/*/*.json")
     number = _first(files, _number_of_videos)
     about = f"DROID with annotations: {len(files)} episodes of {number} videos"
-    source = {"kind": "droid_annotation", "path": str(root), "embodiment": "droid_franka"}
-    found = Discovery("droid_annotation", about, source, episodes=len(files), trains=False)
-    found.evidence["kind",] = "annotation/<split>/<n>.json beside the videos that they name"
-    found.evidence["embodiment",] = "annotations are of DROID's Franka; gripper 0 open .. 1 closed"
+    why = "annotation/<split>/<n>.json beside the videos that they name"
+    found = Discovery.of("droid_annotation", root, about, why, episodes=len(files), trains=False)
+    found.say(("embodiment",), "droid_franka", "annotations are of DROID's Franka; gripper 0 open .. 1 closed")
     views = ["head", "exterior_2", "right_wrist"][:number]
     found.say(("views",), views, "DROID's order of cameras: two outside, one on the wrist")
     found.views = [view for view in views if view != "exterior_2"]
@@ -190,8 +181,7 @@ def _agibot_views(root: AnyPath) -> tuple[list[str], list[str]]:
 
 
 def _agibot(kind: str, about: str, root: AnyPath, why: str) -> Discovery:
-    result = Discovery(kind, about, {"kind": kind, "path": str(root)}, fps=30, cameras="all")
-    result.evidence["kind",] = why
+    result = Discovery.of(kind, root, about, why, fps=30, cameras="all")
     result.say(("embodiment",), "agibot_g1", "AgiBot World is recorded with this robot")
     robot = load_embodiment("agibot_g1")
     result.state_size = robot.state_size
@@ -199,8 +189,6 @@ def _agibot(kind: str, about: str, root: AnyPath, why: str) -> Discovery:
         result.notes.append(
             f"Action maps need the robot's kinematic description: {robot.description.obtain}; then set WORLDLINE_DESCRIPTION_AGIBOT_G1 to its path."
         )
-    if (licence := stated_licence(root)) is not None:
-        result.say(("license",), *licence)
     return result
 
 
@@ -209,8 +197,7 @@ def discover_robomind(root: AnyPath) -> Discovery:
     files = find_files(root, "trajectory.hdf5")
     parts = [*root.parts, *relative_name(files[0], root).parts]
     layout: LayoutName | None = next((name for name in ROBOMIND_LAYOUTS if name in parts), None)
-    found = Discovery("robomind", f"RoboMIND: {len(files)} episodes", {"kind": "robomind", "path": str(root)})
-    found.evidence["kind",] = "trajectory.hdf5 files"
+    found = Discovery.of("robomind", root, f"RoboMIND: {len(files)} episodes", "trajectory.hdf5 files")
     others = sorted({name for name in ROBOMIND_LAYOUTS for path in files if name in relative_name(path, root).parts})
     if len(others) > 1:
         raise DataError(
@@ -240,8 +227,6 @@ def discover_robomind(root: AnyPath) -> Discovery:
         Question("fps", "frames a second: the release does not say it (30 is what other readers use for version 1)"),
         "no file states the rate",
     )
-    if (licence := stated_licence(root)) is not None:
-        found.say(("license",), *licence)
     return found
 
 
@@ -284,12 +269,9 @@ def discover_unitree(root: AnyPath) -> Discovery:
             )
 
     values, cameras, pixels = _first(files, look)
-    found = Discovery(
-        "unitree_h5",
-        f"Unitree's or ACT's HDF5: {len(files)} episodes of {values.shape[1]} columns",
-        {"kind": "unitree_h5", "path": str(root)},
-    )
-    found.evidence["kind",] = "transitions/<dataset>/<n>.h5" if trained else "episode_<n>.hdf5 with observations/qpos"
+    about = f"Unitree's or ACT's HDF5: {len(files)} episodes of {values.shape[1]} columns"
+    why = "transitions/<dataset>/<n>.h5" if trained else "episode_<n>.hdf5 with observations/qpos"
+    found = Discovery.of("unitree_h5", root, about, why)
     if trained:
         cameras = sorted({relative_name(path, root).parts[2] for path in find_files(root / "videos", "*.mp4")})
     robot = _unitree_robot(found, values, bool(trained), root)
@@ -330,8 +312,6 @@ def discover_unitree(root: AnyPath) -> Discovery:
             found.source["channels"] = "as_written" if robot == "aloha" else Question("channels", text)
             found.evidence["channels",] = "ACT's recorder hands OpenCV pictures in RGB"
         found.state_size = sum((arm.joints.chosen.stop - arm.joints.chosen.start) + 1 for arm in ROBOTS[robot])  # pyright: ignore[reportOptionalMemberAccess]
-    if (licence := stated_licence(root)) is not None:
-        found.say(("license",), *licence)
     return found
 
 
@@ -391,14 +371,8 @@ def discover_robotwin(root: AnyPath) -> Discovery:
 
     known: Mapping[str, str] = {"head": "head_camera", "left_wrist": "left_camera", "right_wrist": "right_camera"}
     present = _first(files, cameras)
-    found = Discovery(
-        "robotwin",
-        f"RoboTwin 2: {len(files)} episodes",
-        {"kind": "robotwin", "path": str(root)},
-        cameras="all",
-        trains=False,
-    )
-    found.evidence["kind",] = "data/episode<n>.hdf5 with observation/<camera>"
+    about, why = f"RoboTwin 2: {len(files)} episodes", "data/episode<n>.hdf5 with observation/<camera>"
+    found = Discovery.of("robotwin", root, about, why, cameras="all", trains=False)
     found.say(
         ("views",),
         {view: camera for view, camera in known.items() if camera in present},
@@ -410,6 +384,5 @@ def discover_robotwin(root: AnyPath) -> Discovery:
         Question("fps", "frames a second: 250 divided by `save_freq` of the task's configuration (15: 16.667)"),
         "no file states the rate",
     )
-    found.evidence["split",] = "RoboTwin is for evaluation only: results are compared on it"
-    found.source["split"] = "test"
+    found.say(("split",), "test", "RoboTwin is for evaluation only: results are compared on it")
     return found
