@@ -193,9 +193,13 @@ class _Search:
 
     def singles(self) -> list[Explanation]:
         """Every usual mistake, one at a time."""
-        tried = map(self.read, conventions_to_try(self.observation, self.recorded))
-        found = [self.in_views_that_improve(reading) for reading in tried if reading is not None]
-        lagging = [self.recorded.with_image_lag(lag) for lag in image_lags(self.observation)]
+        observation, recorded = self.observation, self.recorded
+        tried = [c for c in _FIXED_MISTAKES if applicable(observation.episode, c.departures[0])]
+        tried += [RecordedConventions(intrinsics_size=size) for size in intrinsics_sizes(observation.episode.cameras)]
+        tried += [RecordedConventions(camera_lag_frames=lag) for lag in camera_lags(observation, recorded)]
+        tried += [RecordedConventions(tool_offset_z_m=offset) for offset in tool_offset(observation, recorded)]
+        found = [self.in_views_that_improve(reading) for reading in map(self.read, tried) if reading is not None]
+        lagging = [recorded.with_image_lag(lag) for lag in image_lags(observation)]
         found += [each for late in lagging for each in self.lags_by_view(late)]
         return [*found, *self.exchanged_wrist_cameras()]
 
@@ -221,11 +225,9 @@ class _Search:
         poses = {one: episode.cameras[two].T_base_camera for one, two in (views, views[::-1])}
         cameras = {view: replace(episode.cameras[view], T_base_camera=each) for view, each in poses.items()}
         exchanged = replace(episode, cameras=episode.cameras | cameras)
-        observations = {"wrist_extrinsics": replace(self.observation, episode=exchanged)}
+        yield from self.as_written(replace(self.observation, episode=exchanged), ("wrist_extrinsics", "exchanged"))
         if (videos := self.observation.with_exchanged_wrists()) is not None:
-            observations["wrist_videos"] = videos
-        for name, observation in observations.items():
-            yield from self.as_written(observation, (name, "exchanged"))
+            yield from self.as_written(videos, ("wrist_videos", "exchanged"))
 
     def as_written(self, observation: Observation, other: tuple[str, str]) -> Iterator[Explanation]:
         """The reading of another observation as written; none where no tool poses are known."""
@@ -290,8 +292,7 @@ class _Search:
         }
         if late := _best_lag(scores):
             yield RecordedConventions(image_lag_frames=late)
-        if offset := tool_offset(self.observation, undone):
-            yield RecordedConventions(tool_offset_z_m=offset)
+        yield from (RecordedConventions(tool_offset_z_m=offset) for offset in tool_offset(self.observation, undone))
 
 
 def _of_view(evidence: Mapping[str, float], view: str) -> float:
@@ -331,17 +332,6 @@ def robots_like(layout: tuple[tuple[str, int], ...]) -> tuple[ArmKinematics, ...
             if _layout(embodiment) == layout:
                 found.append(ArmKinematics(embodiment))
     return tuple(found)
-
-
-def conventions_to_try(observation: Observation, recorded: Reading) -> list[RecordedConventions]:
-    """One mistake each, without image lags (see `image_lags`), most of them with a fixed value."""
-    episode = observation.episode
-    found = [c for c in _FIXED_MISTAKES if applicable(episode, c.departures[0])]
-    found += [RecordedConventions(intrinsics_size=size) for size in intrinsics_sizes(episode.cameras)]
-    found += [RecordedConventions(camera_lag_frames=lag) for lag in camera_lags(observation, recorded)]
-    if (offset := tool_offset(observation, recorded)) is not None:
-        found.append(RecordedConventions(tool_offset_z_m=offset))
-    return found
 
 
 def image_lags(observation: Observation) -> list[int]:
@@ -395,13 +385,13 @@ def intrinsics_sizes(cameras: Mapping[str, CameraTrack]) -> list[tuple[int, int]
     return list(dict.fromkeys(sizes))
 
 
-def tool_offset(observation: Observation, recorded: Reading) -> float | None:
-    """Distance of the fingertips beyond the recorded tool poses along +z [m], None if unknown or within usual scatter.
+def tool_offset(observation: Observation, recorded: Reading) -> list[float]:
+    """Distance of the fingertips beyond the recorded tool poses along +z [m]; none if unknown or within usual scatter.
 
     From the joints' kinematics where the recording has both, else from wrist cameras with a stated mount.
     """
     if observation.episode.T_base_ee is None:
-        return None
+        return []
     offsets: list[float] = []
     if recorded.kinematic_tools is not None:
         apart = rigid_inverse(recorded.tools) @ recorded.kinematic_tools
@@ -412,4 +402,4 @@ def tool_offset(observation: Observation, recorded: Reading) -> float | None:
                 mount, _ = hand_eye(recorded.tools[:, i], camera.T_base_camera)
                 offsets.append(float(mount[2, 3] - arm.T_tool_mount[2, 3]))
     offset = float(np.median(offsets)) if offsets else 0.0
-    return round(offset, 4) if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None
+    return [round(offset, 4)] if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else []

@@ -457,9 +457,8 @@ class WristView:
             depth = np.clip(depth + (self.plane * fitted[self._of, :, 0]).sum(-1), 0.0, MOST_PER_M)
         return depth
 
-    def equations(self, theta: np.ndarray, blur: float) -> Equations:
+    def equations(self, theta: np.ndarray, _blur: float) -> Equations:
         """Normal equations at `theta`; flow is not blurred."""
-        del blur
         columns = np.flatnonzero(self.differences)
         information, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
         if len(self.step) < MIN_CELLS:
@@ -525,14 +524,13 @@ def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.nda
 
 def covered_cells(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Bool (n, r, c): cells hidden by these points (n + 1, p, 3) at either end of a step, with a margin."""
-    rows, columns = (np.arange(count) * CELL_PX + (CELL_PX - 1) / 2 for count in shape[1:])
+    centres = cell_centres(camera.height, camera.width)[:, :, None]
     hidden = np.zeros((shape[0] + 1, *shape[1:]), dtype=bool)
     for i, pose in enumerate(camera.T_base_camera):
         uv, depth = project_points(points[i], camera.K, pose[None])
         ahead = depth > NEAR_M
         reach = camera.K[0, 0] * radii[ahead] / depth[ahead] + HAND_MARGIN_CELLS * CELL_PX
-        down, across = (rows[:, None] - uv[ahead, 1]) ** 2, (columns[:, None] - uv[ahead, 0]) ** 2
-        hidden[i] = (down[:, None] + across < reach**2).any(-1)
+        hidden[i] = (((centres - uv[ahead]) ** 2).sum(-1) < reach**2).any(-1)
     return hidden[1:] | hidden[:-1]
 
 

@@ -1,8 +1,7 @@
 """`worldline calibrate check`: every episode of a source or a set diagnosed, pictured, and summed up.
 
-Writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg` into one folder. Nothing is repaired here. Unlike action
-tracks, which let wrist cameras follow the kinematics, pictures use the camera poses *as recorded*. The arms' outline is drawn
-into the head view: beside the arm it is the plainest sign of a wrong calibration.
+Unlike action tracks, which let wrist cameras follow the kinematics, pictures use the camera poses *as recorded*. The arms'
+outline is drawn into the head view: beside the arm it is the plainest sign of a wrong calibration.
 """
 
 from __future__ import annotations
@@ -144,9 +143,8 @@ def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
 def check_calibration(
     listed: Sequence[ListedEpisode], output: Path, *, descriptions: Mapping[str, str] | None = None
 ) -> CalibrationCheck:
-    """Diagnoses episodes one after another and writes the result; one that cannot be read or judged is listed with its reason.
-
-    Raises: OSError: the disk is full or cannot be written, which no other episode would escape.
+    """Diagnoses episodes one after another and writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg`; one that cannot
+    be read or judged is listed with its reason. Raises: OSError for a disk that cannot be written.
     """
     kinematics = KinematicsByName(descriptions or {})
     checked: list[EpisodeCheck] = []
@@ -244,14 +242,10 @@ def check_command(
     output: Path | None = None,
 ) -> CalibrationCheck:
     """Check some `episodes` (none: all) of a configuration file's sources or, with `artifact`, of an EpisodeSet's folder;
-    `overrides` (`a.b=value`) change the file.
+    `overrides` (`a.b=value`) change the file. Writes into `output`, by default `artifacts/calibration/<name of the file or folder>`.
 
-    Writes into `output`, by default `artifacts/calibration/<name of the file or folder>`.
-
-    Raises:
-        ConfigError: the file has a mistake, or a folder is to be changed.
-        DataError: the source cannot be opened, or has no such episode.
-        ArtifactError: the EpisodeSet is damaged.
+    Raises: ConfigError for a mistake in the file, or a folder that is to be changed; DataError for a source that cannot be
+        opened, or has no such episode; ArtifactError for a damaged EpisodeSet.
     """
     if artifact and overrides:
         raise ConfigError("--set changes a configuration file, and none is given", got=", ".join(overrides))
@@ -362,10 +356,7 @@ def page(check: CalibrationCheck) -> str:
 
 
 def diagnosis_picture(
-    diagnosis: Diagnosis,
-    recorded: Episode,
-    frames: Mapping[str, Frames],
-    kinematics: ArmKinematics | None,
+    diagnosis: Diagnosis, recorded: Episode, frames: Mapping[str, Frames], kinematics: ArmKinematics | None
 ) -> Picture:
     """One picture per episode: left as recorded, right as repaired, the same frames on both sides.
 
@@ -390,9 +381,18 @@ def diagnosis_picture(
         if not chosen:
             continue
         arms = tracks[0].arms
+        style = OverlayStyle(SIGMA_PX_REF, heat=0.5, outline=view == HEAD_VIEW)
         shown = {n: image for n, image in enumerate(islice(frames[view], max(chosen) + 1)) if n in chosen}
         for title, (each, lag) in zip(sides, both, strict=True):
-            rows[title].append(SheetRow(words(view), _drawn(shown, each, view, lag)))
+            tiles = [
+                draw_tag(
+                    draw_overlay(image, each, n - lag, view, tile_height=TILE_HEIGHT, style=style),
+                    f"frame {n}",
+                    size_px=11,
+                )
+                for n, image in shown.items()
+            ]
+            rows[title].append(SheetRow(words(view), np.stack(tiles)))
     if not arms:
         expected = "a calibrated view with images"
         raise DataError("Nothing to draw", where=f"episode {recorded.episode_id}", expected=expected)
@@ -427,13 +427,3 @@ def recorded_tracks(episode: Episode, view: str, kinematics: ArmKinematics | Non
         controls="state",
         camera_motion=("recorded",),
     )  # fmt: skip
-
-
-def _drawn(images: Mapping[int, np.ndarray], tracks: EpisodeTracks, view: str, lag: int) -> np.ndarray:
-    """Tiles of images by number."""
-    style = OverlayStyle(SIGMA_PX_REF, heat=0.5, outline=view == HEAD_VIEW)
-    tiles = []
-    for n, image in images.items():
-        tile = draw_overlay(image, tracks, n - lag, view, tile_height=TILE_HEIGHT, style=style)
-        tiles.append(draw_tag(tile, f"frame {n}", size_px=11))
-    return np.stack(tiles)

@@ -1,6 +1,4 @@
-"""Diagnoses decide by the scores of an episode's readings. The episodes of a source were written the same way, so their scores
-are added up.
-"""
+"""Verdicts by the scores of an episode's readings, and by their sums over a source, whose episodes were written the same way."""
 
 from __future__ import annotations
 
@@ -158,7 +156,6 @@ class SourceDiagnosis(Diagnosis):
 def bad_terms(explanation: Explanation, as_recorded: Explanation | None = None) -> dict[str, float]:
     """The terms that no healthy recording has, by name. With `as_recorded` those of a departing explanation, which must leave
     nothing suspicious but what is tolerated as written and did not get worse."""
-
     bad = {}
     for name, value in explanation.evidence.items():
         kind = name.split(" ")[0]
@@ -204,20 +201,16 @@ def decide(as_recorded: Explanation, ranked: Sequence[Explanation]) -> tuple[Ver
         near = [e for e in ranked if e is not as_recorded and e.score > alone.score - RIVAL_MARGIN]
         near = [e for e in near if not set(e.departures) & set(best.departures)]
         rivals = [e.text for e in near if len(best.departures) > 1 or not bad_terms(e, as_recorded)]
-        in_doubt = [o.text for o in ranked if _of_fewer_views(o, best) and best.score - o.score < VIEWS_COST]
+        # The same lag in some views alone: the pictures that it leaves out lose by it, if hardly.
+        close = [e for e in ranked if best.departures == ("image_lag_frames",) and best.score - e.score < VIEWS_COST]
+        some = [e for e in close if e.conventions.views is not None]
+        in_doubt = [e.text for e in some if e.conventions.model_copy(update={"views": None}) == best.conventions]
         rivals += in_doubt
         if not rivals:
             return ("unexplained", as_recorded, []) if best.lag_at_edge else ("explained", best, [])
         if bad or in_doubt:
             return "unexplained", as_recorded, [best.text, *rivals]
     return "unexplained" if bad else "consistent", as_recorded, []
-
-
-def _of_fewer_views(other: Explanation, best: Explanation) -> bool:
-    """True for the mistake of all pictures in some views alone: what it leaves out loses by the mistake, if hardly."""
-    everywhere = other.conventions.model_copy(update={"views": None})
-    late = best.departures == ("image_lag_frames",)
-    return late and other.conventions.views is not None and everywhere == best.conventions
 
 
 def tolerated_episodes(count: int) -> float:
@@ -307,7 +300,6 @@ class _SourceReading:
 def _instead_of(key: _Key, found: _ByKey) -> Explanation:
     """Substitute for a reading that was not tried in an episode: the largest part of it that was, since a mistake beside
     another leaves no trace there. For a lag the best other lag if it is worse than none: that lag was not worth trying."""
-
     part = max((tried for tried in found if tried <= key), key=lambda tried: (len(tried), found[tried].score))
     fields = {name for name, _ in key}
     others = [e for tried, e in found.items() if tried and {name for name, _ in tried} == fields]

@@ -42,12 +42,10 @@ FACING_DEG, FACING_SPREAD_DEG = 45.0, 10.0
 # Pictures.
 MIN_IMAGE_PAIRS = 8
 """Fewer pictures are no evidence."""
-Typical = tuple[float, float]
+ARM_FLOW, ARM_CHANGE, WRIST_FLOW, WRIST_ENERGY = (0.92, 20.0), (0.74, 20.0), (0.55, 12.0), (0.8, 8.0)
 """A correlation that healthy recordings reach, and the number of independent samples behind it."""
-ARM_FLOW, ARM_CHANGE = (0.92, 20.0), (0.74, 20.0)
 TOOL_FLOW, TOOL_CHANGE = (0.96, 14.0), (0.5, 14.0)
 """The same where only tool poses are recorded."""
-WRIST_FLOW, WRIST_ENERGY = (0.55, 12.0), (0.8, 8.0)
 FINGERS, FINGER_LINKS = (0.75, 0.4), (0.5, 0.3)
 """Correlation that healthy recordings reach, and its standard deviation."""
 FLOW_TURN_DEG, WORST_TURN_TERM = 8.0, -12.0
@@ -166,11 +164,10 @@ def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, f
 
 def in_view_share(reading: Reading, camera: CameraTrack) -> float:
     """Share of frames with some arm's tool in the picture, in front of the camera."""
-    inside = np.zeros(len(reading.tools), dtype=bool)
-    for i in range(reading.tools.shape[1]):
-        uv, depth = project_points(reading.tools[:, i, :3, 3], camera.K, camera.T_base_camera)
-        inside |= (depth > MIN_DEPTH_M) & inside_image(uv, (camera.height, camera.width))
-    return float(inside.mean())
+    places = np.moveaxis(reading.tools[..., :3, 3], 1, 0)
+    seen = [project_points(arm, camera.K, camera.T_base_camera) for arm in places]
+    inside = [(depth > MIN_DEPTH_M) & inside_image(uv, (camera.height, camera.width)) for uv, depth in seen]
+    return float(np.any(inside, axis=0).mean())
 
 
 def _joint_range(observation: Observation, reading: Reading) -> float:
@@ -233,10 +230,8 @@ def not_judged(observation: Observation) -> dict[str, str]:
     """By calibrated view, why its pictures say nothing about its camera."""
     found = {}
     for view, camera in observation.episode.cameras.items():
-        why = unseen(observation, view)
-        if why is None and view in observation.wrists and not camera.moving:
-            why = "its camera has one pose, though its hand moves"
-        if why is not None:
+        fixed = view in observation.wrists and not camera.moving
+        if why := unseen(observation, view) or ("its camera has one pose, though its hand moves" if fixed else None):
             found[view] = why
     return found
 
@@ -264,7 +259,7 @@ def speed_and_change(observation: Observation, reading: Reading, view: str) -> t
     return speed[states], observation.motion(view).change[images]
 
 
-def correlation_log_likelihood(correlation: float, typical: Typical) -> float:
+def correlation_log_likelihood(correlation: float, typical: tuple[float, float]) -> float:
     """Log-likelihood of a Gaussian residual with this correlation, relative to a typical recording; flat below 0."""
     r, (value, samples) = float(np.clip(correlation, 0.0, 0.995)), typical
     return samples / 2 * float(np.log(1 - value**2) - np.log(1 - r**2))

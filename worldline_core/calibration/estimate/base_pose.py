@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldline_core.calibration.camera_errors import LARGEST_STEP, Equations, StillView, moved_camera
-from worldline_core.calibration.estimate.recordings import LoadedViews, RecordedView, recorded_views
+from worldline_core.calibration.estimate.recordings import LoadedViews, RecordedView, placed, recorded_views
 from worldline_core.calibration.estimate.refine import FOCAL, climb, inflation, summed_equations, with_prior
 from worldline_core.calibration.estimate.still_camera import FINE_BLURS, estimate_still
 from worldline_core.calibration.estimate.verdict import ZOOM_ERROR, BasePose, ViewEstimate, too_few, too_little
@@ -163,9 +163,7 @@ def _zoomed(camera: CameraTrack, focal: float, depth: float) -> CameraTrack:
     """A camera of another focal length [px] that sees a robot at this depth as large as before."""
     change = np.eye(4)
     change[2, 3] = depth * (1 - focal / camera.K[0, 0])
-    K = camera.K.copy()
-    K[0, 0] = K[1, 1] = focal
-    return replace(camera, K=K, T_base_camera=camera.T_base_camera @ change)
+    return placed(camera, focal, camera.T_base_camera @ change)
 
 
 def _alone(first: StillView, second: StillView) -> tuple[StillView, StillView]:

@@ -152,6 +152,13 @@ class RecordedView:
         return MotionOfSteps(before, after, flow, width, height)
 
 
+def placed(camera: CameraTrack, focal_px: float, T_base_camera: np.ndarray) -> CameraTrack:
+    """A camera with square pixels of another focal length, at other poses (n, 4, 4)."""
+    K = camera.K.copy()
+    K[0, 0] = K[1, 1] = focal_px
+    return replace(camera, K=K, T_base_camera=T_base_camera)
+
+
 def near_changes(motion: Motion) -> Motion:
     """Drop flow where nothing changes nearby; for cameras that stand still."""
     size = 2 * REACH_OF_CHANGE + 1

@@ -111,9 +111,12 @@ def equations_at(views: Sequence[StillView], camera: CameraTrack, lag: float, bl
 
 def summed_equations(views: Sequence[StillView], camera: CameraTrack, lag: float, blur: float) -> Equations:
     """Normal equations of all episodes at a camera."""
-    theta = np.zeros(PARAMETERS)
-    theta[LAG] = lag
-    found = [view.at(camera).equations(theta, blur) for view in views]
+    theta = np.append(np.zeros(LAG), lag)
+    return total([view.at(camera).equations(theta, blur) for view in views])
+
+
+def total(found: Sequence[Equations]) -> Equations:
+    """The sum of normal equations."""
     information = sum((each.information for each in found), np.zeros((PARAMETERS, PARAMETERS)))
     gradient = sum((each.gradient for each in found), np.zeros(PARAMETERS))
     return Equations(information, gradient, sum(each.likelihood for each in found))

@@ -14,7 +14,7 @@ import numpy as np
 
 from worldline_core.calibration.camera_errors import LAG, PARAMETERS, StillView, delayed
 from worldline_core.calibration.estimate.camera_search import FoundCamera, MotionOfSteps, search_cameras
-from worldline_core.calibration.estimate.recordings import RecordedView, near_changes
+from worldline_core.calibration.estimate.recordings import RecordedView, near_changes, placed
 from worldline_core.calibration.estimate.refine import FittedCamera, fit_still
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import inside_image, project_points
@@ -121,8 +121,7 @@ def _settled(views: Sequence[StillView], fit: FittedCamera, shared: float) -> Fi
 
 def _likelihoods(views: Sequence[StillView], fit: FittedCamera) -> np.ndarray:
     """(e,) log-likelihood of each episode at the rough size."""
-    theta = np.zeros(PARAMETERS)
-    theta[LAG] = fit.lag
+    theta = np.append(np.zeros(LAG), fit.lag)
     return np.array([view.at(fit.camera).equations(theta, ROUGH_BLURS[-1]).likelihood for view in views])
 
 
@@ -174,15 +173,11 @@ def lag_by_amounts(recorded: RecordedView) -> float:
 
 
 def _at(camera: CameraTrack, found: FoundCamera) -> CameraTrack:
-    K = camera.K.copy()
-    K[0, 0] = K[1, 1] = found.focal * camera.width
-    return replace(camera, K=K, T_base_camera=found.T_base_camera[None])
+    return placed(camera, found.focal * camera.width, found.T_base_camera[None])
 
 
 def _enlarged(camera: CameraTrack, fine: CameraTrack) -> CameraTrack:
-    K = fine.K.copy()
-    K[0, 0] = K[1, 1] = camera.K[0, 0] / camera.width * fine.width
-    return replace(fine, K=K, T_base_camera=camera.T_base_camera)
+    return placed(fine, camera.K[0, 0] / camera.width * fine.width, camera.T_base_camera)
 
 
 def _mirrored(motion: MotionOfSteps) -> MotionOfSteps:

@@ -19,14 +19,13 @@ from worldline_core.calibration.camera_errors import (
     HAND_REACH_M,
     LAG,
     NEAR_M,
-    PARAMETERS,
     Equations,
     StillView,
     WristView,
     covered_cells,
 )
-from worldline_core.calibration.estimate.recordings import RecordedView, ViewOfEpisode, certainty
-from worldline_core.calibration.estimate.refine import LAG_PRIOR, FittedCamera, climb, inflation
+from worldline_core.calibration.estimate.recordings import RecordedView, ViewOfEpisode, certainty, placed
+from worldline_core.calibration.estimate.refine import LAG_PRIOR, FittedCamera, climb, inflation, total
 from worldline_core.calibration.estimate.still_camera import lag_by_amounts
 from worldline_core.calibration.evidence import MIN_OPENING_STEP
 from worldline_core.calibration.observation import tool_travel
@@ -87,20 +86,15 @@ class WristEvidence:
         return self.scene.at(carried).agreement(lag)
 
     def at(self, camera: CameraTrack, lag: float, blur: float) -> Equations:
-        theta = np.zeros(PARAMETERS)
-        theta[LAG] = lag
+        theta = np.append(np.zeros(LAG), lag)
         carried = replace(camera, T_base_camera=self.tools @ camera.T_base_camera)
         found = self.scene.at(carried).equations(theta, blur)
         if self.fingers is None:
             return found
         # The pictures of the fingers have the size of the scene's times FINE: angles and metres are the same.
         size = self.fingers.camera
-        K = size.K.copy()
-        K[0, 0] = K[1, 1] = camera.K[0, 0] / camera.width * size.width
-        other = self.fingers.at(replace(size, K=K, T_base_camera=camera.T_base_camera)).equations(theta, blur)
-        return Equations(
-            found.information + other.information, found.gradient + other.gradient, found.likelihood + other.likelihood
-        )
+        fine = placed(size, camera.K[0, 0] / camera.width * size.width, camera.T_base_camera)
+        return total([found, self.fingers.at(fine).equations(theta, blur)])
 
 
 def wrist_evidence(recorded: RecordedView, arm: int, seen_from: CameraTrack) -> list[WristEvidence]:
@@ -272,10 +266,9 @@ def _made_exact(recorded: RecordedView, arm: int, rough: FittedCamera, mount: Ca
 
 def _zoomed(camera: CameraTrack, factor: float) -> CameraTrack:
     """A camera of a longer lens that is as much farther from the tool, which it shows at the same size."""
-    K, back = camera.K.copy(), np.eye(4)
-    K[0, 0] = K[1, 1] = factor * camera.K[0, 0]
+    back = np.eye(4)
     back[2, 3] = (1 - factor) * rigid_inverse(camera.T_base_camera)[0, 2, 3]
-    return replace(camera, K=K, T_base_camera=camera.T_base_camera @ back)
+    return placed(camera, factor * camera.K[0, 0], camera.T_base_camera @ back)
 
 
 def _searched_starts(few: RecordedView, arm: int, lag: float) -> list[tuple[CameraTrack, list[WristEvidence]]]:
@@ -322,9 +315,7 @@ def _apart(one: CameraTrack, other: CameraTrack) -> bool:
 def mounted(recorded: RecordedView, T_tool_camera: np.ndarray, focal: float) -> CameraTrack:
     """A camera at the rough size of pictures; focal length in widths."""
     camera = recorded.unknown_camera(fine=False)
-    K = camera.K.copy()
-    K[0, 0] = K[1, 1] = focal * camera.width
-    return replace(camera, K=K, T_base_camera=T_tool_camera[None])
+    return placed(camera, focal * camera.width, T_tool_camera[None])
 
 
 def fit_wrist(
@@ -346,17 +337,16 @@ def _equations(
     prior: np.ndarray,
 ) -> Equations:
     """Normal equations of all episodes at a camera, with the priors."""
-    found = [each.at(camera, lag, blur) for each in evidence]
-    information = sum((each.information for each in found), np.zeros((PARAMETERS, PARAMETERS)))
-    gradient = sum((each.gradient for each in found), np.zeros(PARAMETERS))
-    likelihood = sum(each.likelihood for each in found)
+    found = total([each.at(camera, lag, blur) for each in evidence])
     apart = rigid_inverse(camera.T_base_camera)[0] @ prior_at.T_base_camera[0]  # towards the prior
     towards = np.concatenate([cv2.Rodrigues(apart[:3, :3])[0][:, 0], apart[:3, 3]])
     focal = float(np.log(camera.K[0, 0] / camera.width / USUAL_WRIST_FOCAL))
     towards = np.append(towards, [-focal, -lag])
     weight = np.append(prior, [WRIST_FOCAL_PRIOR, LAG_PRIOR]) ** -2.0 * inflation(len(evidence), evidence[0].shared)
     return Equations(
-        information + np.diag(weight), gradient + weight * towards, likelihood - float(weight @ towards**2) / 2
+        found.information + np.diag(weight),
+        found.gradient + weight * towards,
+        found.likelihood - float(weight @ towards**2) / 2,
     )
 
 

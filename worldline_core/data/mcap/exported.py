@@ -53,12 +53,7 @@ def write_episode_mcap(
     *,
     encoding: Encoding = "protobuf",
 ) -> None:
-    """Writes one episode; images are exact (png).
-
-    Args:
-        frames: by view, uint8 (episode.num_video_frames, H, W, 3) RGB.
-        robot_masks: by view, bool (N, H, W).
-    """
+    """Writes one episode with its frames by view, uint8 (episode.num_video_frames, H, W, 3) RGB, exactly (png), and bool masks."""
     streams = {("image", view): images for view, images in frames.items()}
     streams |= {("robot_mask", view): masks for view, masks in (robot_masks or {}).items()}
     for (kind, view), images in streams.items():

@@ -263,12 +263,9 @@ _OTHER_FORMATS = {
 """First bytes of what is often recorded for MCAP: what it is, and how it becomes MCAP."""
 
 
-# Images: read in order of time, each decoded only when an instant needs it.
-
-
 @dataclass(frozen=True)
 class ImageTrack:
-    """Frames of a view as images of a topic.
+    """Frames of a view as images of a topic, read in order of time and decoded only when an instant needs them.
 
     Attributes:
         order: (n,) index in the stream of the i-th message in time.
@@ -320,8 +317,12 @@ class ImageTrack:
         numbers = np.unique(self.chosen)
         for number, value in zip(numbers.tolist(), self._messages(self.order[numbers]), strict=True):
             place = f"{self.where}, image {number}"
-            raw = isinstance(value, RawImage)
-            yield number, _raw_pixels(value, place) if raw else _still(value, place, self.camera is not None)
+            if isinstance(value, RawImage):
+                yield number, _raw_pixels(value, place)
+                continue
+            if _DEPTH.search(value.format) or value.data[12:16] == _PNG:  # ROS' compressedDepth puts 12 bytes before it
+                raise depth_picture(place, repr(value.format))
+            yield number, decode_image(value.data, place, calibrated=self.camera is not None)
 
     def _video(self) -> Iterator[tuple[int, np.ndarray]]:
         """Frames from the last key frame before the first chosen one on, in order of time; none may be missing.
@@ -420,13 +421,6 @@ def frames_after_loss(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarr
     last_loss = np.maximum.accumulate(np.where(lost, np.arange(len(lost)), -1))
     last_key = np.maximum.accumulate(np.where(key_frames, np.arange(len(lost)), -1))
     return last_loss > last_key
-
-
-def _still(image: EncodedImage, where: str, calibrated: bool) -> np.ndarray:
-    """RGB of a JPEG or PNG; ROS' compressedDepth puts 12 bytes before a PNG."""
-    if _DEPTH.search(image.format) or image.data[12:16] == _PNG:
-        raise depth_picture(where, repr(image.format))
-    return decode_image(image.data, where, calibrated=calibrated)
 
 
 def _raw_pixels(image: RawImage, where: str) -> np.ndarray:

@@ -1,8 +1,4 @@
-"""Contents of messages of ROS 2 and Foxglove schemas, in any of their encodings (CDR, protobuf, JSON).
-
-A message is decoded into an object by the schema that the file holds; its fields are then read into the classes of this
-module.
-"""
+"""Contents of messages of ROS 2 and Foxglove schemas, decoded (CDR, protobuf, JSON) by the schemas that the file holds."""
 
 from __future__ import annotations
 

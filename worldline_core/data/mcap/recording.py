@@ -178,11 +178,8 @@ class _Recording:
         return first
 
     def _transforms(self, wanted: Iterable[str]) -> TransformTree:
-        """The frames of the episode.
-
-        Static transforms come from the whole file, moving ones from around the episode. Where these do not lead to a
-        wanted frame, the moving ones before the episode are read too: a fixed camera may be published once, when the
-        recording starts.
+        """Static transforms of the whole file, and moving ones around the episode. Where these do not lead to a wanted frame, the
+        moving ones before the episode are read too: a fixed camera may be published once, when the recording starts.
         """
         config = self.config
 
@@ -287,11 +284,7 @@ class _Recording:
                 check_interpolation(times, values, where)
 
     def arm_vectors(self, arms: Iterable[ArmReadings], grid: np.ndarray, share: float) -> tuple[np.ndarray, int]:
-        """(t, J) joints [rad] and opening of each arm, and how many openings lay outside of 0..1.
-
-        Args:
-            share: of all messages, those that may jump to and fro (`check_alternation`).
-        """
+        """(t, J) joints [rad] and opening of each arm, and how many openings lay outside of 0..1; `share` as in `check_alternation`."""
         columns: list[np.ndarray] = [np.zeros((len(grid), 0))]
         outside = 0
         for arm in arms:

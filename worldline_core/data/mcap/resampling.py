@@ -37,10 +37,8 @@ MAX_DISORDER_S = 1.0
 def times_by_topic(
     config: McapTopicsSourceConfig, streams: Mapping[str, Stream], where: object
 ) -> tuple[dict[str, np.ndarray], int]:
-    """Return the times (n,) of each topic's messages [ns] on the configured clock, and the delay that is subtracted from a log time.
-
-    It is the least delay (log time minus header time) of the joints' topic, which commands must fit; where
-    the joints have no header, the least of all topics.
+    """Times (n,) of each topic's messages [ns] on the configured clock, and the delay that is subtracted from a log time: the least
+    one (log time minus header time) of the joints' topic, which commands must fit; where joints have no header, of all topics.
 
     Raises: RejectedInputError (clock_skew) where header times count, and disagree by more than allowed or are not set.
     """
@@ -343,9 +341,7 @@ def uncalibrated(calibration: Calibration, *, rectified: bool) -> str | None:
 def add_camera(
     cameras: RecordedCameras, view: str, message: Calibration, poses: np.ndarray, where: str, *, rectified: bool = False
 ) -> None:
-    """Adds a view from its calibration message and its poses (n or 1, 4, 4) in the base.
-
-    `rectified`: P holds the K of the images, and no lens is left.
+    """Adds a view from its calibration message (`rectified`: P holds K, and no lens is left) and its poses (n or 1, 4, 4) in the base.
 
     Raises: RejectedInputError: singular_intrinsics, invalid_extrinsics, invalid_distortion.
     """
