@@ -50,6 +50,7 @@ def test_a_folder_of_videos(tmp_path: Path) -> None:
     for n in range(3):
         write_video(tmp_path / f"raw/{n}/clip.mp4", pictures(motion(5, 40, n), "still", n), 10)
     (tmp_path / "raw/captions.csv").write_text("video,caption\n")
+    (tmp_path / "raw/LICENSE").write_text("MIT License\n")
     found, config, counts = init(tmp_path)
     assert (found.kind, found.state_size, counts["kept"]) == ("video_folder", None, 3)
     assert config.train_stage1 is not None and (
@@ -57,6 +58,7 @@ def test_a_folder_of_videos(tmp_path: Path) -> None:
         config.train_stage1.trainer.steps,
     ) == (20, None)
     assert any("captions.csv" in note for note in found.notes)
+    assert config.curate.sources[0].license == "MIT"
 
 
 def test_an_episode_set_and_its_mcap_files(tmp_path: Path, project_root: Path) -> None:

@@ -154,19 +154,12 @@ def find_arms(columns: Sequence[Column], *, commanded: bool = False) -> tuple[li
     if len(found) == 1:
         found[0].side = "right"  # a single arm is the right one
     left_out = [column.label for column in columns if column not in kept]
-    said = "; ".join(
-        f"{len(arm.joints)} joints"
-        + (
-            f" and the gripper {named([arm.gripper.label])}"
-            if arm.gripper
-            else f" and {len(arm.fingers)} fingers"
-            if arm.fingers
-            else ""
-        )
-        + (f" of the {arm.side} arm" if len(found) > 1 else "")
-        for arm in found
-    )
-    return found, f"by their names: {said}" + (f"; left out: {named(left_out, 4)}" if left_out else "")
+    said = []
+    for arm in found:
+        fingers = f" and {len(arm.fingers)} fingers" if arm.fingers else ""
+        hand = f" and the gripper {named([arm.gripper.label])}" if arm.gripper else fingers
+        said.append(f"{len(arm.joints)} joints{hand}" + (f" of the {arm.side} arm" if len(found) > 1 else ""))
+    return found, f"by their names: {'; '.join(said)}" + (f"; left out: {named(left_out, 4)}" if left_out else "")
 
 
 def _of_one_robot(columns: Sequence[Column], *, commanded: bool) -> list[Column]:
@@ -250,16 +243,10 @@ def joint_unit(
     if ends and most <= 100.0005:
         return "range_m100_100", f"{ends} joints stop at exactly 100 or -100, where LeRobot cuts its ranges off", False
     if 0 < share < _OFF_GRID and _is_quantised(values):
-        return (
-            "range_m100_100",
-            f"only {share:.0%} of the steps are ticks of a motor in degrees, and all readings are within -100..100",
-            False,
-        )
-    return (
-        usual,
-        f"readings to {most:.4g}: deg and range_m100_100 both fit; LeRobot's default for this arm is taken",
-        True,
-    )
+        said = f"only {share:.0%} of the steps are ticks of a motor in degrees, and all readings are within -100..100"
+        return "range_m100_100", said, False
+    said = f"readings to {most:.4g}: deg and range_m100_100 both fit; LeRobot's default for this arm is taken"
+    return usual, said, True
 
 
 def _steps(values: np.ndarray) -> np.ndarray:
@@ -327,11 +314,8 @@ def gripper_readings(
     if command is not None and span > 0 and (found := _squeeze(state, command, span)) is not None:
         closes_down, share = found
         side = "below" if closes_down else "above"
-        return GripperReadings(
-            known,
-            f"{ends}; at rest the command stays {side} the reading in {share:.0%} of the frames: it squeezes",
-            closes_down,
-        )
+        said = f"{ends}; at rest the command stays {side} the reading in {share:.0%} of the frames: it squeezes"
+        return GripperReadings(known, said, closes_down)
     return GripperReadings(known, ends, None)
 
 
@@ -410,23 +394,15 @@ def match_robot(
         reasons = [f"{'+'.join(str(len(a.joints)) for a in arms)} joints"]
         reasons += [f"the dataset calls the robot {named([robot_type])}"] if named_alike else []
         reasons += ["the joint names agree"] if words_alike else []
-        reasons += [
-            "all joints within its limits"
-            if fits and not signs
-            else "joints beyond its limits, look at units and zeros"
-            if not fits
-            else "within its limits with joints of the other sign"
-        ]
+        within = "within its limits with joints of the other sign" if signs else "all joints within its limits"
+        reasons.append(within if fits else "joints beyond its limits, look at units and zeros")
         fitting.append((score, Match(name, "; ".join(reasons), signs, fits)))
     if not fitting and stranger:
         return None, [], f"there is no description of a {named([robot_type])}"
     if not fitting:
         count = "+".join(str(len(arm.joints)) for arm in arms)
-        return (
-            None,
-            [],
-            f"none of {considered} described robots with {count} joints has limits that hold these readings",
-        )
+        said = f"none of {considered} described robots with {count} joints has limits that hold these readings"
+        return None, [], said
     fitting.sort(key=lambda found: (-found[0], _variant(found[1].name), found[1].name))
     score, best = fitting[0]
     ties = [match.name for other, match in fitting[1:] if other == score and not _is_variant(best.name, match.name)]

@@ -262,12 +262,7 @@ def _commands(sample: Sample, arms: list[ArmColumns], action: list[Column]) -> t
     """Columns of the commands by arm; none, with the reason, where they are no joint positions."""
     found, _ = find_arms(action, commanded=True)
     if not found:
-        return (
-            [],
-            "the action holds no joints: it repeats the state"
-            if action
-            else "no action is recorded: it repeats the state",
-        )
+        return [], ("the action holds no joints" if action else "no action is recorded") + ": it repeats the state"
     if [len(arm.joints) for arm in found] != [len(arm.joints) for arm in arms]:
         return [], "the action has another number of joints than the state, which it repeats"
     for command, arm in zip(found, arms, strict=True):

@@ -122,12 +122,8 @@ def _first[T](files: Sequence[AnyPath], read: Callable[[AnyPath], T]) -> T:
 def discover_gesim(root: AnyPath) -> Discovery:
     """AgiBot's first-frame bundles."""
     found = sorted({path.parent for name in ("actions.npy", "state_joints_0.npy") for path in find_files(root, name)})
-    result = _agibot(
-        "agibot_gesim",
-        f"AgiBot first-frame bundles: {len(found)}",
-        root,
-        "folders with actions.npy or state_joints_0.npy, and pictures",
-    )
+    why = "folders with actions.npy or state_joints_0.npy, and pictures"
+    result = _agibot("agibot_gesim", f"AgiBot first-frame bundles: {len(found)}", root, why)
     result.views = list(VIEWS)
     result.say(("fps",), 30, "no file states the rate; AgiBot World records 30 Hz")
     result.notes.append(
@@ -140,12 +136,8 @@ def discover_gesim(root: AnyPath) -> Discovery:
 def discover_agibot_world(root: AnyPath) -> Discovery:
     """AgiBot World's own layout."""
     episodes = {relative_name(path, root).parts[1:3] for path in find_files(root, "*_color.mp4")}
-    result = _agibot(
-        "agibot_world",
-        f"AgiBot World: {len(episodes)} episodes",
-        root,
-        "proprio_stats/ and observations/ of AgiBot World",
-    )
+    why = "proprio_stats/ and observations/ of AgiBot World"
+    result = _agibot("agibot_world", f"AgiBot World: {len(episodes)} episodes", root, why)
     present, result.views = _agibot_views(root)
     if not result.views:
         raise DataError(
@@ -219,14 +211,10 @@ def discover_robomind(root: AnyPath) -> Discovery:
             if described.grippers and (key == "gripper_state" or described.commanded):
                 _ask_gripper(found, key, described.arms, files, track)
         if described.channels is None:
-            found.source["channels"] = Question(
-                "channels", "standard, or as_written where red looks blue in the pictures"
-            )
-    found.say(
-        ("fps",),
-        Question("fps", "frames a second: the release does not say it (30 is what other readers use for version 1)"),
-        "no file states the rate",
-    )
+            text = "standard, or as_written where red looks blue in the pictures"
+            found.source["channels"] = Question("channels", text)
+    rate = "frames a second: the release does not say it (30 is what other readers use for version 1)"
+    found.say(("fps",), Question("fps", rate), "no file states the rate")
     return found
 
 
@@ -247,11 +235,8 @@ def _ask_gripper(found: Discovery, key: str, arms: Any, files: Sequence[AnyPath]
         raise DataError("Grippers of no file can be read", where=files[0], next_step="check that the files are whole")
     readings = gripper_readings(np.concatenate(values), None, (), open_is_high=None, why="")
     text = f"reading of the gripper ({key}) when it is {{}} ({readings.evidence})"
-    found.say(
-        (key,),
-        {end: Question(f"{key}_{end}", text.format(end)) for end in ("closed", "open")},
-        f"{readings.evidence}; nothing says which end is open",
-    )
+    asked = {end: Question(f"{key}_{end}", text.format(end)) for end in ("closed", "open")}
+    found.say((key,), asked, f"{readings.evidence}; nothing says which end is open")
 
 
 def discover_unitree(root: AnyPath) -> Discovery:
@@ -262,11 +247,8 @@ def discover_unitree(root: AnyPath) -> Discovery:
 
     def look(path: AnyPath) -> tuple[np.ndarray, list[str], bool]:
         with open_hdf5(path) as file:
-            return (
-                file.array(track, (None, None)),
-                [] if trained else file.names("observations/images"),
-                not trained and _pixels(file),
-            )
+            cameras = [] if trained else file.names("observations/images")
+            return file.array(track, (None, None)), cameras, not trained and _pixels(file)
 
     values, cameras, pixels = _first(files, look)
     about = f"Unitree's or ACT's HDF5: {len(files)} episodes of {values.shape[1]} columns"
@@ -300,11 +282,8 @@ def discover_unitree(root: AnyPath) -> Discovery:
             if robot == "aloha":
                 found.say((key,), {"closed": 0, "open": 1}, "ACT's recorder writes 0 closed .. 1 open")
             elif robot == "g1_dex1":
-                found.say(
-                    (key,),
-                    {"closed": 0.0, "open": 5.4},
-                    "Unitree's teleoperation commands a Dex1 gripper 0 closed .. 5.4 rad open",
-                )
+                why = "Unitree's teleoperation commands a Dex1 gripper 0 closed .. 5.4 rad open"
+                found.say((key,), {"closed": 0.0, "open": 5.4}, why)
             else:
                 _ask_gripper(found, key, ROBOTS[robot], files, name)
         if robot == "aloha" or (not trained and not pixels):
@@ -337,11 +316,9 @@ def _unitree_robot(found: Discovery, values: np.ndarray, trained: bool, root: An
         except RejectedInputError:
             continue
     if width == 14 and (not fitting or (not trained and not _Z1.search(str(root)))):
-        found.say(
-            ("robot",),
-            "aloha",
-            f"14 columns{', beyond the limits of a Z1' if not fitting else ''}: ALOHA's 6 joints and gripper of each arm, by ACT's recorder",
-        )
+        beyond = "" if fitting else ", beyond the limits of a Z1"
+        why = f"14 columns{beyond}: ALOHA's 6 joints and gripper of each arm, by ACT's recorder"
+        found.say(("robot",), "aloha", why)
         found.say(("embodiment",), "aloha", "two arms of 6 joints; aloha_viperx where yours stand side by side")
         return "aloha"
     if not fitting:
@@ -352,11 +329,8 @@ def _unitree_robot(found: Discovery, values: np.ndarray, trained: bool, root: An
             got=width,
             next_step="robots with dexterous hands are read as LeRobot datasets",
         )
-    found.say(
-        ("robot",),
-        fitting[0],
-        f"{width} columns within a Z1's limits" + (f"; {fitting[1]} would fit too" if len(fitting) > 1 else ""),
-    )
+    also = f"; {fitting[1]} would fit too" if len(fitting) > 1 else ""
+    found.say(("robot",), fitting[0], f"{width} columns within a Z1's limits{also}")
     found.say(("embodiment",), NO_EMBODIMENT, "no file of configs/embodiments describes a Z1")
     return fitting[0]
 
@@ -373,16 +347,10 @@ def discover_robotwin(root: AnyPath) -> Discovery:
     present = _first(files, cameras)
     about, why = f"RoboTwin 2: {len(files)} episodes", "data/episode<n>.hdf5 with observation/<camera>"
     found = Discovery.of("robotwin", root, about, why, cameras="all", trains=False)
-    found.say(
-        ("views",),
-        {view: camera for view, camera in known.items() if camera in present},
-        f"cameras of the file: {named(present)}",
-    )
+    views = {view: camera for view, camera in known.items() if camera in present}
+    found.say(("views",), views, f"cameras of the file: {named(present)}")
     found.views = list(found.source["views"])
-    found.say(
-        ("fps",),
-        Question("fps", "frames a second: 250 divided by `save_freq` of the task's configuration (15: 16.667)"),
-        "no file states the rate",
-    )
+    rate = "frames a second: 250 divided by `save_freq` of the task's configuration (15: 16.667)"
+    found.say(("fps",), Question("fps", rate), "no file states the rate")
     found.say(("split",), "test", "RoboTwin is for evaluation only: results are compared on it")
     return found
