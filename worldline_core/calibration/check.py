@@ -393,7 +393,7 @@ def diagnosis_picture(
                 for n, image in shown.items()
             ]
             rows[title].append(SheetRow(words(view), np.stack(tiles)))
-    if not arms:
+    if not any(rows.values()):
         expected = "a calibrated view with images"
         raise DataError("Nothing to draw", where=f"episode {recorded.episode_id}", expected=expected)
     sheets = [contact_sheet(r, tile_height=TILE_HEIGHT, title=t, min_width=MIN_WIDTH) for t, r in rows.items()]
