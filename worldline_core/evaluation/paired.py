@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from worldline_core.errors import ArtifactError
-from worldline_core.evaluation.metric_registry import METRICS, metric_of
+from worldline_core.evaluation.metric_registry import metric_of
 from worldline_core.evaluation.scores import (
     SCORES_FILE,
     SUMMARY_FILE,
@@ -188,7 +188,7 @@ def sign_of(name: str) -> int:
 def margin_of(name: str) -> float:
     """The smallest loss of a series that counts."""
     metric = metric_of(name.rpartition("/")[2])
-    return DECISION_MARGIN if metric is None else METRICS[metric.name].margin
+    return DECISION_MARGIN if metric is None else metric.margin
 
 
 def differences(present: Series, reference: Series) -> Series:
