@@ -5,7 +5,7 @@ from tasks.execution.artifact_task import ArtifactTask
 evaluate_policy = ArtifactTask(
     name="evaluate_policy",
     summary="evidence, rules, accuracy against the recorded outcome",
-    version=13,
+    version=14,
     function="worldline_core.evaluation.policy.evaluate_policy:evaluate_policy",
     config="worldline_core.evaluation.evaluation_config:PolicyEvaluationConfig",
     inputs=("episodes", "rollouts.*"),

@@ -206,7 +206,6 @@ class PolicyEvaluationConfig(_Judging):
     judge: JudgeName = "measured"
     splits: tuple[str, ...] = ("test", "ood_test")
     balanced: bool = True
-    max_per_group: int | None = Field(default=None, ge=1, description="of each outcome in each split and family")
     compare_policies: bool = Field(
         default=False,
         description="sources of the episodes are policies: compare their recorded and predicted success rates",
@@ -218,8 +217,8 @@ class PolicyEvaluationConfig(_Judging):
 
     @model_validator(mode="after")
     def _all_attempts(self) -> PolicyEvaluationConfig:
-        if self.compare_policies and (self.balanced or self.max_per_group is not None):
-            raise ValueError("compare_policies needs every attempt: set balanced: false and max_per_group: null")
+        if self.compare_policies and self.balanced:
+            raise ValueError("compare_policies needs every attempt: set balanced: false")
         return self
 
     def weights_read(self) -> Mapping[str, Path | None]:

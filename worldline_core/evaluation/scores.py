@@ -119,26 +119,6 @@ def paired_difference(
     return bootstrap_mean([first[name] - second[name] for name in common], resamples=resamples, seed=seed)
 
 
-def method_differences(
-    by_method: Mapping[str, Mapping[str, float]],
-    metric: str,
-    *,
-    resamples: int,
-    seed: int,
-) -> list[dict[str, Any]]:
-    """Rows {"first", "second", "metric", mean, low, high, count} of first - second of a metric, for every pair of methods.
-
-    Args:
-        by_method: the metric of each trajectory, by method.
-    """
-    rows: list[dict[str, Any]] = []
-    for first, second in combinations(sorted(by_method), 2):
-        found = paired_difference(by_method[first], by_method[second], resamples=resamples, seed=seed)
-        if found is not None:
-            rows.append({"first": first, "second": second, "metric": metric, **asdict(found)})
-    return rows
-
-
 @dataclass(frozen=True, order=True)
 class Score:
     """One measured value of one predicted (or recorded) trajectory."""
@@ -221,10 +201,10 @@ def summarise(scores: Sequence[Score], *, resamples: int, seed: int, by_view: bo
             weights = [len(items) for items in by_episode.values()]
             interval = bootstrap_mean(list(map(_mean, by_episode.values())), weights=weights, **options)
             metrics[group][method][metric] = asdict(interval)
-        for pair in combinations(sorted(by_method), 2):
-            means = _in_common_views(*(by_method[method] for method in pair))
-            differences[group] += method_differences(dict(zip(pair, means, strict=True)), metric, **options)
-    differences = {group: rows for group, rows in differences.items() if rows}
+        for first, second in combinations(sorted(by_method), 2):
+            found = paired_difference(*_in_common_views(by_method[first], by_method[second]), **options)
+            if found is not None:
+                differences[group].append({"first": first, "second": second, "metric": metric, **asdict(found)})
     return {"metrics": metrics, "differences": differences}
 
 

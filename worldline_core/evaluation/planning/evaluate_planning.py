@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
@@ -291,7 +291,7 @@ def write_results(
     """
     ends = {bank: [outcomes[row.episode_id] for row in rows] for bank, rows in banks.items()}
     direct = {bank: float(np.mean(own)) for bank, own in ends.items()}
-    scores = [_score(DIRECT, banks[bank][0], 0, "success", value) for bank, value in direct.items()]
+    scores: list[Score] = []
     success: dict[str, dict[int, dict[str, list[float]]]] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     malformed: dict[str, int] = defaultdict(int)
     for choice in choices:
@@ -299,83 +299,63 @@ def write_results(
         value = float(outcomes[choice["episode_id"]])
         success[method][budget][bank].append(value)
         malformed[method] += choice["trace"]["malformed_answers"]
-        scores.append(_score(method, banks[bank][0], choice["run"], f"success@{budget}", value))
+        row, metric = banks[bank][0], f"success@{budget}"
+        about = row.embodiment, row.split, "", choice["run"], metric, value, row.scene, row.task_family
+        scores.append(Score(method, bank, *about))
     write_scores(output, scores)
-
-    def interval(values: Sequence[float]) -> dict[str, Any]:
-        return asdict(bootstrap_mean(values, resamples=config.resamples, seed=config.seed))
-
-    def deviation(values: Sequence[float]) -> float:
-        return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-
-    def statistics(by_bank: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-        means = {bank: float(np.mean(by_bank[bank])) for bank in sorted(by_bank)}
-        over_runs = deviation([float(np.mean(run)) for run in zip(*by_bank.values(), strict=True)])
-        spread = {"std_over_banks": deviation(list(means.values())), "std_over_runs": over_runs}
-        gain = interval([means[bank] - direct[bank] for bank in means])
-        return {"success": interval(list(means.values())) | spread, "gain": gain, "banks": means}
-
     means = {
-        name: {n: {bank: float(np.mean(runs)) for bank, runs in sorted(own.items())} for n, own in by_budget.items()}
-        for name, by_budget in success.items()
+        name: {
+            n: {bank: float(np.mean(runs)) for bank, runs in sorted(own.items())}
+            for n, own in sorted(by_budget.items())
+        }
+        for name, by_budget in sorted(success.items())
     }
+    rules = {name.removeprefix(SHORTCUT): own for name, own in means.items() if name.startswith(SHORTCUT)}
 
-    def over_shortcut(method: str, budget: int, members: Sequence[str]) -> dict[str, Any]:
-        """Gain in these banks over the shortcut that is best there."""
-        chosen = means[method][budget]
-        rivals = {name: own[budget] for name, own in means.items() if name.startswith(SHORTCUT)}
-        best = max(sorted(rivals), key=lambda name: np.mean([rivals[name][bank] for bank in members]))
-        gain = interval([chosen[bank] - rivals[best][bank] for bank in members])
-        return {"shortcut": best.removeprefix(SHORTCUT), "gain": gain}
+    def interval(values: Iterable[float]) -> dict[str, Any]:
+        return asdict(bootstrap_mean(list(values), resamples=config.resamples, seed=config.seed))
 
-    def by_family(method: str, by_budget: Mapping[int, Mapping[str, Sequence[float]]]) -> dict[str, Any]:
-        """Mean success and gain of each task family and budget."""
-        found: dict[str, dict[str, Any]] = defaultdict(dict)
-        for budget, values in sorted(by_budget.items()):
-            for family in sorted({banks[bank][0].task_family for bank in values}):
-                members = [bank for bank in values if banks[bank][0].task_family == family]
-                mean = float(np.mean([np.mean(values[bank]) for bank in members]))
-                gain = mean - float(np.mean([direct[bank] for bank in members]))
-                over = over_shortcut(method, budget, members)
-                found[family][str(budget)] = {
-                    "success": mean,
-                    "gain": gain,
-                    "banks": len(members),
-                    "over_shortcut": over,
-                }
-        return found
+    def result(budget: int, own: Mapping[str, float]) -> dict[str, Any]:
+        """Success and gains of a method's choices by bank."""
+        best = max(rules, key=lambda name: np.mean([rules[name][budget][bank] for bank in own]))
+        over = interval(value - rules[best][budget][bank] for bank, value in own.items())
+        gain = interval(value - direct[bank] for bank, value in own.items())
+        return {
+            "success": interval(own.values()),
+            "gain": gain,
+            "banks": own,
+            "over_shortcut": {"shortcut": best, "gain": over},
+        }
+
+    def by_family(by_budget: Mapping[int, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+        """Mean success of each task family and budget."""
+        found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+        for budget, own in by_budget.items():
+            for bank, value in own.items():
+                found[banks[bank][0].task_family][str(budget)].append(value)
+        return {family: {n: float(np.mean(values)) for n, values in own.items()} for family, own in found.items()}
 
     methods = {
-        method: {
-            "budgets": {
-                str(budget): statistics(values) | {"over_shortcut": over_shortcut(method, budget, sorted(values))}
-                for budget, values in sorted(by_budget.items())
-            },
-            "by_family": by_family(method, by_budget),
-            "malformed_answers": malformed[method],
+        name: {
+            "budgets": {str(n): result(n, own) for n, own in by_budget.items()},
+            "by_family": by_family(by_budget),
+            "malformed_answers": malformed[name],
         }
-        for method, by_budget in sorted(success.items())
-        if not method.startswith(SHORTCUT)
+        for name, by_budget in means.items()
+        if not name.startswith(SHORTCUT)
     }
-    shortcuts = {
-        name.removeprefix(SHORTCUT): {
-            str(budget): statistics(values)["success"] for budget, values in sorted(own.items())
-        }
-        for name, own in sorted(success.items())
-        if name.startswith(SHORTCUT)
-    }
-    shown = ("scene", "embodiment", "task_family", "instruction")
     summary = {
         "selector": selector,
         "banks": {
-            bank: {name: getattr(rows[0], name) for name in shown}
-            | {"candidates": len(rows), "direct_success": direct[bank], "any_success": any(ends[bank])}
+            bank: {"task_family": rows[0].task_family, "candidates": len(rows), "direct_success": direct[bank]}
             for bank, rows in banks.items()
         },
-        DIRECT: interval(list(direct.values())),
-        "oracle": interval([float(any(own)) for own in ends.values()]),
+        DIRECT: interval(direct.values()),
+        "oracle": interval(float(any(own)) for own in ends.values()),
         "methods": methods,
-        "shortcuts": shortcuts,
+        "shortcuts": {
+            name: {str(n): interval(own.values()) for n, own in by_budget.items()} for name, by_budget in rules.items()
+        },
         "interval": "95 % bootstrap over banks",
     }
     write_json_atomic(output / SUMMARY_FILE, summary)
@@ -383,7 +363,3 @@ def write_results(
         name: found["budgets"][max(found["budgets"], key=int)]["success"]["mean"] for name, found in methods.items()
     }
     return {"banks": len(banks), DIRECT: summary[DIRECT]["mean"], "success_at_largest_budget": largest}
-
-
-def _score(method: str, row: EpisodeRow, run: int, metric: str, value: float) -> Score:
-    return Score(method, row.bank or "", row.embodiment, row.split, "", run, metric, value, row.scene, row.task_family)

@@ -2,7 +2,7 @@
 
 As many successes as failures are judged in every split and task family: of every method those that it predicted, first of all those
 that all methods predicted. The recorded videos are judged too (method ``true``): that accuracy is the judge's own ceiling. Accuracy
-is pooled per seed and averaged over seeds, by split and task family, with intervals. Shortcuts, which see no video
+is averaged over the seeds of a recording, by split and task family, with intervals. Shortcuts, which see no video
 (`evaluation.shortcuts`), give verdicts on the same attempts: what a model knows counts over the best of them.
 """
 
@@ -44,7 +44,6 @@ from worldline_core.evaluation.scores import (
     Score,
     bootstrap_mean,
     kept_part,
-    method_differences,
     part_file,
     write_scores,
     write_table,
@@ -145,7 +144,6 @@ def choose_trajectories(
         for outcome in _OUTCOMES:
             members = sorted(group[outcome], key=lambda row: row.episode_id)
             limit = fewest if config.balanced else len(members)
-            limit = limit if config.max_per_group is None else min(limit, config.max_per_group)
             drawn = generator.permutation(len(members))
             picked = sorted(drawn, key=lambda index: -times[members[index].episode_id])[:limit]
             chosen += [members[index] for index in sorted(picked)]
@@ -203,7 +201,7 @@ def _count(
     left_out = {
         "in other splits": len(rows) - len(inside),
         "without a recorded success or failure": len(inside) - len(judgeable),
-        "not drawn (evaluate_policy.balanced, max_per_group)": len(judgeable) - len(chosen),
+        "not drawn (evaluate_policy.balanced)": len(judgeable) - len(chosen),
         "predicted shorter than recorded": len(chosen) - kept,
     }
     if not verdicts:
@@ -227,17 +225,17 @@ def _correctness(row: Mapping[str, Any]) -> Score:
 def summarise_decisions(
     rows: Sequence[Mapping[str, Any]], shortcuts: Mapping[str, Mapping[str, bool]], *, resamples: int, seed: int
 ) -> dict[str, Any]:
-    """Accuracy of every method and group, and differences between methods.
+    """Accuracy of every method and group.
 
     Args:
-        rows: verdicts with method, episode_id, seed, split, task_family, outcome, predicted, undecided, answers, malformed_answers.
+        rows: verdicts with method, episode_id, split, task_family, outcome, predicted, undecided, answers, malformed_answers.
         shortcuts: success by shortcut and episode, without any video.
 
     Returns:
-        {"trajectories", "methods": {method: {group: {"accuracy": interval, "seeds": {...}, "confusion": {...}, "over_shortcut": {"shortcut",
-        "gain": interval}, "undecided": {"share", "accuracy_of_decided"}}}}, "shortcuts": {shortcut: {group: interval}}, "differences": [...]};
-        groups are "all", each split, each family, and split/family; an undecided verdict counts as the nearer side; a gain is over the
-        shortcut that is right most often there, recording by recording.
+        {"trajectories", "methods": {method: {group: {"accuracy": interval, "confusion": {...}, "over_shortcut": {"shortcut", "gain": interval},
+        "undecided": {"share", "accuracy_of_decided"}}}}, "shortcuts": {shortcut: {group: interval}}}; groups are "all", each split, each
+        family, and split/family; an undecided verdict counts as the nearer side; a gain is over the shortcut that is right most often
+        there, recording by recording.
     """
     outcomes = {row["episode_id"]: row["outcome"] == "success" for row in rows}
     correct = {
@@ -256,7 +254,7 @@ def summarise_decisions(
         for row in members:
             right = "true" if row["predicted"] == row["outcome"] else "false"
             confusion[f"{right}_{row['predicted']}"] += 1
-        own = _accuracy(members, "episode_id")
+        own = _accuracy(members)
         accuracy = bootstrap_mean(list(own.values()), resamples=resamples, seed=seed)
         best = max(sorted(correct), key=lambda name: np.mean([correct[name][episode] for episode in own]))
         gains = [value - correct[best][episode] for episode, value in own.items()]
@@ -275,24 +273,21 @@ def summarise_decisions(
                 else None,
             },
             "over_shortcut": {"shortcut": best, "gain": gain},
-            "seeds": {str(name): value for name, value in _accuracy(members, "seed").items()},
             "confusion": confusion,
             **{name: sum(row[name] for row in members) for name in ("malformed_answers", "answers")},
         }
-    by_method = {method: _accuracy(groups[method, _ALL], "episode_id") for method in methods}
     return {
         "trajectories": len({row["episode_id"] for row in rows}),
         "methods": dict(methods),
         "shortcuts": dict(by_group),
-        "differences": method_differences(by_method, "accuracy", resamples=resamples, seed=seed),
     }
 
 
-def _accuracy(rows: Sequence[Mapping[str, Any]], key: str) -> dict[Any, float]:
-    """Share of right verdicts by trajectory or seed."""
-    values: dict[Any, list[float]] = defaultdict(list)
+def _accuracy(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Share of right verdicts by trajectory."""
+    values: dict[str, list[float]] = defaultdict(list)
     for row in rows:
-        values[row[key]].append(float(row["predicted"] == row["outcome"]))
+        values[row["episode_id"]].append(float(row["predicted"] == row["outcome"]))
     return {name: sum(items) / len(items) for name, items in sorted(values.items())}
 
 
