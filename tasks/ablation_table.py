@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 ablation_table = ArtifactTask(
     name="ablation_table",
-    summary="the paper's ablations as one table beside the paper's numbers",
     version=5,
     function="worldline_core.report.ablation_table:ablation_table",
     config="worldline_core.report.ablation_table:AblationTableConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 curate = ArtifactTask(
     name="curate",
-    summary="read recordings of any source into one EpisodeSet",
     version=26,
     function="worldline_core.data.curation.curate:curate",
     config="worldline_core.data.curation.curate_config:CurateConfig",

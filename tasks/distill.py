@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 distill = ArtifactTask(
     name="distill",
-    summary="Stage III: teacher forcing, trajectory regression, distribution matching",
     version=15,
     function="worldline_core.distillation.distill:distill",
     config="worldline_core.distillation.distill_config:DistillConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 encode_latents = ArtifactTask(
     name="encode_latents",
-    summary="cache the video tokenizer's latents",
     version=6,
     function="worldline_core.training.encode_latents:encode_latents",
     config="worldline_core.training.clip_config:EncodeLatentsConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 estimate_cameras = ArtifactTask(
     name="estimate_cameras",
-    summary="estimate uncalibrated cameras from the recorded episodes alone",
     version=10,
     function="worldline_core.calibration.estimate.estimate:estimate_cameras",
     config="worldline_core.calibration.estimate.estimate_config:EstimateConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 evaluate_planning = ArtifactTask(
     name="evaluate_planning",
-    summary="bracket selection among candidate controls, success of the choice",
     version=11,
     function="worldline_core.evaluation.planning.evaluate_planning:evaluate_planning",
     config="worldline_core.evaluation.evaluation_config:PlanningConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 evaluate_policy = ArtifactTask(
     name="evaluate_policy",
-    summary="evidence, rules, accuracy against the recorded outcome",
     version=14,
     function="worldline_core.evaluation.policy.evaluate_policy:evaluate_policy",
     config="worldline_core.evaluation.evaluation_config:PolicyEvaluationConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 evaluate_video = ArtifactTask(
     name="evaluate_video",
-    summary="PSNR, SSIM, LPIPS, robot-mask and object IoU",
     version=13,
     function="worldline_core.evaluation.video.evaluate_video:evaluate_video",
     config="worldline_core.evaluation.evaluation_config:VideoEvaluationConfig",

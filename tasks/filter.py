@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 filter_episodes = ArtifactTask(
     name="filter",
-    summary="drop static, reset, corrupted, moving-base, misaligned and badly calibrated segments",
     version=18,
     function="worldline_core.filters.filter:filter_episodes",
     config="worldline_core.filters.filter_config:FilterConfig",

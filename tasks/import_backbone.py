@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 import_backbone = ArtifactTask(
     name="import_backbone",
-    summary="turn pretrained weights (Cosmos3, Wan) into the base checkpoint",
     version=5,
     function="worldline_core.model.backbone:import_backbone",
     config="worldline_core.model.world_model_config:ImportBackboneConfig",

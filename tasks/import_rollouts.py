@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 import_rollouts = ArtifactTask(
     name="import_rollouts",
-    summary="any folder of predicted videos as a set of rollouts, every file accounted for",
     version=4,
     function="worldline_core.rollout.import_rollouts:import_rollouts",
     config="worldline_core.rollout.rollout_config:ImportRolloutsConfig",

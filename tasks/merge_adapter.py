@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 merge_adapter = ArtifactTask(
     name="merge_adapter",
-    summary="a LoRA adapter and the checkpoint that it started from as one checkpoint",
     version=1,
     function="worldline_core.training.adapters:merge_adapter",
     config="worldline_core.training.training_config:MergeAdapterConfig",

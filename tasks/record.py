@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 record = ArtifactTask(
     name="record",
-    summary="simulated robots, scenes and scripted controllers into an EpisodeSet",
     version=2,
     function="worldline_core.recorder.attempts:record_artifact",
     config="worldline_core.recorder.attempts:RecordingConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 render_actions = ArtifactTask(
     name="render_actions",
-    summary="project the controls into every view: action tracks and overlay previews",
     version=8,
     function="worldline_core.actions.render_actions:render_actions",
     config="worldline_core.actions.actions_config:RenderActionsConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 report = ArtifactTask(
     name="report",
-    summary="static pages with tables, plots and videos",
     version=34,
     function="worldline_core.report.report:report",
     config="worldline_core.report.context:ReportConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 rollout = ArtifactTask(
     name="rollout",
-    summary="predict videos from a first observation and controls",
     version=8,
     function="worldline_core.rollout.rollout:rollout",
     config="worldline_core.rollout.rollout_config:RolloutConfig",

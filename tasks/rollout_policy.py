@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 rollout_policy = ArtifactTask(
     name="rollout_policy",
-    summary="videos of a policy that drives the simulator from recorded first frames on",
     version=1,
     function="worldline_core.rollout.policy_rollout:rollout_policy",
     config="worldline_core.rollout.rollout_config:PolicyRolloutConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 train_judge = ArtifactTask(
     name="train_judge",
-    summary="train the small judge of outcomes",
     version=1,
     function="worldline_core.evaluation.policy.learned_judge:train_judge",
     config="worldline_core.evaluation.evaluation_config:JudgeConfig",

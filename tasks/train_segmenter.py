@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 train_segmenter = ArtifactTask(
     name="train_segmenter",
-    summary="train the small robot segmenter",
     version=6,
     function="worldline_core.evaluation.segmenters.learned:train_segmenter",
     config="worldline_core.evaluation.evaluation_config:SegmenterConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 train_stage1 = ArtifactTask(
     name="train_stage1",
-    summary="Stage I: action-free, text-conditioned video prediction",
     version=8,
     function="worldline_core.training.stage1:train_stage1",
     config="worldline_core.training.training_config:Stage1Config",

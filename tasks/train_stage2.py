@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 train_stage2 = ArtifactTask(
     name="train_stage2",
-    summary="Stage II: action-driven three-view prediction on successes and failures",
     version=17,
     function="worldline_core.training.stage2:train_stage2",
     config="worldline_core.training.training_config:Stage2Config",

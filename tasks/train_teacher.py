@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 train_teacher = ArtifactTask(
     name="train_teacher",
-    summary="train the small relational teacher of the embedded default",
     version=2,
     function="worldline_core.training.video_teacher:train_teacher",
     config="worldline_core.training.training_config:TeacherConfig",

@@ -4,7 +4,6 @@ from tasks.execution.artifact_task import ArtifactTask
 
 train_tokenizer = ArtifactTask(
     name="train_tokenizer",
-    summary="fit the small video tokenizer of the embedded default, or a small decoder for any tokenizer's latents",
     version=5,
     function="worldline_core.training.train_tokenizer:train_tokenizer",
     config="worldline_core.training.training_config:TokenizerConfig",

@@ -40,7 +40,6 @@ class ArtifactTask:
     """
 
     name: str
-    summary: str
     version: int
     function: str
     config: str
@@ -48,6 +47,11 @@ class ArtifactTask:
     optional_inputs: tuple[str, ...] = ()
     distributed: bool = False
     mapped: bool = False
+
+    @property
+    def summary(self) -> str:
+        """The first line of its file."""
+        return importlib.import_module(f"tasks.{self.name}").__doc__ or ""
 
     def submit(
         self,

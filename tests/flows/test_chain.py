@@ -191,8 +191,7 @@ TASK = """
 from tasks.execution.artifact_task import ArtifactTask
 
 count_files = ArtifactTask(
-    name="count_files", summary="count the files", version=1,
-    function="counting:count_files", config="counting:CountConfig", inputs=("episodes",),
+    name="count_files", version=1, function="counting:count_files", config="counting:CountConfig", inputs=("episodes",),
 )
 """
 

@@ -40,7 +40,7 @@ def declare(monkeypatch: pytest.MonkeyPatch) -> Declare:
 
     def make(name: str, *inputs: str, function: Any = write) -> ArtifactTask:
         module = ModuleType(f"tasks.{name}")
-        task = ArtifactTask(name, "", 1, f"tasks.{name}:work", f"tasks.{name}:Config", inputs)
+        task = ArtifactTask(name, 1, f"tasks.{name}:work", f"tasks.{name}:Config", inputs)
         vars(module).update({name: task, "work": function, "Config": WriteConfig})
         monkeypatch.setitem(sys.modules, module.__name__, module)
         return task
