@@ -15,7 +15,16 @@ from flows.exchange_commands import add_exchange_commands
 from flows.fit_command import add_fit_command
 from flows.full_size_commands import add_plan_command, add_rehearse_command
 from tasks.execution.artifact_task import find_task, task_names
-from tasks.execution.command_line import add_config_arguments, add_overrides, add_task_arguments
+from tasks.execution.command_line import (
+    add_config_arguments,
+    add_overrides,
+    add_task_arguments,
+    exit_with_clear_errors,
+    list_artifacts,
+    print_artifact,
+    run_supervised,
+    run_task,
+)
 from tasks.execution.temporary_server import prepare_prefect, start_server_early
 
 
@@ -69,7 +78,7 @@ def build_parser() -> argparse.ArgumentParser:
     inspect.set_defaults(run=_inspect)
     listing = commands.add_parser("list", help="name the artifacts of a run: what is finished, and where it is")
     add_config_arguments(listing)
-    listing.set_defaults(run=_list)
+    listing.set_defaults(run=list_artifacts)
     verify = commands.add_parser("verify", help="compare the files of finished artifacts with what was written")
     verify.add_argument(
         "artifact", type=Path, nargs="*", help="only these, shipped ones too (default: all of the store)"
@@ -184,8 +193,10 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     estimate.set_defaults(run=_calibrate_estimate)
 
 
-def _checked_preset(arguments: argparse.Namespace, *, weights: bool = False) -> str | None:
-    """The preset of a run whose configuration is sound, and whose recordings and ``weights`` are there: mistakes are
+def _begin_run(
+    arguments: argparse.Namespace, *, weights: bool = False
+) -> tuple[str | None, Path | None, tuple[str, ...], Path]:
+    """Preset, file, overrides and store of a run. Its configuration is sound, and its recordings and ``weights`` are there: mistakes are
     reported before Prefect and its server start."""
     from worldline_core.config import preset_path
 
@@ -198,18 +209,18 @@ def _checked_preset(arguments: argparse.Namespace, *, weights: bool = False) -> 
     check_recordings(config, Path.cwd())
     if weights:
         check_weights(config, Path.cwd())
-    return preset
+    prepare_prefect(arguments.artifacts)
+    start_server_early()
+    return preset, arguments.config, tuple(arguments.overrides), arguments.artifacts
 
 
 def _pipeline(arguments: argparse.Namespace) -> None:
-    preset = _checked_preset(arguments, weights=True)
-    prepare_prefect(arguments.artifacts)
-    start_server_early()
+    values = _begin_run(arguments, weights=True)
     from flows.pipeline import pipeline
     from tasks.execution.prefect_artifacts import run_flow
 
     print(f"how far it is, and then the report: {arguments.artifacts / 'report' / 'latest' / 'index.html'}")
-    report = run_flow(pipeline, preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
+    report = run_flow(pipeline, *values)
     print(f"report: {report.path / 'index.html'}")
 
 
@@ -220,32 +231,24 @@ def _nightly(arguments: argparse.Namespace) -> None:
         accept_night(arguments.artifacts / "nightly", arguments.accept)
         print(f"later nights are held against {arguments.accept}")
         return
-    preset = _checked_preset(arguments)
-    prepare_prefect(arguments.artifacts)
-    start_server_early()
+    values = _begin_run(arguments)
     from flows.nightly_evaluation import nightly_evaluation
     from tasks.execution.prefect_artifacts import run_flow
 
-    values = preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, arguments.night
-    print(f"nightly: {run_flow(nightly_evaluation, *values) / 'index.html'}")
+    print(f"nightly: {run_flow(nightly_evaluation, *values, arguments.night) / 'index.html'}")
 
 
 def _ablations(arguments: argparse.Namespace) -> None:
-    preset = _checked_preset(arguments, weights=True)
-    prepare_prefect(arguments.artifacts)
-    start_server_early()
+    values = _begin_run(arguments, weights=True)
     from flows.ablations import ablations
     from tasks.execution.prefect_artifacts import run_flow
 
     variants = None if arguments.variant is None else tuple(arguments.variant)
-    values = preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, variants, arguments.variants
-    table = run_flow(ablations, *values, tuple(arguments.seeds))
+    table = run_flow(ablations, *values, variants, arguments.variants, tuple(arguments.seeds))
     print((Path(str(table.path)) / "table.md").read_text(), f"table: {table.path / 'table.md'}", sep="\n")
 
 
 def _task(arguments: argparse.Namespace) -> None:
-    from tasks.execution.command_line import print_artifact, run_task
-
     prepare_prefect(arguments.artifacts)
     print_artifact(run_task(find_task(arguments.step), arguments))
 
@@ -276,12 +279,6 @@ def _inspect(arguments: argparse.Namespace) -> None:
     from worldline_core.report.inspect import inspect
 
     print(inspect(arguments.artifact, arguments.output, episodes=arguments.episodes, episode_id=arguments.episode))
-
-
-def _list(arguments: argparse.Namespace) -> None:
-    from tasks.execution.command_line import list_artifacts
-
-    list_artifacts(arguments)
 
 
 def _verify(arguments: argparse.Namespace) -> None:
@@ -430,7 +427,6 @@ def _doctor(arguments: argparse.Namespace) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console command, which works in a child process; with `argv` it works in this one."""
-    from tasks.execution.command_line import exit_with_clear_errors, run_supervised
     from worldline_core.scale.process import keep_freed_memory
 
     # Early: threads that have allocated keep the arena that they have.

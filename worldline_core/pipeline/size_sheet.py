@@ -107,23 +107,22 @@ class SizeSheet(StrictModel):
             return self._rows(pool)
 
     def _rows(self, pool: Executor) -> list[Estimate]:
-        made: dict[int, Estimate] = {}
         with Progress("worldline plan", len(self._trainings()), "training") as progress:
+            made: dict[int, Estimate] = {}
             for number, row in self._finished(pool):
                 made[number] = row
                 progress.advance()
         return [made[number] for number in sorted(made)]
 
     def rows_and_rollouts(self, rows: list[Estimate] | None = None) -> tuple[list[Estimate], list[BlockCost]]:
-        """The same, and of a card that is known blocks of the distilled model in one view and in all; none where nothing is
-        distilled.
+        """The same, and of a card that is known blocks of the distilled model in one view and in all.
 
         Args:
             rows: what `fitting_rows` returned.
         """
-        config, views = self.config, () if self.config.distill is None else tuple(self.config.distill.views)
+        config, views = self.config, tuple(self.config.distill.views)
         with self._processes() as pool:
-            if self.card is None or config.distill is None or config.train_stage2 is None:
+            if self.card is None:
                 return self._rows(pool) if rows is None else rows, []
             model = stage2_model_config(config.train_stage2, self.model)
             shown = list(dict.fromkeys((views[:1], views)))
@@ -144,7 +143,7 @@ class SizeSheet(StrictModel):
     def _processes(self) -> Executor:
         """Processes that find imported what all of them need, and never search for garbage."""
         FakeTensorMode()  # imports half of torch
-        if any(stage is not None and stage.lora for stage in (self.config.train_stage2, self.config.distill)):
+        if self.config.train_stage2.lora or self.config.distill.lora:
             load_peft()
         context = multiprocessing.get_context("fork")
         return ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=gc.disable)
