@@ -217,6 +217,7 @@ def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict
 
 
 def _copy_mapping(values: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy in which no mapping is another one's alias."""
     return {key: _copy_mapping(value) if isinstance(value, Mapping) else value for key, value in values.items()}
 
 
@@ -437,6 +438,13 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
         else:
             result[key] = change
     return result
+
+
+def value_at(values: Any, *keys: str) -> Any:
+    """The value below some keys of nested mappings; None where there is none."""
+    for key in keys:
+        values = None if values is None else values.get(key)
+    return values
 
 
 def _holds_boolean(value: Any) -> bool:

@@ -10,7 +10,7 @@ from typing import Any, Literal, Self, cast
 from pydantic import Field, model_validator
 
 from worldline_core.actions.actions_config import RenderActionsConfig
-from worldline_core.config import StrictModel, load_config, read_config
+from worldline_core.config import StrictModel, load_config, read_config, value_at
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ConfigError, UnavailableError
@@ -50,6 +50,10 @@ class ModelPaths(StrictModel):
     causal: Path | None = Field(default=None, description="long-trained causal checkpoint to report beside this run's")
 
 
+GIVEN = {"base": "base", "shipped_stage2": "stage2", "shipped_causal": "causal"}
+"""Checkpoints that a rollout may name and a run does not make, and the field of `ModelPaths` with the folder of each."""
+
+
 class RolloutRun(StrictModel):
     """One named set of predicted videos: of a model or a baseline (``config``), or ``imported`` from a folder ``videos``."""
 
@@ -76,13 +80,11 @@ def _drop_unusable_rollouts(values: dict[str, Any], written: Mapping[str, Any]) 
     )
     if not all(isinstance(part, Mapping) for part in (rollouts, own, models)):
         return  # validation names it
-    draws = values.get("render_actions") is not None
-    there = {
-        "base": models.get("base"),
-        "stage1": values.get("train_stage1"),
-        "shipped_stage2": models.get("stage2") if draws else None,
-        "shipped_causal": models.get("causal") if draws else None,
+    there = {checkpoint: models.get(name) for checkpoint, name in GIVEN.items()} | {
+        "stage1": values.get("train_stage1")
     }
+    if values.get("render_actions") is None:
+        there |= {"shipped_stage2": None, "shipped_causal": None}
 
     def usable(run: object) -> bool:
         if not isinstance(run, Mapping):
@@ -151,8 +153,13 @@ class PipelineConfig(StrictModel):
     @property
     def caches_latents(self) -> bool:
         """True if a training reads latents of `encode_latents`."""
-        stages = (self.train_stage1, self.train_stage2, self.distill)
-        return any(stage is not None and not isinstance(stage.input, FrameInput) for stage in stages)
+        return any(not isinstance(stage.input, FrameInput) for stage in self.stages.values())
+
+    @property
+    def stages(self) -> dict[str, Stage1Config | Stage2Config | DistillConfig]:
+        """The trainings of the model by their sections."""
+        first = {} if self.train_stage1 is None else {"train_stage1": self.train_stage1}
+        return {**first, "train_stage2": self.train_stage2, "distill": self.distill}
 
     def recordings(self) -> list[tuple[str, RecordingConfig]]:
         """Names and settings of the recordings that the run's sources read."""
@@ -191,7 +198,9 @@ class PipelineConfig(StrictModel):
         """Checkpoints by the names that rollouts use: trained by this run or given; None for baselines."""
         own = {"stage1": "train_stage1", "stage2": "train_stage2", "causal": "distill"}
         made: dict[str | None, T | Path | None] = {name: trained[step] for name, step in own.items() if step in trained}
-        return {None: None, **self.shipped_checkpoints(), **made}
+        folders = self.model_folders()
+        given = {checkpoint: folders[model] for checkpoint, model in GIVEN.items() if model in folders}
+        return {None: None, **given, **made}
 
     def model_folders(self) -> dict[str, Path]:
         """Folders of the weights that the run starts from or compares with, those that it names."""
@@ -213,12 +222,6 @@ class PipelineConfig(StrictModel):
                 got={name: run.checkpoint for name, run in self.rollouts.items()},
                 next_step="take the preset demo or tiny, or name a model and a rollout of it",
             )
-
-    def shipped_checkpoints(self) -> dict[str, Path]:
-        """Folders of the checkpoints that a rollout may name and this run does not make."""
-        folders = self.model_folders()
-        shipped = {f"shipped_{name}": folders[name] for name in ("stage2", "causal") if name in folders}
-        return shipped | {name: folder for name, folder in folders.items() if name == "base"}
 
     def videos_folder(self, run: RolloutRun) -> Path:
         """Folder of an imported rollout's videos."""
@@ -245,13 +248,8 @@ class PipelineConfig(StrictModel):
         for name, run in self.rollouts.items():
             if run.episodes == "banks" and self.curate_banks is None:
                 raise ValueError(f"rollouts.{name} needs curate_banks")
-            shipped = {
-                "shipped_stage2": self.models.stage2,
-                "shipped_causal": self.models.causal,
-                "base": self.models.base,
-            }
-            if run.checkpoint in shipped and shipped[run.checkpoint] is None:
-                raise ValueError(f"rollouts.{name} needs models.{run.checkpoint.removeprefix('shipped_')}")
+            if run.checkpoint in GIVEN and getattr(self.models, GIVEN[run.checkpoint]) is None:
+                raise ValueError(f"rollouts.{name} needs models.{GIVEN[run.checkpoint]}")
             if run.checkpoint == "stage1" and self.train_stage1 is None:
                 raise ValueError(f"rollouts.{name} needs train_stage1")
         if self.render_actions is None:
@@ -286,18 +284,10 @@ class PipelineConfig(StrictModel):
     @model_validator(mode="after")
     def _latents_reach_as_far_as_clips(self) -> PipelineConfig:
         """Refuse what training would refuse after all latents are encoded."""
-        for name, stage in (
-            ("train_stage1", self.train_stage1),
-            ("train_stage2", self.train_stage2),
-            ("distill", self.distill),
-        ):
-            longest, encoded = 0 if stage is None else max(stage.clips.lengths), self.encode_latents.clip_frames
-            if (
-                stage is not None
-                and not isinstance(stage.input, FrameInput)
-                and encoded is not None
-                and longest > encoded
-            ):
+        encoded = self.encode_latents.clip_frames
+        for name, stage in self.stages.items():
+            longest = 0 if isinstance(stage.input, FrameInput) else max(stage.clips.lengths)
+            if encoded is not None and longest > encoded:
                 raise ValueError(f"{name}.clips.lengths: {longest} frames, encode_latents.clip_frames: {encoded}")
         return self
 
@@ -350,20 +340,12 @@ def check_weights(config: PipelineConfig, project: Path) -> None:
     """
     missing: list[str] = []
     advice: list[str] = []
-    named = {f"models.{name}": path for name, path in config.models.model_dump().items()}
-    named |= {
-        "train_stage1.text.path": None if config.train_stage1 is None else config.train_stage1.text.path,
-        "distill.lpips_weights": config.distill.lpips_weights,
+    values = config.model_dump()
+    named = {
+        key: value_at(values, *key.split(".")) for key in (*(f"models.{name}" for name in values["models"]), *_OUTSIDE)
     }
-    if config.evaluate_video is not None:
-        named["evaluate_video.lpips_weights"] = config.evaluate_video.lpips_weights
-        named["evaluate_video.sam3_weights"] = config.evaluate_video.sam3_weights
-    if config.evaluate_policy is not None:
-        named["evaluate_policy.sam3_weights"] = config.evaluate_policy.sam3_weights
-        named["evaluate_policy.vlm.weights"] = config.evaluate_policy.vlm.weights
-    for name, run in config.rollouts.items():
-        text = getattr(run.config and run.config.sampler, "text", None)
-        named[f"rollouts.{name}.config.sampler.text.path"] = None if text is None else text.path
+    for name, run in values["rollouts"].items():
+        named[f"rollouts.{name}.config.sampler.text.path"] = value_at(run, "config", "sampler", "text", "path")
     for key, path in named.items():
         if path is None:
             continue

@@ -81,14 +81,9 @@ class SizeSheet(StrictModel):
         return Sources.of(self.folder("tokenizer"), self.folder("teacher"), reading.image_size)
 
     def _trainings(self) -> list[Training]:
-        generation = self.model.model_copy(update={"towers": "generation"})
-        stages = (
-            (self.config.train_stage1, self.model),
-            (self.config.train_stage2, generation),
-            (self.config.distill, generation),
-        )
-        given = ((stage, model) for stage, model in stages if stage is not None)
-        return [training for stage, model in given for training in trainings(stage, model, self.source(stage))]
+        models = {name: self.model.model_copy(update={"towers": "generation"}) for name in ("train_stage2", "distill")}
+        stages = [(stage, models.get(name, self.model)) for name, stage in self.config.stages.items()]
+        return [training for stage, model in stages for training in trainings(stage, model, self.source(stage))]
 
     def row(self, number: int) -> Estimate:
         """One line of the sheet."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from typing import Any
 
+from worldline_core.config import value_at
 from worldline_core.errors import ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.progress import Progress
@@ -21,9 +21,8 @@ _CELL = 32
 def smaller_settings(config: PipelineConfig) -> list[list[str]]:
     """Changes of a configuration, each list with all those before it: first what costs time alone, then precision, the length of
     clips, the size of pictures, and last all weights but adapters."""
-    stages = [name for name in ("train_stage1", "train_stage2") if getattr(config, name) is not None]
     parts = [f"distill.{step}" for step in config.distill.trainers]
-    trainers = [f"{name}.trainer" for name in (*stages, *parts)]
+    trainers = [f"{name}.trainer" for name in (*config.stages, *parts) if name != "distill"]
     steps = [
         [f"{one}.sharding.checkpointing=block" for one in trainers]
         + ["distill.trajectory_regression.trajectories.clips_per_shard=1"],
@@ -35,13 +34,9 @@ def smaller_settings(config: PipelineConfig) -> list[list[str]]:
     for length in _LENGTHS:
         if length < longest and (length - 1) % block == 0:
             cached = [f"encode_latents.clip_frames={length}"] if config.encode_latents.clip_frames else []
-            steps.append([f"{name}.clips.lengths=[{length}]" for name in (*stages, "distill")] + cached)
-    sizes = ["curate.image_size", "encode_latents.image_size"]
-    sizes += [
-        f"{name}.input.image_size"
-        for name in (*stages, "distill")
-        if isinstance(getattr(config, name).input, FrameInput)
-    ]
+            steps.append([f"{name}.clips.lengths=[{length}]" for name in config.stages] + cached)
+    framed = [name for name, stage in config.stages.items() if isinstance(stage.input, FrameInput)]
+    sizes = ["curate.image_size", "encode_latents.image_size", *(f"{name}.input.image_size" for name in framed)]
     for scale in _SCALES:
         size = [int(scale * side) // _CELL * _CELL for side in config.encode_latents.image_size]
         if min(size) > 0:
@@ -78,10 +73,4 @@ def largest_fitting(
         )  # fmt: skip
     last = dict(change.split("=", 1) for change in settings[found])
     before = load(()).model_dump(mode="json")
-    return [f"{key}={value}" for key, value in last.items() if str(_at(before, key)) != value]
-
-
-def _at(values: Any, key: str) -> Any:
-    for name in key.split("."):
-        values = None if values is None else values.get(name)
-    return values
+    return [f"{key}={value}" for key, value in last.items() if str(value_at(before, *key.split("."))) != value]
