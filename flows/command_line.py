@@ -19,6 +19,7 @@ from tasks.execution.command_line import (
     add_config_arguments,
     add_overrides,
     add_task_arguments,
+    chosen_preset,
     exit_with_clear_errors,
     list_artifacts,
     print_artifact,
@@ -200,7 +201,7 @@ def _begin_run(
     reported before Prefect and its server start."""
     from worldline_core.config import preset_path
 
-    preset = arguments.preset or (None if arguments.config else "demo")
+    preset = chosen_preset(arguments)
     if preset is not None:
         preset_path(preset)  # answers before torch is imported
     from worldline_core.pipeline.pipeline_config import PipelineConfig, check_recordings, check_weights

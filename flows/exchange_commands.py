@@ -13,11 +13,7 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     card.add_argument(
         "artifact", type=Path, metavar="FOLDER", help="an EpisodeSet, curated or filtered, or a checkpoint"
     )
-    card.add_argument(
-        "--evaluation", type=Path, action="append", metavar="FOLDER",
-        help="a finished evaluation of a checkpoint, repeatable (default: all of the store that measured it)",
-    )  # fmt: skip
-    card.add_argument("--artifacts", type=Path, default=Path("artifacts"), help="the store of the evaluations")
+    card.add_argument("--artifacts", type=Path, default=Path("artifacts"), help="the store whose evaluations count")
     card.add_argument("--license", metavar="NAME", help="of a checkpoint's weights, as the hub writes it (apache-2.0)")
     card.add_argument("--output", type=Path, default=None, help="where the card goes (default: FOLDER/run/card)")
     card.add_argument("--title", default=None, help="its heading (default: EpisodeSet and the folder's name)")
@@ -74,18 +70,16 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
 
 
 def _card(arguments: argparse.Namespace) -> None:
+    output = arguments.output or arguments.artifact / "run" / "card"
     if (arguments.artifact / "checkpoint.json").is_file():
         from worldline_core.model.model_card import write_model_card
         from worldline_core.report.results import evaluations_of_store, measurements
 
-        evaluations = arguments.evaluation or evaluations_of_store(arguments.artifacts)
-        output = arguments.output or arguments.artifact / "run" / "card"
-        found = measurements(arguments.artifact, evaluations)
+        found = measurements(arguments.artifact, evaluations_of_store(arguments.artifacts))
         print(f"wrote {write_model_card(arguments.artifact, output, found, arguments.license)}")
         return
     from worldline_core.report.data import write_card
 
-    output = arguments.output or arguments.artifact / "run" / "card"
     print(f"wrote {write_card(arguments.artifact, output, arguments.title)}")
 
 

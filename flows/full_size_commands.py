@@ -8,7 +8,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from tasks.execution.command_line import add_config_arguments, add_preset_arguments
+from tasks.execution.command_line import add_config_arguments, add_preset_arguments, chosen_preset
 from tasks.execution.temporary_server import prepare_prefect
 
 
@@ -104,7 +104,7 @@ def rehearse_command(arguments: argparse.Namespace) -> None:
     from worldline_core.rehearsal.rehearsal import prepare, table
 
     path = None if arguments.config is None else arguments.config.resolve()
-    preset = arguments.preset or (None if path else "cosmos3-nano")
+    preset = chosen_preset(arguments, "cosmos3-nano")
     with_ablations = not arguments.without_ablations
     changes, besides = prepare(arguments.output, preset, path, arguments.overrides, ablations=with_ablations)
     print(table(changes))

@@ -49,6 +49,11 @@ def add_preset_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     add_overrides(parser)
 
 
+def chosen_preset(arguments: argparse.Namespace, default: str = "demo") -> str | None:
+    """The preset that a command works on; None where a file is given instead."""
+    return arguments.preset or (None if arguments.config else default)
+
+
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments that say which configuration and which store a command works on."""
     add_preset_arguments(parser, "demo")
@@ -79,13 +84,13 @@ def run_task(task: ArtifactTask, arguments: argparse.Namespace) -> Artifact:
     Of a file that does not describe a whole run, and of a task that the chain does not call by this name, the task's own section is
     read; nothing is looked up then.
     """
-    chosen = arguments.config is not None or arguments.preset is not None
-    if task.name == "curate" and arguments.name is None and not (chosen or arguments.overrides):
+    chosen = (arguments.config, arguments.preset, arguments.name, *arguments.overrides)
+    if task.name == "curate" and not any(chosen):
         raise ConfigError(
             "Nothing says which recordings to read", expected="--config FILE or --preset NAME", got="neither",
             next_step="write their source into a file (docs/sources.md); --preset demo reads the shipped ones",
         )  # fmt: skip
-    preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "demo"
+    preset = chosen_preset(arguments)
     from tasks.execution.shard_mapper import shard_mapper
     from worldline_core.pipeline.pipeline_config import PipelineConfig, source_folders
     from worldline_core.scale.mapping import RunnerConfig
@@ -155,8 +160,8 @@ def list_artifacts(arguments: argparse.Namespace) -> None:
     from worldline_core.pipeline.pipeline_config import PipelineConfig
     from worldline_core.report.comparison import aligned
 
-    preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "demo"
-    calls = outline(load_chain(), PipelineConfig.load(preset, arguments.config, arguments.overrides))
+    config = PipelineConfig.load(chosen_preset(arguments), arguments.config, arguments.overrides)
+    calls = outline(load_chain(), config)
     store = ArtifactStore(arguments.artifacts)
     found = find_artifacts(calls, store)
     lines = [("name", "artifact", "seconds", "finished")]

@@ -62,8 +62,12 @@ class ArtifactReference(StrictModel):
 
     @property
     def folder(self) -> Path:
-        """The artifact's folder."""
         return Path(str(self.path))
+
+    @classmethod
+    def of(cls, artifact: Artifact) -> Self:
+        """The reference to an artifact."""
+        return cls(step=artifact.step, path=artifact.path, digest=artifact.digest)
 
 
 class PrefectRun(Outline):
@@ -124,15 +128,15 @@ class PrefectRun(Outline):
         """Make the call a Prefect task: here and now, or in the pool of processes."""
         pending = [source for source in call.upstream if source.name in self._futures]
         if not pending:
-            digests = {name: _reference(s, self._store) for name, s in self._sources(call).items()}
-            key = call.task.key(self._store, call.config, {name: r.digest for name, r in digests.items()})
+            references: dict[str, ArtifactReference] = self._sources(call)
+            key = call.task.key(self._store, call.config, {name: r.digest for name, r in references.items()})
             found = self._store.find(call.task.name, key)
             if found is not None or self._runner.steps_at_once == 1:
-                self._call_here(call, key, digests)
+                self._call_here(call, key, references)
                 return
         self._futures[call.name] = self._pool.submit(
             _prefect_task(call, refresh=True),
-            {**self._parameters(call), "inputs": self._sources(call)},
+            {**self._parameters(call), "inputs": _as_json(self._sources(call))},
             wait_for=[self._futures[source.name] for source in pending],
             dependencies={"inputs": self._run_inputs(call)},
         )
@@ -140,9 +144,7 @@ class PrefectRun(Outline):
 
     def _call_here(self, call: TaskCall, key: str, inputs: Mapping[str, ArtifactReference]) -> None:
         found = self._store.find(call.task.name, key)
-        recorded = found is not None and _is_recorded(
-            f"{call.task.name}-{key}", ArtifactReference(step=found.step, path=found.path, digest=found.digest)
-        )
+        recorded = found is not None and _is_recorded(f"{call.task.name}-{key}", ArtifactReference.of(found))
         if (flow_run := FlowRunContext.get()) is not None:
             # Prefect takes parameters for results of tasks by the ids of plain objects, which equal strings share; what a
             # call waits for is stated below.
@@ -151,7 +153,7 @@ class PrefectRun(Outline):
             "State[Any]",
             _prefect_task(call, refresh=not recorded)(
                 **self._parameters(call),
-                inputs={name: reference.model_dump(mode="json") for name, reference in inputs.items()},
+                inputs=_as_json(inputs),
                 wait_for=[self._ended[source.name] for source in call.upstream],
                 return_state=True,
             ),
@@ -166,7 +168,7 @@ class PrefectRun(Outline):
                 next_step="run the command again",
             )
         self._ended[call.name] = state
-        self.artifacts[call.name] = ArtifactReference(step=made.step, path=made.path, digest=made.digest)
+        self.artifacts[call.name] = ArtifactReference.of(made)
         if self._page is not None:
             self._page.finished(call, made.path, cached=found is not None)
 
@@ -216,15 +218,14 @@ class PrefectRun(Outline):
         }
 
     def _sources(self, call: TaskCall) -> dict[str, Any]:
-        """Inputs as Prefect resolves them: futures of tasks in the pool, references of those that have ended."""
+        """Inputs as Prefect resolves them: futures of tasks in the pool, references of those that have ended and of folders."""
         sources: dict[str, Any] = {}
         for name, source in call.inputs.items():
-            if not isinstance(source, TaskCall):
-                sources[name] = _reference(source, self._store).model_dump(mode="json")
-            elif source.name in self._futures:
-                sources[name] = self._futures[source.name]
+            if isinstance(source, TaskCall):
+                sources[name] = self._futures.get(source.name) or self.artifacts[source.name]
             else:
-                sources[name] = self.artifacts[source.name].model_dump(mode="json")
+                path = source if is_remote(source) else source.resolve()
+                sources[name] = ArtifactReference(step="folder", path=path, digest=self._store.input_digest(source))
         return sources
 
     def _run_inputs(self, call: TaskCall) -> set[RunInput]:
@@ -277,7 +278,7 @@ def _run_task(
         artifact = task.run(store, task.load_config().model_validate(config), folders, shard_mapper(settings))
     finally:
         running_node.reset(before)
-    return ArtifactReference(step=artifact.step, path=artifact.path, digest=artifact.digest).model_dump(mode="json")
+    return ArtifactReference.of(artifact).model_dump(mode="json")
 
 
 def _cache_key(_context: TaskRunContext, parameters: dict[str, Any]) -> str:
@@ -299,10 +300,6 @@ def _is_recorded(key: str, reference: ArtifactReference) -> bool:
         return False
 
 
-def _reference(value: Path | dict[str, Any] | ArtifactReference, store: ArtifactStore) -> ArtifactReference:
-    if isinstance(value, ArtifactReference):
-        return value
-    if isinstance(value, dict):
-        return ArtifactReference.model_validate(value)
-    path = value if is_remote(value) else value.resolve()
-    return ArtifactReference(step="folder", path=path, digest=store.input_digest(value))
+def _as_json(sources: Mapping[str, Any]) -> dict[str, Any]:
+    """Inputs with their references as plain JSON."""
+    return {n: s.model_dump(mode="json") if isinstance(s, ArtifactReference) else s for n, s in sources.items()}
