@@ -143,8 +143,7 @@ _StrictLoader.add_implicit_resolver(_BOOLEAN, re.compile(r"^(?:true|True|TRUE|fa
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read one YAML mapping.
 
-    Raises:
-        ConfigError: the file is missing, is not YAML, repeats a key, or does not hold a mapping.
+    Raises: ConfigError: the file is missing, is not YAML, repeats a key, or does not hold a mapping.
     """
     if not path.is_file() and path.parts[:1] == ("configs",):
         # The documents name the project's own files so; an installed package has them elsewhere.
@@ -173,8 +172,7 @@ def preset_names() -> list[str]:
 def preset_path(name: str) -> Path:
     """The file of a preset.
 
-    Raises:
-        ConfigError: there is no preset of that name; the message lists those there are.
+    Raises: ConfigError: there is no preset of that name; the message lists those there are.
     """
     if name not in preset_names():
         close = difflib.get_close_matches(name, preset_names(), n=1)
@@ -190,8 +188,7 @@ def preset_path(name: str) -> Path:
 def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """Apply ``a.b=value`` overrides (the value is read as YAML) to a copy of ``values``.
 
-    Raises:
-        ConfigError: an override is not of the form ``a.b=value``, or goes through something that is not a mapping.
+    Raises: ConfigError: an override is not of the form ``a.b=value``, or goes through something that is not a mapping.
     """
     result = _copy_mapping(values)
     for override in overrides:
@@ -224,8 +221,7 @@ def _copy_mapping(values: Mapping[str, Any]) -> dict[str, Any]:
 def validate[Model: BaseModel](model: type[Model], values: Mapping[str, Any], *, where: object) -> Model:
     """Build ``model`` from ``values``; every mistake is reported with its dotted path.
 
-    Raises:
-        ConfigError: a key is unknown (the message suggests the nearest one), missing, or has a bad value.
+    Raises: ConfigError: a key is unknown (the message suggests the nearest one), missing, or has a bad value.
     """
     try:
         return model.model_validate(dict(values))
@@ -343,8 +339,7 @@ def load_config[Model: BaseModel](
         prune: changes the values before they are validated, given what the user wrote: the file and the overrides without
             the preset.
 
-    Raises:
-        ConfigError: anything that is not right with it.
+    Raises: ConfigError: anything that is not right with it.
     """
     given = read_config(preset, path)
     source = preset_path(preset) if preset is not None else path

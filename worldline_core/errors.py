@@ -12,12 +12,7 @@ class WorldLineError(Exception):
     """Base of every error raised on purpose. Its message hides credentials and control characters, and is cut where
     a file put too much text into it.
 
-    Args:
-        what: one sentence saying what is wrong.
-        where: the episode, file, key or field concerned.
-        expected: what would have been right.
-        got: what was found instead.
-        next_step: what the reader can do about it.
+    ``what`` is wrong, ``where`` (episode, file, key or field), what was ``expected``, what was there instead, and what the reader can do.
     """
 
     def __init__(
@@ -93,11 +88,9 @@ def installing(extra: str) -> str:
 
 @contextmanager
 def needing(extra: str, library: str, *, where: str | None = None, otherwise: str = "") -> Iterator[None]:
-    """Around the imports of an optional library. Raises: UnavailableError where it is not installed.
+    """Around the imports of an optional library, for which the setting ``where`` asks; ``otherwise``: what can be done without it.
 
-    Args:
-        where: the setting that asks for it.
-        otherwise: what can be done without it.
+    Raises: UnavailableError where it is not installed.
     """
     try:
         yield

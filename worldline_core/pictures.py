@@ -152,8 +152,7 @@ def contact_sheet(
         tile_height: small frames are enlarged by a whole factor to at most this.
         min_width: room for titles where tiles are few.
 
-    Raises:
-        ValueError: no rows, or a row without pictures.
+    Raises: ValueError: no rows, or a row without pictures.
     """
     if not rows or any(row.frames.shape[0] == 0 for row in rows):
         raise ValueError("a contact sheet needs at least one row, and at least one picture in every row")
@@ -221,13 +220,9 @@ def side_by_side(
 ) -> Iterator[Picture]:
     """Pictures of labelled columns of frames `n h w 3`, one after the other.
 
-    They end with the shortest column, so that no frozen picture looks like a prediction.
+    They end with the shortest column, so that no frozen picture looks like a prediction. ``most`` columns are in one line (default: all).
 
-    Args:
-        most: columns of one line; the others go below them (default: all beside each other).
-
-    Raises:
-        ValueError: no columns, or an empty one.
+    Raises: ValueError: no columns, or an empty one.
     """
     if not columns or any(len(frames) == 0 for frames in columns.values()):
         raise ValueError("a side-by-side video needs at least one column, and frames in every column")

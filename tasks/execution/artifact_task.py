@@ -67,8 +67,7 @@ class ArtifactTask:
             inputs: results of earlier calls, or folders. A mapping gives several: ``rollouts={"stage2": ...}`` is the
                 input ``rollouts.stage2``. None leaves an optional input out.
 
-        Raises:
-            ConfigError: an input is missing or unknown.
+        Raises: ConfigError: an input is missing or unknown.
         """
         flat: dict[str, TaskCall | Path] = {}
         for key, value in inputs.items():
@@ -84,8 +83,7 @@ class ArtifactTask:
     ) -> Artifact:
         """Do the work now, in this process, or find its finished artifact.
 
-        Args:
-            mapper: does the episodes of a task that maps them; by default this process.
+        ``mapper`` does the episodes of a task that maps them; by default this process.
         """
         self.check_inputs(inputs)
         options = {"mapper": mapper} if self.mapped else {}
@@ -115,11 +113,9 @@ class ArtifactTask:
         return store.key(self.name, self.version, config, dict(sorted(digests.items())))
 
     def load_function(self) -> Callable[..., dict[str, Any]]:
-        """The core function."""
         return load_object(self.function)
 
     def load_config(self) -> type[StrictModel]:
-        """The configuration's class."""
         return load_object(self.config)
 
     def check_inputs(self, names: Mapping[str, Any]) -> None:
@@ -147,7 +143,6 @@ class TaskCall:
 
     @property
     def upstream(self) -> list[TaskCall]:
-        """The calls whose results this one needs."""
         return [source for source in self.inputs.values() if isinstance(source, TaskCall)]
 
     @property

@@ -24,10 +24,7 @@ def outline[**P](chain: Callable[P, object], *arguments: P.args, **options: P.kw
 
 
 def load_chain() -> Callable[..., object]:
-    """The project's chain, a function of its configuration: the entry point ``chain`` of the group ``worldline``.
-
-    Tasks do not import flows; a task that runs alone asks the installed package for the chain that it belongs to.
-    """
+    """The project's chain: the entry point ``chain`` of the group ``worldline``, because tasks do not import flows."""
     (found,) = entry_points(group="worldline", name="chain")
     return found.load()
 

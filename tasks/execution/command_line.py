@@ -79,7 +79,7 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_task(task: ArtifactTask, arguments: argparse.Namespace) -> Artifact:
-    """Run one task with parsed arguments, on the finished artifacts of those before it in the chain.
+    """Run one task on the finished artifacts of those before it in the chain.
 
     Of a file that does not describe a whole run, and of a task that the chain does not call by this name, the task's own section is
     read; nothing is looked up then.
@@ -279,10 +279,7 @@ def _print_traceback(kind: type[BaseException], error: BaseException, trace: Tra
 
 
 class _StderrHandler(logging.StreamHandler[TextIO]):
-    """Prints a message unless Prefect, which gives the root logger a handler of its own when it is imported, prints it.
-
-    Either prints it, and Prefect stores it, without credentials and control characters.
-    """
+    """Prints a message, without credentials and control characters, unless the root logger's handler of Prefect prints it."""
 
     def handle(self, record: logging.LogRecord) -> bool:
         record.msg, record.args = shown(record.getMessage()), None

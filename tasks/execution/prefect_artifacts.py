@@ -33,8 +33,7 @@ STORE = Path("artifacts")
 def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
     """Run a flow; its result counts although Prefect's server ended before it could record it.
 
-    Raises:
-        UnavailableError: the server ended before the flow did.
+    Raises: UnavailableError: the server ended before the flow did.
     """
     done: list[R] = []
 

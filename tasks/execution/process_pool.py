@@ -22,9 +22,7 @@ class RankedPool:
 
     When work of rank r ends, its worker waits up to `_SUCCESSOR_SECONDS` for a successor of rank r - 1, unless something of that rank
     is waiting already.
-
-    Args:
-        rank: called in the thread that submits work; returns the rank of that work.
+    ``rank`` is called in the thread that submits work.
     """
 
     def __init__(self, executor: Executor, workers: int, rank: Callable[[], int]) -> None:
@@ -46,7 +44,6 @@ class RankedPool:
         return future
 
     def shutdown(self, *, wait: bool, cancel_futures: bool) -> None:
-        """Cancel all waiting work, then shut the executor down."""
         with self._changed:
             self._ended = True
             waiting, self._waiting = self._waiting, []
@@ -98,11 +95,7 @@ class RankedPool:
 
 
 def process_runner(workers: int, ranks: Mapping[str, int] | None = None) -> Any:
-    """Returns a task runner with this many processes.
-
-    Args:
-        ranks: rank of each task by the name of its run; among tasks that are ready, the highest starts first.
-    """
+    """A task runner; ``ranks``, by the name of a task's run: among tasks that are ready, the highest starts first."""
     from prefect import Task
     from prefect.task_runners import ProcessPoolTaskRunner
 

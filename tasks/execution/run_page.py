@@ -48,10 +48,7 @@ class RunPage:
     """Shows what is done, running and to come; written after every step and every ten seconds.
 
     A context: when it is left, the page leads to the finished report, or shows the error that ended the run.
-
-    Args:
-        calls: all calls of the run, in order.
-        at_once: how many of them run side by side.
+    ``at_once`` calls run side by side.
     """
 
     def __init__(self, artifacts: Path, calls: Mapping[str, TaskCall], at_once: int = 1) -> None:
@@ -84,7 +81,6 @@ class RunPage:
                 write_finished_page(self.folder, self._report)
 
     def finished(self, call: TaskCall, folder: Path, *, cached: bool) -> None:
-        """Note that a call has its artifact."""
         with self._change:
             began = self._running.pop(call.name, time.monotonic())
             seconds = 0.0 if cached else time.monotonic() - began

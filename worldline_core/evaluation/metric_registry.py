@@ -50,7 +50,6 @@ class Metric:
         return f"{self.title}{unit}\u00a0{'↓' if self.lower_is_better else '↑'}"
 
     def load(self) -> Callable[..., Any]:
-        """The function that computes a metric on request."""
         return getattr(importlib.import_module("worldline_core.evaluation.metrics"), f"{self.compute}")
 
 

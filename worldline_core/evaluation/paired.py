@@ -65,12 +65,9 @@ class PairedTest:
 
 
 def collect_metrics(inputs: Mapping[str, Path]) -> dict[str, Interval]:
-    """Intervals of finished evaluations by name, ``<what>/<where>/<method>/<metric>``: ``video/test/shipped_stage2/ssim@head``.
+    """Intervals of finished evaluations (folders by step name, a variant after a dot) by the names of their series.
 
     Whole splits and every number of candidates; embodiments and task families would only add false alarms.
-
-    Args:
-        inputs: folders by step name, a variant after a dot; other steps than evaluations are ignored.
     """
     found: dict[str, Interval] = {}
     for name, folder in sorted(inputs.items()):
@@ -97,10 +94,7 @@ def _intervals(step: str, summary: JsonObject) -> Iterator[tuple[str, Any]]:
 
 
 def read_scores(folder: Path, *, subgroups: bool = False) -> Series:
-    """The series of a finished evaluation, from its table of scores; seeds and views of a recording are averaged.
-
-    Args:
-        subgroups: embodiments and outcomes as well, as ``test|ur5e_pair``.
+    """The series of a finished evaluation; seeds and views of a recording are averaged. ``subgroups``: of embodiments and outcomes as well (``test|ur5e_pair``).
 
     Raises: ArtifactError where the folder has no table of scores, or a damaged one.
     """
@@ -201,11 +195,7 @@ def differences(present: Series, reference: Series) -> Series:
 
 
 def paired_tests(found: Series, *, least: int = LEAST_RECORDINGS) -> dict[str, PairedTest]:
-    """Tests all series of differences together; those of fewer than ``least`` recordings are left out.
-
-    Returns:
-        by series; the p values hold for all of them at once.
-    """
+    """Tests by series; p values hold for all of them at once. Those of fewer than ``least`` recordings are left out."""
     names = [name for name, values in sorted(found.items()) if len(values) >= least]
     if not names:
         return {}

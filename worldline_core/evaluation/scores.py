@@ -62,8 +62,7 @@ def bootstrap_mean(
     ``weights`` (n,) count how many trajectory-view pairs a value stands for, so that the mean equals the mean over
     pairs. One value alone has an interval of width zero.
 
-    Raises:
-        DataError: for no values, or values that are not finite.
+    Raises: DataError: for no values, or values that are not finite.
     """
     sample = np.asarray(values, dtype=np.float64)
     weight = np.ones_like(sample) if weights is None else np.asarray(weights, dtype=np.float64)

@@ -152,7 +152,7 @@ _PATIENCE = 3
 
 
 def open_vlm(kind: Literal["qwen3_vl", "openai"], config: VLMConfig) -> VisionLanguageModel:
-    """The vision-language model that the config names.
+    """The configured model.
 
     Raises:
         ConfigError: its weights or its address are not configured.
@@ -322,7 +322,6 @@ class Qwen3VLModel:
 
     @torch.inference_mode()
     def answer(self, parts: Sequence[Part]) -> str:
-        """Greedy text of at most MAX_NEW_TOKENS tokens."""
         kinds = {Text: "text", Image: "image", Video: "video"}
         content = [{"type": kinds[type(p)]} | ({"text": p.text} if isinstance(p, Text) else {}) for p in parts]
         images = [rearrange(torch.from_numpy(p.pixels.copy()), "h w c -> c h w") for p in parts if isinstance(p, Image)]

@@ -41,8 +41,7 @@ def variant_config(load: LoadConfig, variant: Variant, seed: int | None = None) 
     Args:
         seed: of its trainings; None: as configured.
 
-    Raises:
-        ConfigError: the run has no rollout of its Stage II model, or no base model.
+    Raises: ConfigError: the run has no rollout of its Stage II model, or no base model.
     """
     full = _with_row(load([]))
     changes = [change for change in variant.changes if _can_change(full, change)]

@@ -45,8 +45,7 @@ UTILISATION = 0.35
 def find_card(name: str) -> str:
     """A card's name as `CARDS` has it: "4090" and "rtx4090" are RTX 4090.
 
-    Raises:
-        ConfigError: no card, or several, have this name.
+    Raises: ConfigError: no card, or several, have this name.
     """
     wanted = _letters(name)
     found = [card for card in CARDS if _letters(card) == wanted]

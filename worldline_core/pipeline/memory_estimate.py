@@ -133,7 +133,6 @@ class Estimate:
         return sum(self.parts.values())
 
     def fits(self, memory: float) -> bool:
-        """Returns whether a device of so many bytes holds it."""
         return self.total <= USABLE * memory
 
     def describe_parts(self) -> str:
@@ -319,8 +318,7 @@ def _distillation(part: str, size: int, config: DistillConfig, source: Sources, 
 def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
     """Refuse a training that this process's card cannot hold, before anything is loaded.
 
-    Raises:
-        ConfigError: its parts in GB, and the setting that would fit.
+    Raises: ConfigError: its parts in GB, and the setting that would fit.
     """
     if not isinstance(config, AnyStage):
         return

@@ -335,8 +335,7 @@ _OUTSIDE = {
 def check_weights(config: PipelineConfig, project: Path) -> None:
     """Refuse a run that would end for want of weights, before its first step: some of them are opened days later.
 
-    Raises:
-        UnavailableError: a folder that the configuration names is not there, or empty; the message lists all of them.
+    Raises: UnavailableError: a folder that the configuration names is not there, or empty; the message lists all of them.
     """
     missing: list[str] = []
     advice: list[str] = []

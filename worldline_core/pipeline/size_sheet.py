@@ -43,7 +43,6 @@ class SizeSheet(StrictModel):
 
     @property
     def bytes(self) -> float:
-        """Memory of a device."""
         if self.memory is not None:
             return self.memory
         if self.card is None:
@@ -86,7 +85,6 @@ class SizeSheet(StrictModel):
         return [training for stage, model in stages for training in trainings(stage, model, self.source(stage))]
 
     def row(self, number: int) -> Estimate:
-        """One line of the sheet."""
         return self._trainings()[number].estimate(self.devices)
 
     def _finished(self, pool: Executor) -> Iterator[tuple[int, Estimate]]:

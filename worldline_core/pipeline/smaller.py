@@ -50,11 +50,7 @@ def largest_fitting(
 ) -> list[str]:
     """Changes of the first of `smaller_settings` that fits; memory falls from each to the next.
 
-    Args:
-        load: the configuration with changes.
-
-    Raises:
-        ConfigError: not even the smallest fits.
+    Raises: ConfigError: not even the smallest fits.
     """
     settings = smaller_settings(load(()))
     rest = range(1, len(settings))

@@ -57,13 +57,9 @@ class Variant(StrictModel):
 
 
 def load_variants(file: Path = VARIANTS_FILE) -> dict[str, Variant]:
-    """Variants by name, the full model first.
+    """Variants by name, the full model first; those of the paper, or of a file of others.
 
-    Args:
-        file: other variants than the paper's.
-
-    Raises:
-        ConfigError: a variant has unknown fields, or the full model is not the first one.
+    Raises: ConfigError: a variant has unknown fields, or the full model is not the first one.
     """
     variants = {name: validate(Variant, values, where=file) for name, values in read_yaml(file).items()}
     if next(iter(variants), None) != FULL:
@@ -108,8 +104,7 @@ type _Measured = tuple[dict[str, dict[str, float]], dict[str, str]]
 def ablation_table(config: AblationTableConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Put the evaluations ``evaluate_video.<variant>.<seed>`` and ``evaluate_planning.<variant>.<seed>`` into one table.
 
-    Raises:
-        ArtifactError: a variant has no video evaluation, or none of the method; an evaluation is of no variant.
+    Raises: ArtifactError: a variant has no video evaluation, or none of the method; an evaluation is of no variant.
     """
     named = {name.partition(".")[2] for name in inputs}
     wanted = [f"{name}.{seed}" for name in config.variants for seed in config.seeds]

@@ -120,9 +120,7 @@ def compare_runs(
         methods: compare this method of the first run with that one of the second.
         metrics: only these (``ssim@head``); none means all.
 
-    Raises:
-        ArtifactError: a run has no scores.
-        ConfigError: the runs share no recording, method and metric.
+    Raises: ConfigError: the runs share no recording, method and metric. ArtifactError: as `read_run`.
     """
     runs = read_run(first), read_run(second)
     named = [sorted({name.split("/")[2] for name in run}) for run in runs]
@@ -298,8 +296,7 @@ def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -
             same name are the same night, measured again.
         inputs: finished evaluations by step name.
 
-    Raises:
-        ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
+    Raises: ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
     """
     metrics = collect_metrics(inputs)
     if not metrics:
@@ -338,8 +335,7 @@ def _compare(present: Night, earlier: Sequence[Night], history: Path) -> Nightly
 def accept_night(history: Path, night: str) -> None:
     """Mark a night as good: later ones are compared with it.
 
-    Raises:
-        ArtifactError: there is no such night, or the history is damaged.
+    Raises: ArtifactError: there is no such night, or the history is damaged.
     """
     with exclusive_lock(history / ".lock"):
         nights = read_history(history)
@@ -365,8 +361,7 @@ def _write_history(history: Path, nights: Sequence[Night]) -> None:
 def read_history(history: Path) -> list[Night]:
     """The nights of a history folder, oldest first; no file means no nights.
 
-    Raises:
-        ArtifactError: a line is not a night.
+    Raises: ArtifactError: a line is not a night.
     """
     path = history / HISTORY_FILE
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
@@ -384,15 +379,7 @@ def read_history(history: Path) -> list[Night]:
 
 
 def compare_with_history(scores: Mapping[str, Path], history: Path, night: str | None = None) -> NightlyComparison:
-    """Record a night, and write `comparison.json` and its page into the history's folder.
-
-    Args:
-        scores: finished evaluations by step name.
-        night: its name, as in `record_night`.
-
-    Raises:
-        ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
-    """
+    """`record_night`, and write `comparison.json` and the page of the nights into the history's folder."""
     compared = record_night(history, night, scores)
     changes = [asdict(change) | {"verdict": change.verdict} for change in compared.changes]
     content = asdict(compared) | {"changes": changes, "regressions": compared.regressions}

@@ -142,7 +142,6 @@ class VideoScores:
 
     @cached_property
     def series(self) -> Series:
-        """Values by recording."""
         return {} if self.folder is None else read_scores(self.folder)
 
     @cached_property
@@ -175,7 +174,6 @@ class VideoScores:
         return [METRICS[name] for name in HEADLINES if self.value(group, method, f"{name}@head")]
 
     def headline(self, group: str, method: str) -> Metric | None:
-        """The first of them."""
         return next(iter(self.headlines(group, method)), None)
 
     def primary(self, group: str) -> Method | None:
@@ -227,7 +225,6 @@ class ReportContext:
 
     @cached_property
     def rollouts(self) -> dict[str, RolloutSet]:
-        """Predicted videos by method."""
         folders = {name.partition("."): path for name, path in sorted(self.inputs.items())}
         return {method: RolloutSet.open(path) for (step, _, method), path in folders.items() if step == "rollout"}
 

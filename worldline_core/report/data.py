@@ -241,11 +241,7 @@ def sheet_rows(episodes: EpisodeSet, positions: Iterable[int]) -> tuple[list[She
 
 
 def write_card(folder: Path, output: Path, title: str | None = None) -> Path:
-    """Write the card of a finished EpisodeSet; equal sets give equal bytes.
-
-    Args:
-        output: gets README.md.
-        title: default: "EpisodeSet" and the folder's name.
+    """Write the card of a finished EpisodeSet as ``output/README.md``; equal sets give equal bytes.
 
     Raises: DataError when the folder is no EpisodeSet; ArtifactError when it is damaged.
     """

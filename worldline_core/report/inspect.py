@@ -127,7 +127,6 @@ class _Page:
         write_bytes_atomic(self.written[-1], jpeg_bytes(picture))
 
     def write(self, kind: str, linked: Path | None, episode_id: str | None) -> None:
-        """Write everything that the page shows."""
         own = dict.fromkeys(str(row["episode_id"]) for row in read_rows(self.folder / "index.parquet"))
         if kind == "EpisodeSet" and (self.folder / FINDINGS_FILE).is_file():
             if linked is None:

@@ -62,8 +62,7 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
     Inputs: any finished artifacts by the name of their step (`curate`, `rollout.<method>`, `evaluate_video`, ...); a page whose
     artifacts are missing says so.
 
-    Raises:
-        WorldLineError: an artifact cannot be read.
+    Raises: WorldLineError: an artifact cannot be read.
     """
     # Remains of an earlier, killed call may not enter the digest.
     shutil.rmtree(output / "media", ignore_errors=True)

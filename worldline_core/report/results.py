@@ -420,8 +420,7 @@ def measurements(model: Path, evaluations: Iterable[Path]) -> Sequence[Measureme
     Args:
         evaluations: finished ones; a later one counts where two measured the same.
 
-    Raises:
-        ArtifactError: an evaluation is damaged.
+    Raises: ArtifactError: an evaluation is damaged.
     """
     digest, found = read_manifest(model).get("digest"), dict[tuple[str, str], Measurement]()
     for folder in evaluations:

@@ -51,7 +51,6 @@ class CandidateVideo:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the pictures alone."""
         digest = hashlib.sha256()
         for view, frames in sorted(self.frames.items()):
             digest.update(view.encode())
@@ -111,7 +110,6 @@ class ScoringSelector:
         return tuple(ranked[:select_count]), True
 
     def score(self, instruction: str, candidate: CandidateVideo) -> tuple[float, bool]:
-        """0..100."""
         key = (instruction, candidate.digest)
         if key not in self._scores:
             self._scores[key] = round(100.0 * self.likelihood(instruction, candidate), 3)
@@ -202,11 +200,7 @@ def choose(
     scene: str,
     seed: int,
 ) -> Choice:
-    """Choose one of ``candidates`` (numbers in the bank, each once).
-
-    Args:
-        load: returns a candidate's video.
-        scene: names the scene and the run; with ``seed`` it decides the order of showing.
+    """Choose one of ``candidates`` (numbers in the bank, each once); ``scene`` (and run) and ``seed`` decide the order of showing.
 
     Raises: DataError for no candidates or a number that occurs twice.
     """

@@ -87,8 +87,7 @@ class ClosedLoopPlanner:
         seed: of the proposals, and of the model's noise, which all candidates share.
         limits: as of ``WorldLine.start``.
 
-    Raises:
-        ConfigError: there is no such embodiment, or a number is not positive.
+    Raises: ConfigError: there is no such embodiment, or a number is not positive.
     """
 
     def __init__(

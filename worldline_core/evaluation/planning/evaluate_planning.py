@@ -316,7 +316,6 @@ def write_results(
         return asdict(bootstrap_mean(list(values), resamples=config.resamples, seed=config.seed))
 
     def result(budget: int, own: Mapping[str, float]) -> dict[str, Any]:
-        """Success and gains of a method's choices by bank."""
         best = max(rules, key=lambda name: np.mean([rules[name][budget][bank] for bank in own]))
         over = interval(value - rules[best][budget][bank] for bank, value in own.items())
         gain = interval(value - direct[bank] for bank, value in own.items())

@@ -343,8 +343,7 @@ def policy_agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed:
         {method: {task: {"policies": {name: {"recorded", "predicted", "attempts"}}, statistic: {"value",
         "over_starts_and_policies": [low, high]}}}}; tasks are "all" and each.
 
-    Raises:
-        DataError: fewer than three policies.
+    Raises: DataError: fewer than three policies.
     """
     require_policies({row["policy"] for row in rows})
     found: dict[str, dict[str, Any]] = defaultdict(dict)

@@ -192,7 +192,6 @@ class _Block(nn.Module):
         nn.init.zeros_(self.second.weight)
 
     def forward(self, features: Tensor, condition: Tensor) -> Tensor:
-        """Features of half the size."""
         features = functional.silu(self.norm(self.down(features)))
         scale, shift = self.modulation(condition)[..., None, None].chunk(2, dim=1)
         inner = functional.silu(self.first(features) * (1 + scale) + shift)
@@ -200,8 +199,6 @@ class _Block(nn.Module):
 
 
 class _Described(BaseModel):
-    """A judge's description."""
-
     widths: tuple[Annotated[int, Field(ge=_GROUPS, le=1 << 12, multiple_of=_GROUPS)], ...] = Field(
         min_length=1, max_length=8
     )
@@ -325,7 +322,6 @@ class OutcomeObjective(Objective[OutcomeBatch]):
         self.losses = [math.log(2)] * tasks
 
     def loss(self, batch: OutcomeBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Loss of one batch."""
         del generator, step
         logits = self.network(batch.pictures, batch.shown, batch.words).float()
         losses = functional.binary_cross_entropy_with_logits(logits, batch.success, reduction="none")
@@ -334,11 +330,9 @@ class OutcomeObjective(Objective[OutcomeBatch]):
         return losses.mean(), {}
 
     def state(self) -> dict[str, Any]:
-        """Losses by task."""
         return {"losses": self.losses}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Continue with saved losses."""
         self.losses = state["losses"]
 
 

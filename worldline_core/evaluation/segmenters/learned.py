@@ -103,8 +103,6 @@ def _double_convolution(cin: int, cout: int) -> nn.Sequential:
 
 
 class _Described(BaseModel):
-    """Fields of a description that the network needs."""
-
     widths: tuple[Annotated[int, Field(ge=_GROUPS, le=1 << 16, multiple_of=_GROUPS)], ...] = Field(
         min_length=1, max_length=16
     )
@@ -142,7 +140,6 @@ class LearnedSegmenter:
         return np.concatenate(masks) if masks else np.zeros(video.shape[:3], dtype=bool)
 
     def stream(self) -> Callable[[np.ndarray, np.ndarray | None], np.ndarray]:
-        """Every frame is masked by itself."""
         return self.segment
 
     @classmethod
@@ -191,7 +188,6 @@ class MaskObjective(Objective[MaskBatch]):
         self.network = network
 
     def loss(self, batch: MaskBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Loss of one batch."""
         del generator, step
         logits = self.network(batch.frames.contiguous(memory_format=torch.channels_last)).float()
         probability = logits.sigmoid()

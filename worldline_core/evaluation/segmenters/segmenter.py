@@ -197,7 +197,6 @@ class ColourSegmenter:
         return self.stream()(video, points)
 
     def stream(self) -> MaskStream:
-        """Uses the points of the first frame alone."""
         following: _Following | None = None
 
         def masks_of(video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
@@ -223,7 +222,6 @@ class _Following:
         self._colours = np.zeros(0)
 
     def mask(self, frame: np.ndarray) -> np.ndarray:
-        """Bool (h, w) of the next frame."""
         mask = np.zeros(frame.shape[:2], dtype=bool)
         if len(self._start) == 0:
             return mask
