@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -34,16 +33,6 @@ MOST_FACTS = 6
 PICTURES = ("previews/*.png", "previews/*.jpg", "media/*.jpg")
 
 
-@dataclass(frozen=True)
-class FinishedStep:
-    """A finished step of the plan: its name, its artifact, and the seconds that it took in this run (0 when cached)."""
-
-    name: str
-    folder: Path
-    seconds: float
-    cached: bool = False
-
-
 class RunPage:
     """Shows what is done, running and to come; written after every step and every ten seconds.
 
@@ -56,7 +45,7 @@ class RunPage:
         self._calls = calls
         self._at_once = at_once
         self._running: dict[str, float] = {}
-        self._done: dict[str, FinishedStep] = {}
+        self._done: dict[str, dict[str, Any]] = {}
         self._report: Path | None = None
         self._writable = True
         self._began = time.monotonic()
@@ -82,9 +71,8 @@ class RunPage:
 
     def finished(self, call: TaskCall, folder: Path, *, cached: bool) -> None:
         with self._change:
-            began = self._running.pop(call.name, time.monotonic())
-            seconds = 0.0 if cached else time.monotonic() - began
-            self._done[call.name] = FinishedStep(call.name, folder, seconds, cached)
+            seconds = time.monotonic() - self._running.pop(call.name, time.monotonic())
+            self._done[call.name] = finished_step(self.folder, call.name, folder, None if cached else seconds)
             if call.task.name == "report":
                 self._report = folder
             self._start_ready()
@@ -123,7 +111,7 @@ class RunPage:
 
 def write_progress_page(
     folder: Path,
-    done: Sequence[FinishedStep],
+    done: Sequence[Mapping[str, Any]],
     running: Sequence[str],
     to_come: Sequence[str],
     elapsed: float,
@@ -132,11 +120,12 @@ def write_progress_page(
     """Write `folder/index.html` (`artifacts/report/latest`).
 
     Args:
+        done: steps as `finished_step` describes them.
         elapsed: seconds since the run began.
         failed: the error that ended the run; the page then shows it and no longer reloads.
     """
     page = render(
-        "report/progress.html", title="WorldLine: this run", done=[_shown(folder, step) for step in done],
+        "report/progress.html", title="WorldLine: this run", done=done,
         running=list(running), to_come=list(to_come), elapsed=elapsed, failed=failed,
         reload=0 if failed else RELOAD_SECONDS,
     )  # fmt: skip
@@ -152,18 +141,19 @@ def write_finished_page(folder: Path, report: Path) -> Path:
     return folder / "index.html"
 
 
-def _shown(folder: Path, step: FinishedStep) -> dict[str, Any]:
-    pictures = [path for pattern in PICTURES for path in sorted(step.folder.glob(pattern))]
-    metrics = read_json(step.folder / "manifest.json").get("metrics") or {}
+def finished_step(folder: Path, name: str, artifact: Path, seconds: float | None) -> dict[str, Any]:
+    """What the page in ``folder`` shows of a finished step, which took ``seconds``; None where it was found in the store."""
+    pictures = [path for pattern in PICTURES for path in sorted(artifact.glob(pattern))]
+    metrics = read_json(artifact / "manifest.json").get("metrics") or {}
     numbers = [
-        f"{name.replace('_', ' ')} {number(value, 3)}"
-        for name, value in metrics.items()
+        f"{metric.replace('_', ' ')} {number(value, 3)}"
+        for metric, value in metrics.items()
         if isinstance(value, (int, float)) and not isinstance(value, bool)
     ]
     return {
-        "name": step.name,
-        "time": "found in the store" if step.cached else duration(step.seconds),
-        "folder": _address(folder, step.folder),
+        "name": name,
+        "time": "found in the store" if seconds is None else duration(seconds),
+        "folder": _address(folder, artifact),
         "facts": " · ".join(numbers[:MOST_FACTS]),
         "picture": _address(folder, pictures[0]) if pictures else None,
     }

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tasks.execution.run_page import FinishedStep, write_finished_page, write_progress_page
+from tasks.execution.run_page import finished_step, write_finished_page, write_progress_page
 from worldline_core.report.context import ReportConfig, ReportContext, VideoScores, in_order, method, share_interval
 from worldline_core.report.report import Figure, first_page, head_views, headline, planning_figure, video_figure
 from worldline_core.report.results import best_median_worst, choose_episodes
@@ -157,8 +157,9 @@ def test_the_page_says_what_is_done_running_and_coming(tmp_path: Path, hostile_t
     tracks = artifact(tmp_path, "render_actions", "k2", 7.0)
     (tracks / "previews").mkdir()
     (tracks / "previews" / "a b.png").write_bytes(b"png")
-    done = [FinishedStep("curate", curate, 21.6), FinishedStep("render_actions", tracks, 0.0, cached=True)]
     latest = tmp_path / "report" / "latest"
+    steps = (("curate", curate, 21.6), ("render_actions", tracks, None))
+    done = [finished_step(latest, *step) for step in steps]
     page = write_progress_page(latest, done, ["train_stage1"], ["distill", hostile_text], 30.0)
     text = page.read_text()
     assert page == latest / "index.html"
