@@ -11,8 +11,7 @@ from pydantic import Field, field_validator, model_validator
 
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.episode import VIEWS
-from worldline_core.errors import ConfigError
-from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, requested
+from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST
 from worldline_core.processor import processor_has_bfloat16
 from worldline_core.training.training_config import OptimizerConfig, TrainerConfig
 from worldline_core.untrusted_text import carries_credentials
@@ -135,10 +134,8 @@ class VideoEvaluationConfig(StrictModel):
     @field_validator("metrics")
     @classmethod
     def _known(cls, metrics: tuple[str, ...]) -> tuple[str, ...]:
-        try:
-            requested(metrics)
-        except ConfigError as error:
-            raise ValueError(str(error)) from error
+        if not {*metrics} <= {*ON_REQUEST} or len({*metrics}) != len(metrics):
+            raise ValueError(f"No metrics on request: expected some of {', '.join(ON_REQUEST)}, each once")
         return metrics
 
     def of_methods(self, methods: Collection[str]) -> Self:

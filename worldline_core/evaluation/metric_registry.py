@@ -11,8 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from worldline_core.errors import ConfigError
-
 Needs = Literal["tool_paths", "frames", "changed_controls"]
 """Arguments of a metric on request (`compute`):
 
@@ -96,14 +94,3 @@ ON_REQUEST = tuple(metric.name for metric in _METRICS if metric.needs)
 def metric_of(name: str) -> Metric | None:
     """The entry behind a name of a table: ``robot_iou[colour]@head`` is of ``robot_iou``; None for what is no video metric."""
     return METRICS.get(name.partition("@")[0].partition("[")[0])
-
-
-def requested(names: tuple[str, ...]) -> dict[str, Metric]:
-    """The entries of metrics that are asked for.
-
-    Raises: ConfigError for a name that is no metric on request.
-    """
-    unknown = [name for name in names if name not in ON_REQUEST]
-    if unknown or len(set(names)) != len(names):
-        raise ConfigError("No metrics on request", expected=f"some of {', '.join(ON_REQUEST)}, each once", got=names)
-    return {name: METRICS[name] for name in names}

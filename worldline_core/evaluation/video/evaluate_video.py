@@ -1,9 +1,7 @@
 """The step evaluate_video: full-frame metrics and robot-mask IoU of predicted videos.
 
-``robot_iou`` follows the paper: one segmenter masks the true and the predicted video independently of each other. ``robot_iou_exact``
-compares the predicted video's mask with the recording's exact one; the method ``true`` shows how good the segmenter itself is, against
-exact masks or kinematic ones. Where it does not know a robot, ``robot_iou`` is withheld with the reason. Means
-over trajectories of every frame show drift along a rollout. `metric_registry` lists every metric.
+The method ``true`` shows how good a segmenter itself is, against exact masks or kinematic ones; where it does not know a robot, ``robot_iou``
+is withheld with the reason. Means over trajectories of every frame show drift along a rollout. `metric_registry` lists every metric.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
-from worldline_core.evaluation.metric_registry import METRICS, requested
+from worldline_core.evaluation.metric_registry import METRICS
 from worldline_core.evaluation.metrics import ControlledPair
 from worldline_core.evaluation.recordings import HEAD, open_rollouts, open_tracks, rows_of, stride_of, tool_points
 from worldline_core.evaluation.scores import (
@@ -70,7 +68,7 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
         f"[{name}]" if place else "": open_segmenter(name, learned=inputs.get("segmenter"), sam3=config.sam3_weights)
         for place, name in enumerate(config.segmenters if tracks else ())
     }
-    metrics = requested(config.metrics)
+    metrics = {name: METRICS[name] for name in config.metrics}
     check_changed_controls(config, list(rollouts))
     unavailable: dict[str, str] = {}
     try:
@@ -262,7 +260,7 @@ def controlled_values(
 
     Raises: DataError when both were not predicted at one rate.
     """
-    metrics = {name: m for name, m in requested(config.metrics).items() if m.needs == "changed_controls"}
+    metrics = {name: METRICS[name] for name in config.metrics if METRICS[name].needs == "changed_controls"}
     tools: dict[tuple[str, str], dict[int, np.ndarray]] = {}
     for method, row, content in records:
         found = {
