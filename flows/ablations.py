@@ -12,9 +12,9 @@ from flows.pipeline import evaluate, predict, prepare, prepare_models, train
 from tasks.ablation_table import ablation_table
 from tasks.execution.artifact_task import Inputs, variant
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
-from worldline_core.pipeline.ablations import FULL, METHOD, LoadConfig, choose_variants, variant_config
+from worldline_core.pipeline.ablations import METHOD, LoadConfig, choose_variants, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.report.ablation_table import AblationTableConfig, Variant
+from worldline_core.report.ablation_table import FULL, AblationTableConfig, Variant
 
 
 @flow(name="ablations")

@@ -54,19 +54,10 @@ def train_in_processes(
             call.task.run(store, call.config, ready_inputs(call, calls, store))
             continue
         launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
-        command = [
-            *launcher,
-            "-m",
-            f"tasks.{call.task.name}",
-            *chosen,
-            "--artifacts",
-            str(store.root),
-            "--name",
-            call.name,
-        ]
+        step = ["-m", f"tasks.{call.task.name}", *chosen, "--artifacts", str(store.root), "--name", call.name]
         code = [str(Path(str(package.__file__)).parents[1]) for package in (tasks, worldline_core)]
         search = os.pathsep.join([*code, *filter(None, [os.environ.get("PYTHONPATH")])])
-        ended = subprocess.run(command, env={**os.environ, "PYTHONPATH": search}, check=False)  # noqa: S603
+        ended = subprocess.run([*launcher, *step], env={**os.environ, "PYTHONPATH": search}, check=False)  # noqa: S603
         if ended.returncode:
             raise TrainingError(
                 "A training ended with an error", where=call.name, got=f"exit status {ended.returncode}; see above"

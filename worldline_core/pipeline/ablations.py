@@ -13,12 +13,12 @@ from typing import cast
 from worldline_core.config import validate
 from worldline_core.errors import ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun
-from worldline_core.report.ablation_table import VARIANTS_FILE, Variant, load_variants
+from worldline_core.report.ablation_table import FULL, VARIANTS_FILE, Variant, load_variants
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.training.clip_config import view_subsets
 from worldline_core.training.training_config import StageConfig
 
-FULL, METHOD = "full", "stage2"
+METHOD = "stage2"
 
 type LoadConfig = Callable[[Sequence[str]], PipelineConfig]
 """Loads the run's configuration with some more ``a.b=value`` overrides."""

@@ -58,16 +58,18 @@ class CandidateVideo:
         return digest.hexdigest()
 
 
+Candidates = Mapping[str, CandidateVideo]
+"""By letter."""
+
+
 class Selector(Protocol):
     """Ranks candidates of one scene; every answer comes with whether it could be read."""
 
     @property
     def name(self) -> str: ...
 
-    def compare(
-        self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
-    ) -> tuple[Letters, bool]:
-        """P1: letters of the ``select_count`` candidates (by letter) most likely to complete the task."""
+    def compare(self, instruction: str, candidates: Candidates, select_count: int) -> tuple[Letters, bool]:
+        """P1: letters of the ``select_count`` candidates most likely to complete the task."""
         ...
 
     def score(self, instruction: str, candidate: CandidateVideo) -> tuple[float, bool]:
@@ -102,9 +104,7 @@ class ScoringSelector:
         # Smaller budgets show the same videos again.
         self._scores: dict[tuple[str, str], float] = {}
 
-    def compare(
-        self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
-    ) -> tuple[Letters, bool]:
+    def compare(self, instruction: str, candidates: Candidates, select_count: int) -> tuple[Letters, bool]:
         """The highest scores; of equals, those shown first."""
         ranked = sorted(candidates, key=lambda letter: -self.score(instruction, candidates[letter])[0])
         return tuple(ranked[:select_count]), True
@@ -156,9 +156,7 @@ class VLMSelector:
         self.model = model
         self.name = model.name
 
-    def compare(
-        self, instruction: str, candidates: Mapping[str, CandidateVideo], select_count: int
-    ) -> tuple[Letters, bool]:
+    def compare(self, instruction: str, candidates: Candidates, select_count: int) -> tuple[Letters, bool]:
         """P1. A malformed answer has no labels."""
         parts: list[Part] = [Text(f"Task instruction: {instruction}")]
         for letter, candidate in candidates.items():

@@ -1,13 +1,11 @@
 """Judging one video: a judge states evidence, rules decide, and unsuccessful verdicts are verified.
 
-Evidence schemas: prompts P3..P5 of the paper. A fact is true, false, or null (hidden in every view); an answer that cannot be parsed
-becomes evidence in which every fact is null, and is counted. Router and rules: appendix "Evidence-based trajectory evaluation". The
-paper does not print its router; this one goes by the verbs. A null is never taken for the favourable value, and a wrong object or a
-drop fails.
+Evidence schemas: prompts P3..P5 of the paper. A fact is true, false, or null (hidden in every view, or in an answer that cannot be parsed,
+which is counted). Router and rules: appendix "Evidence-based trajectory evaluation"; the paper does not print its router, this one goes
+by the verbs. A null is never taken for the favourable value, and a wrong object or a drop fails.
 
-Sampled frames: appendix "Observation sampling". A success of the first pass stands. Otherwise (appendix "Verification of unsuccessful
-predictions"): six late groups at higher resolution where there are several views; logical reconciliation for state changes; a
-twelve-frame motion check for lifts and state changes.
+Sampled frames: appendix "Observation sampling". Passes after a first one without success: appendix "Verification of unsuccessful
+predictions".
 """
 
 from __future__ import annotations
@@ -190,16 +188,6 @@ def first_pass_indices(num_frames: int) -> tuple[int, ...]:
     return frames_at(np.sqrt(np.linspace(0.0, 1.0, FIRST_PASS_COUNT)), num_frames)
 
 
-def verification_indices(num_frames: int) -> tuple[int, ...]:
-    """Six late groups, inspected at higher resolution."""
-    return frames_at(VERIFICATION_POSITIONS, num_frames)
-
-
-def motion_indices(num_frames: int) -> tuple[int, ...]:
-    """Frames spread evenly over the whole video."""
-    return frames_at(np.linspace(0.0, 1.0, MOTION_COUNT), num_frames)
-
-
 def frames_at(positions: np.ndarray | tuple[float, ...], num_frames: int) -> tuple[int, ...]:
     """Nearest frames of normalised positions, in order; a frame that two positions share is shown once."""
     return tuple(sorted({round(float(position) * (num_frames - 1)) for position in positions}))
@@ -258,7 +246,7 @@ def judge_trajectory(judge: Judge, trajectory: Trajectory) -> Judgement:
     selected: Evidence = first
     verification = ""
     if len(trajectory.frames) > 1:
-        indices = verification_indices(count)
+        indices = frames_at(VERIFICATION_POSITIONS, count)
         second = take("verification", judge.extract(trajectory, family, indices, VERIFICATION_HEIGHT_PX))
         verification = second.observations
         if establishes_success(second):
@@ -272,7 +260,8 @@ def judge_trajectory(judge: Judge, trajectory: Trajectory) -> Judgement:
             return done(True)
 
     if family in ("lift", "state_change"):
-        answer = judge.inspect_motion(trajectory, motion_indices(count), selected.observations)
+        indices = frames_at(np.linspace(0.0, 1.0, MOTION_COUNT), count)
+        answer = judge.inspect_motion(trajectory, indices, selected.observations)
         return done(overturns(take("motion", answer).task_effect_completed, selected))
     return done(False)
 

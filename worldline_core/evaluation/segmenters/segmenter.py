@@ -80,12 +80,9 @@ def open_segmenter(name: SegmenterName, *, learned: Path | None, sam3: Path | No
 
 
 class Sam3Segmenter:
-    """Each arm is one tracked object, prompted by one point; the robot's mask is their union.
+    """Each arm is one tracked object of a Sam3TrackerVideoModel (transformers), prompted by one point; the robot's mask is their union.
 
     Frames and session state stay on the CPU: long videos otherwise fill the accelerator's memory.
-
-    Args:
-        model, processor: a Sam3TrackerVideoModel and its Sam3TrackerVideoProcessor (transformers).
     """
 
     name = "sam3"
@@ -148,11 +145,8 @@ class Sam3Segmenter:
     def _started(self, video: np.ndarray, points: np.ndarray | None) -> Any:
         """A session with these first frames, one object a valid point of the first one; None without any."""
         height, width = video.shape[1:3]
-        start = np.zeros((0, 2)) if points is None or len(video) == 0 else points[0]
-        # Comparisons with NaN are False, so points that are not valid drop out as well.
-        inside = np.logical_and(start >= 0, start < np.array([width, height]))
-        start = start[np.all(inside, axis=-1)]
-        if len(start) == 0:
+        start = _inside(points, (height, width))
+        if len(video) == 0 or len(start) == 0:
             return None
         session = self.processor.init_video_session(
             video=list(video), inference_device=self.device, inference_state_device="cpu", processing_device="cpu",
@@ -178,6 +172,12 @@ class Sam3Segmenter:
         return objects.numpy().astype(bool).any(axis=(0, 1))
 
 
+def _inside(points: np.ndarray | None, size: Sequence[int]) -> np.ndarray:
+    """Points (p, 2) of the first frame that are in the picture; comparisons with NaN are False."""
+    start = np.zeros((0, 2)) if points is None or len(points) == 0 else points[0]
+    return start[((start >= 0) & (start < np.array(size[::-1]))).all(axis=-1)]
+
+
 SEED_FRACTION = 0.10  # the robot is surely within this distance of a point, of the frame height
 TABLE_DISTANCE = 28.0  # from the frame's median colour, in 8-bit Lab units: farther is no table
 REACH_FRACTION = 1.0  # the robot is looked for within this distance of a point, of the frame height
@@ -197,38 +197,34 @@ class ColourSegmenter:
         return self.stream()(video, points)
 
     def stream(self) -> MaskStream:
-        following: _Following | None = None
-
-        def masks_of(video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
-            nonlocal following
-            if len(video) == 0:
-                return np.zeros(video.shape[:3], dtype=bool)
-            if following is None:
-                following = _Following(video[0], points)
-            return np.stack([following.mask(frame) for frame in video])
-
-        return masks_of
+        return _Following().masks
 
 
 class _Following:
     """One video: colour models of its first frame, and the mask of the frame before."""
 
-    def __init__(self, first: np.ndarray, points: np.ndarray | None) -> None:
+    def __init__(self) -> None:
         self._previous: np.ndarray | None = None
         self._foreground, self._background = np.zeros((1, 65)), np.zeros((1, 65))
-        start = np.zeros((0, 2)) if points is None else points[0][np.isfinite(points[0]).all(axis=-1)]
-        height, width = first.shape[:2]
-        self._start = start[(start >= 0).all(axis=-1) & (start[:, 0] < width) & (start[:, 1] < height)]
+        self._start: np.ndarray | None = None
         self._colours = np.zeros(0)
 
-    def mask(self, frame: np.ndarray) -> np.ndarray:
+    def masks(self, video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
+        if self._start is None and len(video):
+            self._start = _inside(points, video.shape[1:3])
+        masks = np.zeros(video.shape[:3], dtype=bool)
+        for frame, mask in zip(video, masks, strict=True):
+            mask[:] = self._mask(frame, self._start)
+        return masks
+
+    def _mask(self, frame: np.ndarray, start: np.ndarray | None) -> np.ndarray:
         mask = np.zeros(frame.shape[:2], dtype=bool)
-        if len(self._start) == 0:
+        if start is None or len(start) == 0:
             return mask
         lab, begins = cv2.cvtColor(frame, cv2.COLOR_RGB2LAB), self._previous is None
         if self._previous is None:
             cv2.setRNGSeed(0)  # GrabCut starts its colour models by k-means
-            labels = self._first_labels(lab, self._start)
+            labels = self._first_labels(lab, start)
             self._colours = colour_ratio(lab, _robot(labels))
         else:
             labels = self._carried_labels(self._previous, robot_likely(lab, self._colours))
