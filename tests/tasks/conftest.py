@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import errno
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import pytest
 
@@ -30,12 +30,8 @@ def write(config: WriteConfig, inputs: Mapping[str, Path], output: Path) -> dict
     return {"written": len(before) + 1}
 
 
-class Declare(Protocol):
-    def __call__(self, name: str, *inputs: str, function: Any = write) -> ArtifactTask: ...
-
-
 @pytest.fixture
-def declare(monkeypatch: pytest.MonkeyPatch) -> Declare:
+def declare(monkeypatch: pytest.MonkeyPatch) -> Callable[..., ArtifactTask]:
     """Declares a task of a name, as its file in `tasks` would. Its config is a text."""
 
     def make(name: str, *inputs: str, function: Any = write) -> ArtifactTask:
