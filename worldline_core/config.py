@@ -328,16 +328,13 @@ def load_config[Model: BaseModel](
 ) -> Model:
     """Load a preset or a file, apply overrides, and validate.
 
-    A file may begin with ``extends: PRESET``: it then states only what differs from that preset.
-
-    ``section`` picks one top-level mapping of the file (a single step's config out of a whole preset); overrides are
-    still written from the top (``train_stage2.steps=10``). An override with null takes away what the file has (one of its
-    rollouts), as in a file that extends it, where null is no value of its own. A value that begins with TODO is refused,
-    whichever section is asked for.
+    A file may begin with ``extends: PRESET``: it then states only what differs from that preset. An override with null takes away what the
+    file has (one of its rollouts), as in a file that extends it, where null is no value of its own. A value that begins with TODO is
+    refused, whichever section is asked for.
 
     Args:
-        prune: changes the values before they are validated, given what the user wrote: the file and the overrides without
-            the preset.
+        section: one top-level mapping of the file; overrides are still written from the top (``train_stage2.steps=10``).
+        prune: changes the values before they are validated, given the file and the overrides without the preset.
 
     Raises: ConfigError: anything that is not right with it.
     """

@@ -181,14 +181,9 @@ class _StoppedError(BaseException):
 def run_supervised(action: Callable[[], object], *, continues: bool) -> None:
     """Do the work in a process group of its own, and end with its exit status.
 
-    Processes of a pool and Prefect's temporary server belong to that group. Ctrl-C in a terminal reaches this process
-    alone; otherwise the server would end first and the flow wait minutes for it. Killed, this process takes the group
-    with it, and torchrun takes this process. SIGINT ends the whole group within `GRACE_SECONDS`, SIGTERM within
-    `SAVE_SECONDS`, with exit status 130 or 143. Finished work is safe whenever that happens: outputs are written
-    atomically, training goes on from its last state.
-
-    Args:
-        continues: whether the same command, called again, goes on where this one was stopped.
+    Ctrl-C in a terminal reaches this process alone: Prefect's temporary server, which is in the group, would end first and the flow wait
+    minutes for it. Killed, this process takes the group with it, and torchrun takes this process. SIGINT ends the group within
+    `GRACE_SECONDS`, SIGTERM within `SAVE_SECONDS`, with exit status 130 or 143. ``continues``: the same command, called again, goes on.
     """
     if not hasattr(os, "fork"):
         action()

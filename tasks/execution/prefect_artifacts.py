@@ -73,8 +73,7 @@ def show_in_prefect(
     """Add the artifacts `report`, `metrics` and `pictures` (a link, a table, images) to the flow run that calls this.
 
     Args:
-        page: folder of the report or comparison, with `index.html`.
-        done: the artifacts of the run by the nodes' names; its evaluations fill the table.
+        page: folder of the report or comparison.
         verdicts: of metrics beside an earlier run, in the order of the table's rows.
     """
     pictures = _report_pictures(done["report"].folder) if "report" in done else {}

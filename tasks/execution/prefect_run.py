@@ -79,7 +79,6 @@ class PrefectRun(Outline):
     allowed to finish, and the error is raised.
 
     Args:
-        artifacts: root of the store.
         page_of: an outline of the run; its page then shows how far the run is, and remaining paths order the tasks.
 
     Attributes:

@@ -1,18 +1,15 @@
-"""Formulas of the metrics of predicted videos, by frame or over a path. The caller takes means over time, per trajectory and view.
+"""Formulas of the metrics of predicted videos, by frame or over a path (docs/evaluation.md). The caller takes means over time, per
+trajectory and view.
 
-Full frame: PSNR and SSIM (appendix "Full-frame metrics" of the paper). The conditioning frame counts like every other.
-
-Robot-mask IoU, head view only (appendix "Robot-mask IoU"). A frame in which both masks are empty is left out; one in
-which only one is empty counts 0. A video whose masks are empty in every frame is left out.
+Full frame: appendix "Full-frame metrics" of the paper. The conditioning frame counts like every other. Robot-mask IoU, head view only:
+appendix "Robot-mask IoU".
 
 Background, for recordings with exact masks: the median colour of a pixel in the frames in which the recording shows it free of the
 robot. A pixel that differs from it shows the robot, or what a prediction invents. Pixels that the robot always covers, or on which a
 thing is at some time, do not count; nor does the first frame, which is given.
 
-On request (``evaluate_video.metrics``): paths of the tools, and still scenes. HSD, nDTW and DYN follow EWMBench (arXiv 2505.09694):
-reciprocals of distances, in hundredths of the frame's height, of the arms that move. Tools cannot be found more precisely than about
-one hundredth, so places are no nearer than that, and a perfect path scores 1 instead of infinity. docs/evaluation.md states the
-formulas and the differences.
+On request: HSD, nDTW and DYN follow EWMBench (arXiv 2505.09694): reciprocals of distances, in hundredths of the frame's height, of the arms
+that move. Tools cannot be found more precisely than about one hundredth, so a perfect path scores 1 instead of infinity.
 """
 
 from __future__ import annotations
@@ -118,10 +115,7 @@ def _check(predicted: Tensor, true: Tensor) -> None:
 
 
 def frame_iou(true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Intersection over union of each frame (n,) float64; NaN where both masks are empty.
-
-    Args:
-        true, predicted: bool (n, h, w).
+    """Intersection over union (n,) float64 of masks bool (n, h, w); NaN where both are empty.
 
     Raises: DataError for masks of different shape or another type.
     """

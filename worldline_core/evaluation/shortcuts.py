@@ -99,11 +99,8 @@ def named_places(
     T_base_camera: np.ndarray,
     image_size: tuple[int, ...],
 ) -> tuple[np.ndarray, ...]:
-    """Places (3) of the things that an instruction names, where rays through them meet a height; up to the first that is not seen.
-
-    Args:
-        picture: (1, H, W, 3). K: (3, 3), of images of image_size (h, w). T_base_camera: (4, 4).
-    """
+    """Places (3) of the things that an instruction names, where rays through them in a picture (1, H, W, 3) meet a height; up to the first
+    that is not seen. K is of images of image_size (h, w)."""
     things = []
     for thing in named_things(instruction):
         share = thing_share(picture, thing.colour, own_colour(picture, thing.colour))[0]
@@ -264,9 +261,6 @@ def verdicts_without_video(
 ) -> dict[str, dict[str, bool]]:
     """Success of each attempt, by the shortcut's name: trees that saw attempts of its task from other starts, with commands, placed
     paths, or the score of a rule alone; and `one_verdict`, the commonest outcome, for all. Without any to learn from, an attempt fails.
-
-    Args:
-        rows: attempts that ended in success or failure. tasks: by episode.
     """
     starts: dict[str, list[EpisodeRow]] = defaultdict(list)
     for row in rows:

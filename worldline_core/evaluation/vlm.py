@@ -285,11 +285,7 @@ def _content(part: Part) -> list[dict[str, Any]]:
 
 
 class Qwen3VLModel:
-    """One user message in, greedy text out; there is no system prompt and no thinking.
-
-    Args:
-        model, processor: a Qwen3VLForConditionalGeneration and its Qwen3VLProcessor (transformers).
-    """
+    """One user message in, greedy text out of a Qwen3VLForConditionalGeneration (transformers), without system prompt and thinking."""
 
     def __init__(self, model: Any, processor: Any, name: str = "qwen3-vl") -> None:
         self.model = model.eval()

@@ -108,11 +108,7 @@ class SizeSheet(StrictModel):
         return [made[number] for number in sorted(made)]
 
     def rows_and_rollouts(self, rows: list[Estimate] | None = None) -> tuple[list[Estimate], list[BlockCost]]:
-        """The same, and of a card that is known blocks of the distilled model in one view and in all.
-
-        Args:
-            rows: what `fitting_rows` returned.
-        """
+        """The same (or what `fitting_rows` returned), and of a card that is known blocks of the distilled model in one view and in all."""
         config, views = self.config, tuple(self.config.distill.views)
         with self._processes() as pool:
             if self.card is None:

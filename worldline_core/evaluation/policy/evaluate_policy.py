@@ -128,11 +128,7 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
 def choose_trajectories(
     config: PolicyEvaluationConfig, rows: Sequence[EpisodeRow], times: Mapping[str, int]
 ) -> list[EpisodeRow]:
-    """Draw as many successes as failures in every split and task family.
-
-    Args:
-        times: number of methods that predicted each episode; those that more have predicted are taken first.
-    """
+    """Draw as many successes as failures in every split and task family, first those that more methods predicted (``times``)."""
     groups: dict[tuple[str, str], dict[str, list[EpisodeRow]]] = defaultdict(lambda: {name: [] for name in _OUTCOMES})
     for row in rows:
         if row.split in config.splits and row.outcome in _OUTCOMES:

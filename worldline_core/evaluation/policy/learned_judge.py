@@ -118,9 +118,7 @@ def frame_numbers(available: Sequence[int], num_frames: int) -> list[int]:
 class OutcomeNetwork(nn.Module):
     """Convolutions on the frames of one view at a time, stacked; the instruction and the view scale and shift the features.
 
-    Args:
-        widths: channels at half, quarter, ... resolution; multiples of 8.
-        words: size of the vocabulary.
+    ``widths`` are channels at half, quarter, ... resolution, multiples of 8; ``words`` is the size of the vocabulary.
     """
 
     def __init__(self, widths: tuple[int, ...], words: int) -> None:
@@ -265,10 +263,7 @@ class LearnedJudge:
 
     @classmethod
     def load(cls, folder: Path) -> LearnedJudge:
-        """Open a trained judge.
-
-        Raises: ArtifactError for a missing or damaged folder, or weights of another network.
-        """
+        """Open a trained judge. Raises: ArtifactError, as `load_network`."""
         network, described = load_network(
             folder, DESCRIPTION_FILE, _Described, lambda found: OutcomeNetwork(found.widths, len(found.words)), noun="judge",
             next_step="run train_judge",

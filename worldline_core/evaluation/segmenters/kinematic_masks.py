@@ -18,14 +18,10 @@ _ROWS = 192
 def kinematic_masks(
     tracks: EpisodeTracks, view: str, index: NDArray[np.int64], frames: NDArray[np.uint8]
 ) -> NDArray[np.bool_] | None:
-    """Masks (n, h, w) of the robot in recorded frames of one view; None without its camera.
+    """Masks (n, h, w) of the robot in frames (n, h, w, 3) of a recording, ``index`` their numbers; None without the view's camera.
 
     Capsules are wider than most links. What lies outside of all of them is not robot; within, GrabCut (Rother et al. 2004) parts the
     robot's colours from those of the surroundings, frame by frame.
-
-    Args:
-        index: numbers of the frames in the recording.
-        frames: (n, h, w, 3).
     """
     number = tracks.views.index(view)
     if tracks.camera_motion[number] == "absent":

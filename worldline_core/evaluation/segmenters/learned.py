@@ -2,8 +2,7 @@
 ones, or kinematic ones where a recording has none.
 
 It sees neither points nor other frames: what it marks in a predicted video is what that video shows. Training frames are augmented to
-look like unseen scenes and like predicted frames: a predicted frame has passed a lossy tokenizer and an imperfect model, is blurred and
-blocky, and shows faint copies of a moving arm. Masks follow the geometry only.
+look like unseen scenes and like predicted frames; masks follow the geometry only.
 """
 
 from __future__ import annotations
@@ -45,11 +44,7 @@ _GROUPS = 8
 
 
 class UNet(nn.Module):
-    """Encoder and decoder with skip connections at full, half, quarter and eighth resolution.
-
-    Args:
-        widths: channels at each resolution, finest first; multiples of 8.
-    """
+    """Encoder and decoder with skip connections; ``widths``: channels at full, half, ... resolution, multiples of 8."""
 
     def __init__(self, widths: tuple[int, ...] = (8, 24, 48, 96)) -> None:
         super().__init__()
@@ -144,10 +139,7 @@ class LearnedSegmenter:
 
     @classmethod
     def load(cls, folder: Path) -> LearnedSegmenter:
-        """Open a trained segmenter.
-
-        Raises: ArtifactError for a missing or damaged folder, or weights of another network.
-        """
+        """Open a trained segmenter. Raises: ArtifactError, as `load_network`."""
         network, described = load_network(
             folder, DESCRIPTION_FILE, _Described, lambda found: UNet(found.widths), noun="segmenter",
             next_step="run train_segmenter, or use artifacts/shipped/models/segmenter",
