@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
@@ -82,7 +82,12 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
 
     def choose_in_bank(method: str, bank: str) -> list[dict[str, Any]]:
         load = candidate_loader(config.views, episodes, tracks, rollouts.get(method), method, banks[bank])
-        return choices_of_bank(config, selector, bank, banks[bank], load)
+        task = banks[bank][0].instruction
+
+        def by_video(scene: str, shown: Sequence[int]) -> Choice:
+            return choose(selector, task, shown, load, scene=scene, seed=config.seed)
+
+        return choices_of_bank(config, bank, banks[bank], by_video)
 
     choices: list[dict[str, Any]] = []
     for method in (TRUE_METHOD, *rollouts):
@@ -151,33 +156,22 @@ def open_selector(config: PlanningConfig, inputs: Mapping[str, Path]) -> Selecto
 
 
 def choices_of_bank(
-    config: PlanningConfig,
-    selector: Selector,
-    bank: str,
-    rows: Sequence[EpisodeRow],
-    load: Callable[[int], CandidateVideo],
+    config: PlanningConfig, bank: str, rows: Sequence[EpisodeRow], choice: Callable[[str, Sequence[int]], Choice]
 ) -> list[dict[str, Any]]:
-    """One choice per run and budget; budgets larger than the bank are left out.
+    """One choice per run and budget, given the scene's name and the candidates shown; budgets larger than the bank are left out.
 
     The paper samples a new bank for every run. Here a run is another order of the same bank (the first one is the
     recorded order), which changes what the smaller budgets contain.
     """
     results = []
-    for run, budget, shown in shown_candidates(config, bank, len(rows)):
-        scene = f"{bank} {run} {budget}"
-        choice = choose(selector, rows[0].instruction, shown, load, scene=scene, seed=config.seed)
-        episode_id = rows[choice.candidate].episode_id
-        results.append({"run": run, "budget": budget, "episode_id": episode_id, "trace": asdict(choice)})
-    return results
-
-
-def shown_candidates(config: PlanningConfig, bank: str, count: int) -> Iterator[tuple[int, int, list[int]]]:
-    """Run, budget and the numbers of the candidates to choose among."""
-    numbers = list(range(count))
+    numbers = range(len(rows))
     for run in range(config.runs):
-        order = numbers if run == 0 else shown_order(numbers, f"{bank} run {run}", config.seed)
-        for budget in sorted({budget for budget in config.budgets if budget <= count}):
-            yield run, budget, order[:budget]
+        order = [*numbers] if run == 0 else shown_order(numbers, f"{bank} run {run}", config.seed)
+        for budget in sorted({budget for budget in config.budgets if budget <= len(rows)}):
+            chosen = choice(f"{bank} {run} {budget}", order[:budget])
+            episode_id = rows[chosen.candidate].episode_id
+            results.append({"run": run, "budget": budget, "episode_id": episode_id, "trace": asdict(chosen)})
+    return results
 
 
 Chooser = Callable[[Sequence[int]], int]
@@ -209,16 +203,16 @@ def tree_scores_by_shortcut(
 def shortcut_choices(
     config: PlanningConfig, bank: str, rows: Sequence[EpisodeRow], choosers: Mapping[str, Chooser]
 ) -> list[dict[str, Any]]:
-    """Choices like `choices_of_bank`, of rules that see no video."""
-    found = []
-    for name, chooser in choosers.items():
-        for run, budget, shown in shown_candidates(config, bank, len(rows)):
-            trace = asdict(Choice(chooser(shown), {}, [], 0, 0))
-            found.append(
-                {"method": f"{SHORTCUT}{name}", "bank": bank, "run": run, "budget": budget, "trace": trace}
-                | {"episode_id": rows[trace["candidate"]].episode_id}
-            )
-    return found
+    """Choices of rules that see no video."""
+    return [
+        {"method": f"{SHORTCUT}{name}", "bank": bank, **choice}
+        for name, chooser in choosers.items()
+        for choice in choices_of_bank(config, bank, rows, partial(_without_video, chooser))
+    ]
+
+
+def _without_video(chooser: Chooser, _scene: str, shown: Sequence[int]) -> Choice:
+    return Choice(chooser(shown), {}, [], 0, 0)
 
 
 def candidate_loader(
