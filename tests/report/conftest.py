@@ -205,7 +205,7 @@ def write_planning_scores(folder: Path) -> None:
     methods = {
         name: {
             "budgets": {str(n): budget(0.45 + (top - 0.45) * i / 5) for i, n in enumerate(numbers)},
-            "by_family": {"lift": {"2": 0.5, "32": top}},
+            "by_family": {"lift": {"2": {"success": {"mean": 0.5}}, "32": {"success": {"mean": top}}}},
         }
         for name, top in (("true", 0.95), ("banks_shipped_causal", 0.8))
     }

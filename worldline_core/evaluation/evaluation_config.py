@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -226,7 +226,7 @@ class PlanningConfig(_Judging):
     """Selector and budgets of evaluate_planning."""
 
     selector: JudgeName = "measured"
-    budgets: tuple[int, ...] = Field(default=(2, 4, 8, 16, 24, 32), min_length=1)
+    budgets: tuple[Annotated[int, Field(ge=1)], ...] = Field(default=(2, 4, 8, 16, 24, 32), min_length=1)
     runs: int = Field(
         default=5, ge=1, description="orders of each bank's candidates; smaller budgets are prefixes of an order"
     )

@@ -328,6 +328,8 @@ _OUTSIDE = {
     "evaluate_video.sam3_weights": "accept the licence of facebook/sam3 and download it, or choose other segmenters",
     "evaluate_policy.sam3_weights": "accept the licence of facebook/sam3 and download it, or choose another segmenter",
     "evaluate_policy.vlm.weights": "download Qwen/Qwen3-VL-8B-Instruct, or choose judge: openai or measured",
+    "evaluate_planning.sam3_weights": "accept the licence of facebook/sam3 and download it, or choose another segmenter",
+    "evaluate_planning.vlm.weights": "download Qwen/Qwen3-VL-8B-Instruct, or choose selector: openai or measured",
 }
 """Folders of weights that a run reads, by the key that names each, and how to come by the published ones."""
 

@@ -320,13 +320,13 @@ def write_results(
             "over_shortcut": {"shortcut": best, "gain": over},
         }
 
-    def by_family(by_budget: Mapping[int, Mapping[str, float]]) -> dict[str, dict[str, float]]:
-        """Mean success of each task family and budget."""
-        found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    def by_family(by_budget: Mapping[int, Mapping[str, float]]) -> dict[str, dict[str, Any]]:
+        """Results of each task family and budget."""
+        found: dict[str, dict[int, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
         for budget, own in by_budget.items():
             for bank, value in own.items():
-                found[banks[bank][0].task_family][str(budget)].append(value)
-        return {family: {n: float(np.mean(values)) for n, values in own.items()} for family, own in found.items()}
+                found[banks[bank][0].task_family][budget][bank] = value
+        return {family: {str(n): result(n, own) for n, own in by_budget.items()} for family, by_budget in found.items()}
 
     methods = {
         name: {
