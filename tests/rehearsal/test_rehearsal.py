@@ -29,8 +29,8 @@ from worldline_core.serving.session_host import SessionHost
 from worldline_core.store.artifact_files import finished_artifacts, read_manifest
 
 PRESET = "cosmos3-nano"
-SIZES = {"image_size", "device", "steps", "workers", "student_layer", "clips", "start_step", "seeds", "timed_blocks",
-         "sources", "steps_at_once"}  # fmt: skip
+SIZES = {"image_size", "device", "steps", "workers", "student_layer", "clips", "start_step", "seeds", "sources",
+         "steps_at_once"}  # fmt: skip
 if not processor_has_bfloat16():
     SIZES |= {"precision", "weights", "bfloat16"}
 FOLDERS = ("Cosmos3-Nano/vae", "Cosmos3-Nano/text_tokenizer", "base", "vjepa2-vitg-fpc64-384", "lpips", "sam3",

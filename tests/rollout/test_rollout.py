@@ -71,10 +71,7 @@ def test_times_lie_beside_the_predictions_and_outside_their_digest(inputs, predi
     assert speed.items() >= {"steps": 4, "batch_size": 2, "device": "cpu", "dtype": dtype}.items()
     assert speed["frames"] == 6 * N  # the first of four batches of two warms up
     assert speed["seconds_per_frame"] == speed["seconds"] / speed["frames"] > 0
-    assert "long_rollout" not in speed
-    rolled(CONFIG, inputs, tmp_path, sampler=BlockCausalConfig(timed_blocks=6))
-    seconds = speed_of(tmp_path)["long_rollout"]["block_seconds"]
-    assert len(seconds) == 6 and min(seconds) > 0
+    rolled(CONFIG, inputs, tmp_path)
     assert digest_folder(tmp_path) == digest_folder(output)
     rollout(CONFIG, inputs, output)  # nothing is left to predict
     assert speed_of(output) == speed
@@ -88,7 +85,7 @@ def test_times_lie_beside_the_predictions_and_outside_their_digest(inputs, predi
     assert kept.stat().st_mtime_ns == before
 
 
-def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(inputs, tmp_path, monkeypatch):
+def test_a_model_of_other_blocks_is_rolled_out_with_them(inputs, tmp_path, monkeypatch):
     """Blocks of two latent frames, a window of one recent block, two Euler steps: as the checkpoint says."""
     passes, forward, joint = [], WorldModel.forward_block, WorldModel.write_and_forward_block
 
@@ -103,15 +100,14 @@ def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(inputs, tmp_p
 
     monkeypatch.setattr(WorldModel, "forward_block", watch)
     monkeypatch.setattr(WorldModel, "write_and_forward_block", watch_joint)
-    timed = {"sampler": BlockCausalConfig(timed_blocks=3), "seeds": (42,), "embodiments": ("ur5e_pair",)}
-    config, given = CONFIG.model_copy(update=timed | {"num_frames": 31}), model(inputs, "small_blocks")
+    chosen = {"seeds": (42,), "embodiments": ("ur5e_pair",), "num_frames": 31}
+    config, given = CONFIG.model_copy(update=chosen), model(inputs, "small_blocks")
     summary = rollout(config, given, tmp_path)
     assert (summary["steps"], summary["frames"]) == (2, 25)
     frames, held, levels = zip(*passes, strict=True)
     assert set(frames) == {2} and max(held) == 1 + 2
     assert list(levels) == [1.0, 0.5] * (len(levels) // 2)
-    speed = speed_of(tmp_path)
-    assert (speed["steps"], len(speed["long_rollout"]["block_seconds"])) == (2, 3)
+    assert speed_of(tmp_path)["steps"] == 2
     other = config.model_copy(update={"sampler": BlockCausalConfig(steps=1)})
     assert rollout(other, given, tmp_path / "other")["steps"] == 1
 

@@ -63,7 +63,6 @@ SIZES: tuple[tuple[str, Any, str], ...] = (
     ("rollouts.causal.*.seeds", [42, 43], "enough for a mean over seeds"),
     ("rollouts.*.seeds", [42], "one seed is enough beside them"),
     ("rollouts.*.steps", 4, "Euler steps of a whole clip"),
-    ("rollouts.*.timed_blocks", 10, "past the window of the cache"),
     ("runner.steps_at_once", 2, "two cores"),
 )
 """Pattern of a dotted key, its small value, and why; the first that fits holds. What no pattern names stays as it is."""

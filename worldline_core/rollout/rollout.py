@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.actions.action_tracks import changed_tracks
-from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import ActionTracks, open_controls
 from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -35,8 +33,7 @@ from worldline_core.rollout.rollout_config import (
     TextToVideoConfig,
 )
 from worldline_core.rollout.rollout_set import RolloutSetWriter
-from worldline_core.rollout.samplers import BlockCausalSimulator
-from worldline_core.rollout.simulation import Frames, encode_images
+from worldline_core.rollout.simulation import Frames
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.atomic import write_json_atomic
 
@@ -134,7 +131,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         )  # fmt: skip
     writer.close()
     if times:
-        _write_speed(output, config, world, times, _timed_blocks(config, world, episodes, tracks, planned[0]))
+        _write_speed(output, config, world, times)
     in_splits = len(episodes.select(split=config.splits))
     reasons = {"in other splits": len(episodes) - in_splits, "not among those asked for": in_splits - len(chosen)}
     reasons |= Counter(row.reason for row in left_out)
@@ -174,7 +171,7 @@ def _load(
         bfloat16=config.bfloat16,
         weights=config.weights,
         compiled=config.compile,
-        **sampler.model_dump(exclude={"kind", "timed_blocks"}),
+        **sampler.model_dump(exclude={"kind"}),
     )
     if world.contract.fps not in rates:
         world.contract.require(where=inputs["episodes"], fps=rates[0])
@@ -220,36 +217,24 @@ def _write(
     seconds, done = 0.0, 0
     with ExitStack() as stack:
         videos = [stack.enter_context(writer.video(item.episode_id, item.seed, item.views, size)) for item in batch]
-        while True:
-            piece, elapsed = timed(partial(next, pieces, None), device)
-            seconds += elapsed
-            if piece is None:
-                return seconds
+        begin = _finished(device)
+        for piece in pieces:
+            seconds += _finished(device) - begin
             for add, item, clip in zip(videos, batch, piece, strict=True):
                 add({view: frames[: max(0, item.frames - done)] for view, frames in clip.items()})
             done += len(next(iter(piece[0].values())))
+            begin = _finished(device)
+    return seconds
 
 
-def _timed_blocks(
-    config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks | None, item: Prediction
-) -> dict[str, list[float]] | None:
-    """Seconds of the blocks of one long rollout, where the sampler asks for it."""
-    blocks = config.sampler.timed_blocks if isinstance(config.sampler, BlockCausalConfig) else 0
-    if not isinstance(world, WorldLine) or tracks is None or not blocks:
-        return None
-    first = encode_images(world.tokenizer, _observed(world, episodes, [item]).to(config.device))
-    index = range(0, world.frames_per_unit + 1, TEMPORAL_FACTOR)
-    maps = world.action_maps([tracks.tracks(item.controls_of)], index, views=item.views, by_vector=not config.cameras)
-    return long_rollout(partial(world.simulator, [item.seed], item.views), first, maps, blocks)
+def _finished(device: str) -> float:
+    """Seconds of a clock when the kernels of the current stream are done."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.current_stream(device).synchronize()
+    return time.perf_counter()
 
 
-def _write_speed(
-    output: Path,
-    config: RolloutConfig,
-    world: World,
-    times: Sequence[tuple[int, int, float]],
-    blocks: dict[str, list[float]] | None,
-) -> None:
+def _write_speed(output: Path, config: RolloutConfig, world: World, times: Sequence[tuple[int, int, float]]) -> None:
     """Write ``run/speed.json`` from (clips, frames, seconds) of the batches; the first one warms up, unless it is alone."""
     clips, frames, seconds = (sum(column) for column in zip(*(times[1:] or times), strict=True))
     speed = {
@@ -263,38 +248,7 @@ def _write_speed(
         "seconds": seconds,
         "seconds_per_frame": seconds / frames,
     }
-    write_json_atomic(output / "run" / "speed.json", speed | ({} if blocks is None else {"long_rollout": blocks}))
-
-
-def timed[T](work: Callable[[], T], device: str) -> tuple[T, float]:
-    """Returns the result of ``work`` and its wall seconds; waits for the kernels of the current stream on a GPU."""
-
-    def now() -> float:
-        if torch.device(device).type == "cuda":
-            torch.cuda.current_stream(device).synchronize()
-        return time.perf_counter()
-
-    begin = now()
-    return work(), now() - begin
-
-
-def long_rollout(
-    simulator: Callable[[], BlockCausalSimulator], first: Tensor, maps: Tensor, blocks: int
-) -> dict[str, list[float]]:
-    """Seconds of every block of one long rollout under constant controls; its frames are dropped.
-
-    Two blocks of another rollout before it are not counted.
-
-    Args:
-        first, maps: observed latents ``(b v c h w)`` and the action maps of a clip ``(b v a t h w)``.
-    """
-    seconds: list[float] = []
-    for count in (2, blocks):
-        running = simulator()
-        running.start(first, maps[:, :, :, :1])
-        controls = maps[:, :, :, -running.spec.block_size :]
-        seconds = [timed(partial(running.step, controls), str(maps.device))[1] for _ in range(count)]
-    return {"block_seconds": seconds}
+    write_json_atomic(output / "run" / "speed.json", speed)
 
 
 def device_name(device: str) -> str:

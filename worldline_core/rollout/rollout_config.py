@@ -61,12 +61,10 @@ class BlockCausalConfig(_ModelSampler):
 
     Attributes:
         steps: Euler steps per block; None: as the model was trained.
-        timed_blocks: blocks of one additional long rollout that measures the cost of each; it changes no prediction.
     """
 
     kind: Literal["block_causal"] = "block_causal"
     steps: int | None = Field(default=None, ge=1)
-    timed_blocks: int = Field(default=0, ge=0)
 
 
 class TextToVideoConfig(_ModelSampler):
