@@ -32,13 +32,11 @@ def facts_of(recorder: EpisodeRecorder, layout: Layout, motions: list[ExecutedMo
     # Where the commands send the hands: how far fingers really closed tells what they hold.
     tools, gripper = [], []
     for motion in motions:
-        sent, column = motion.qpos.copy(), 0
+        sent = motion.qpos.copy()
         for arm in recorder.scene.arms:
-            sent[:, arm.qpos] = motion.action[:, column : column + len(arm.qpos)]
-            column += len(arm.qpos) + 1
+            sent[:, arm.qpos] = motion.action[:, arm.columns]
         tools.append([recorder.tool_positions(arm, sent) for arm in range(len(recorder.scene.arms))])
-        grippers = [name.endswith("/gripper") for name in recorder.scene.state_names]
-        gripper.append(motion.action[:, grippers])
+        gripper.append(motion.action[:, [arm.gripper for arm in recorder.scene.arms]])
     tools = np.array(tools).transpose(0, 2, 1, 3)
     first = motions[0]
     still = replace(first, qpos=first.qpos[:1], state=first.state[:1], action=first.action[:1])

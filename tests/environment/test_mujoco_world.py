@@ -176,13 +176,25 @@ def test_a_start_is_drawn_by_the_policies_in_the_order_of_their_recording(compar
     again.close()
 
 
+@pytest.mark.slow
+def test_each_start_is_filmed_by_its_own_camera(tmp_path):
+    group = {"embodiment": ROBOT, "split": "test", "count": 1, "families": ["press"]}
+    groups = [group | {"held_out_camera": held_out} for held_out in (False, True)]
+    config = RecordingConfig.model_validate({"episodes": {"groups": groups, "num_frames": 17, "workers": 1}})
+    record_into(config, tmp_path / "recordings", 1)
+    environment = MujocoEnv(tmp_path / "recordings", embodiment=ROBOT)
+    first, other, again = (environment.reset(seed=number)[0]["pixels"]["head"] for number in (0, 1, 0))
+    environment.close()
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
 def test_recordings_whose_starts_are_not_known_are_refused(physics, shipped, monkeypatch):
     with pytest.raises(DataError, match=r"(?s)The manifest does not say where things stood.*banks"):
         MujocoEnv(shipped / "banks", embodiment=ROBOT, splits=("bank", "test"))
     with pytest.raises(ConfigError, match="observe_every 0"):
         MujocoEnv(embodiment=ROBOT, observe_every=0)
     drawn = physics._drawn
-    monkeypatch.setattr(physics, "_drawn", lambda number: (*drawn(number)[:3], drawn(number)[3] + 0.01))
+    monkeypatch.setattr(physics, "_drawn", lambda name: (drawn(name)[0], drawn(name)[1] + 0.01, drawn(name)[2]))
     with pytest.raises(DataError, match="cannot be drawn again as it was recorded"):
         physics.reset(seed=0)
 

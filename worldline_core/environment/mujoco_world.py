@@ -137,7 +137,7 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         number = (int(self.np_random.integers(2**31)) if seed is None else seed) % len(self.starts)
         ((name, frame),) = each_start(options, self._usual_start, 1)
         start = self.starts.at(self.starts.rows[number].episode_id if name is None else name, frame)
-        self._layout, self._scene, self._jitter, first = self._drawn(start.episode_id)
+        self._layout, first, self._filmed = self._drawn(start.episode_id)
         self.task = self.task_description = start.instruction
         if self._layout.instruction != start.instruction or not np.allclose(first, start.state, atol=1e-4):
             raise _drawn_otherwise(start, f"{start.instruction}, {start.state}", f"{self._layout.instruction}, {first}")
@@ -214,12 +214,7 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     def _film(self, start: RecordedStart, state: np.ndarray) -> dict[str, np.ndarray]:
         now = ExecutedMotion(state[None], state[None], self._data.qpos[None].copy(), "unknown")
         frames = self._recorder.film(
-            self._layout,
-            now,
-            episode_id=start.episode_id,
-            scene_id=self._scene,
-            split="test",
-            jitter=deepcopy(self._jitter),
+            self._layout, now, episode_id=start.episode_id, split="test", masked=False, **deepcopy(self._filmed)
         ).frames
         return {view: resized_frames(frames[view], self.image_size)[0] for view in self.views}
 
@@ -235,11 +230,11 @@ def _drawn_otherwise(start: RecordedStart, expected: object, got: object) -> Dat
     )  # fmt: skip
 
 
-Drawn = tuple[Layout, str, np.random.Generator, np.ndarray]
+Drawn = tuple[Layout, np.ndarray, dict[str, Any]]
 
 
 def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
-    """Returns a function that draws a recording again: its things, scene, camera draws and first command."""
+    """Returns a function that draws a recording again: its things, its first command, and how it is filmed."""
     manifest = read_manifest(recordings)
     step, values, where = str(manifest.get("step")), manifest.get("config", {}), recordings / MANIFEST_NAME
     kind = step.removeprefix("record_")
@@ -256,7 +251,8 @@ def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
         def of_policies(recorder: EpisodeRecorder, row: EpisodeRow) -> Drawn:
             spec = specs[row.bank or ""]
             layout, motions = compared.draw(recorder, spec)
-            return layout, spec.scene, compared.camera_draws(spec), motions[row.source].action[0]
+            filmed = {"scene_id": spec.scene, "jitter": compared.camera_draws(spec)}
+            return layout, motions[row.source].action[0], filmed
 
         return of_policies
     if kind == "episodes":
@@ -265,9 +261,9 @@ def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
 
         def of_episodes(recorder: EpisodeRecorder, row: EpisodeRow) -> Drawn:
             job = jobs[row.episode_id]
-            recorder.held_out_camera = job.held_out_camera
             layout, motion, scene, random = recorder.draw(job)
-            return layout, scene, random, motion.action[0]
+            filmed = {"scene_id": scene, "jitter": random, "held_out_camera": job.held_out_camera}
+            return layout, motion.action[0], filmed
 
         return of_episodes
     raise DataError(

@@ -223,14 +223,14 @@ def _record_starts(
 ) -> list[tuple[BankSpec, dict[str, tuple[str, dict[str, float]]]]]:
     """Record all starts; finished episodes survive a kill. Returns outcome and facts of each attempt, by start."""
     prepare_rendering()
-    specs, outcomes = config.specs(), []
+    specs, recorded = config.specs(), []
     with Progress("record attempts", len(specs), "start") as progress:
-        for found in run_in_processes(_record_start, [(spec, config, output) for spec in specs], config.workers):
-            outcomes.append(found)
+        attempts = run_in_processes(_record_start, [(spec, config, output) for spec in specs], config.workers)
+        for spec, found in zip(specs, attempts, strict=True):
+            recorded.append((spec, found))
             progress.advance()
     if not EpisodeSetWriter.finished(output):
         EpisodeSetWriter(output, video_crf=config.video_crf).close()
-    recorded = list(zip(specs, outcomes, strict=True))
     check_recorded(output, [f"{spec.name}-{name}" for spec, found in recorded for name in found])
     return recorded
 

@@ -1,7 +1,7 @@
 """Scripted controllers: waypoints of each arm, with errors as wide as a hand, and the joint targets that follow them.
 
 Grippers close and open over more than half a second, and the last second shows how it ended. Whether a plan goes wrong
-is drawn; whether it went wrong is measured afterwards (``outcomes.outcome``).
+is drawn; whether it went wrong is measured afterwards (``simulate.outcome``).
 """
 
 from __future__ import annotations

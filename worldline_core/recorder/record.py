@@ -284,7 +284,7 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
 
 
 # One recorder per process: a compiled model and its renderers are reused while the embodiment stays the same.
-_RECORDERS: dict[tuple[str, bool, bool], EpisodeRecorder] = {}
+_RECORDERS: dict[tuple[str, bool], EpisodeRecorder] = {}
 
 
 def _close_recorders() -> None:
@@ -296,7 +296,7 @@ def _close_recorders() -> None:
 def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
     """Record one episode into the set's parts; runs in a worker process."""
     job, config, output = task
-    key = (job.embodiment, job.held_out_camera, job.family in CONTACT)
+    key = (job.embodiment, job.family in CONTACT)
     if key not in _RECORDERS:
         _close_recorders()
         _RECORDERS[key] = EpisodeRecorder(*key)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
@@ -144,11 +145,7 @@ class SceneRenderer:
         import mujoco
 
         model, data = self.scene.model, self._data
-        frames: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras}
-        masked = self.cameras if labels is not None else {}
-        masks: dict[str, list[np.ndarray]] = {view: [] for view in masked}
-        things: dict[str, list[np.ndarray]] = {view: [] for view in masked}
-        poses: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras}
+        frames, masks, things, poses = (defaultdict[str, list[np.ndarray]](list) for _ in range(4))
         height, width = FRAME_SIZE
         for positions in qpos:
             data.qpos[:] = positions

@@ -28,7 +28,10 @@ FINGER_JOINTS = ("finger_a", "finger_b")
 
 @dataclass(frozen=True)
 class ArmIndices:
-    """Indices of one arm's joints, fingers and tool in the compiled model; ``limits`` (J, 2) of the joints [rad]."""
+    """Indices of one arm's joints, fingers and tool in the compiled model; ``limits`` (J, 2) of the joints [rad].
+
+    ``columns``: of its joints in states and actions; ``gripper``: that of its opening behind them.
+    """
 
     joint_names: tuple[str, ...]
     qpos: np.ndarray
@@ -38,6 +41,8 @@ class ArmIndices:
     finger_actuators: np.ndarray
     tool_site: int
     limits: np.ndarray
+    columns: slice
+    gripper: int
 
 
 @dataclass(frozen=True)
@@ -179,16 +184,16 @@ def compile_scene(spec: Any, robot: Robot) -> SceneModel:
         spec.attach(child, prefix=f"{arm.name}/", frame=frame)
     model = spec.compile()
     prefixes = tuple(f"{arm.name}/" for arm in robot.arms)
-    of_robot = [model.body(int(body)).name.startswith(prefixes) for body in model.geom_bodyid]
-    arms = tuple(_arm_indices(model, prefix) for prefix in prefixes)
-    of_robot = np.array(of_robot, dtype=bool)
+    of_robot = np.array([model.body(int(body)).name.startswith(prefixes) for body in model.geom_bodyid])
+    arms = tuple(_arm_indices(model, prefix, number) for number, prefix in enumerate(prefixes))
     return SceneModel(robot=robot, model=model, arms=arms, robot_geoms=of_robot, sizes=model.geom_size.copy())
 
 
-def _arm_indices(model: Any, prefix: str) -> ArmIndices:
+def _arm_indices(model: Any, prefix: str, number: int) -> ArmIndices:
     names = [model.joint(j).name for j in range(model.njnt) if model.joint(j).name.startswith(prefix)]
     fingers = tuple(name for name in names if name.removeprefix(prefix) in FINGER_JOINTS)
     joints = tuple(name for name in names if name not in fingers)
+    first = number * (len(joints) + 1)
     return ArmIndices(
         joint_names=joints,
         qpos=np.array([model.joint(name).qposadr[0] for name in joints]),
@@ -198,6 +203,8 @@ def _arm_indices(model: Any, prefix: str) -> ArmIndices:
         finger_actuators=np.array([model.actuator(name).id for name in fingers]),
         tool_site=model.site(f"{prefix}tool").id,
         limits=np.array([model.joint(name).range for name in joints]),
+        columns=slice(first, first + len(joints)),
+        gripper=first + len(joints),
     )
 
 

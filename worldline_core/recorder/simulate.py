@@ -116,23 +116,17 @@ class Recording:
 
 def draw_layout(robot: Robot, family: str, random: np.random.Generator, look: Look) -> Layout:
     """Draw an initial state for any task."""
-    return (
-        CONTACT_TASKS[family].layout(robot, random, look)
-        if family in CONTACT
-        else sample_layout(robot, family, random, look)
-    )
+    task = CONTACT_TASKS.get(family)
+    return task.layout(robot, random, look) if task else sample_layout(robot, family, random, look)
 
 
 def motor_targets(scene: SceneModel, action: np.ndarray) -> np.ndarray:
     """(N, nu) targets of all servos for actions (N, J)."""
-    control, column = np.zeros((len(action), scene.model.nu)), 0
+    control = np.zeros((len(action), scene.model.nu))
+    given = action.astype(np.float64)  # stored as float32; the simulator is driven by exactly what is stored
     for arm in scene.arms:
-        count = len(arm.joint_names)
-        # Actions are stored as float32; the simulator is driven by exactly what is stored.
-        control[:, arm.actuators] = action[:, column : column + count].astype(np.float64)
-        fingers = scene.robot.fingers(action[:, column + count].astype(np.float64))
-        control[:, arm.finger_actuators] = fingers[:, None]
-        column += count + 1
+        control[:, arm.actuators] = given[:, arm.columns]
+        control[:, arm.finger_actuators] = scene.robot.fingers(given[:, [arm.gripper]])
     return control
 
 
@@ -140,12 +134,9 @@ def place_arms(scene: SceneModel, data: Any, command: np.ndarray) -> None:
     """Put the arms where a command (J,) sends them; things stay."""
     import mujoco
 
-    column = 0
     for arm in scene.arms:
-        count = len(arm.joint_names)
-        data.qpos[arm.qpos] = command[column : column + count]
-        data.qpos[arm.finger_qpos] = scene.robot.fingers(command[column + count].astype(np.float64))
-        column += count + 1
+        data.qpos[arm.qpos] = command[arm.columns]
+        data.qpos[arm.finger_qpos] = scene.robot.fingers(command[arm.gripper].astype(np.float64))
     mujoco.mj_forward(scene.model, data)
 
 
@@ -176,11 +167,8 @@ def execute(scene: SceneModel, data: Any, action: np.ndarray) -> tuple[np.ndarra
 
 def read_state(scene: SceneModel, data: Any) -> np.ndarray:
     """(J,) joint positions then opening, arm after arm."""
-    parts: list[np.ndarray] = []
-    for arm in scene.arms:
-        parts.append(data.qpos[arm.qpos])
-        parts.append(np.atleast_1d(scene.robot.opening(data.qpos[arm.finger_qpos])))
-    return np.concatenate(parts)
+    parts = ((data.qpos[arm.qpos], [scene.robot.opening(data.qpos[arm.finger_qpos])]) for arm in scene.arms)
+    return np.concatenate([part for arm in parts for part in arm])
 
 
 def outcome(scene: SceneModel, data: Any, layout: Layout, qpos: np.ndarray, tool: np.ndarray) -> tuple[str, str]:
@@ -274,17 +262,16 @@ def _released_at(
 class EpisodeRecorder:
     """Records episodes of one body; holds the compiled model and its renderers.
 
-    With ``held_out_camera`` the head camera is placed where it never is otherwise; ``contact``: the tasks are contact tasks.
+    ``contact``: the tasks are contact tasks.
 
     Raises: DataError for an unknown body.
     """
 
-    def __init__(self, body: str, held_out_camera: bool = False, contact: bool = False) -> None:
+    def __init__(self, body: str, contact: bool = False) -> None:
         if body not in BODIES:
             raise DataError("Unknown body", expected=" | ".join(sorted(BODIES)), got=body)
         self.scene = build_contact_scene(BODIES[body]) if contact else build_scene(BODIES[body])
         self.contact = contact
-        self.held_out_camera = held_out_camera
         self._solver = ArmSolver(self.scene)
         self._data = self.new_data()
         self._kinematics = self.new_data()
@@ -326,7 +313,7 @@ class EpisodeRecorder:
             return None
         if policy is not None:
             action = late(action, policy.delay_frames)
-            grippers = [number for number, name in enumerate(self.scene.state_names) if name.endswith("/gripper")]
+            grippers = [arm.gripper for arm in self.scene.arms]
             action[:, grippers] = late(action, policy.gripper_delay_frames)[:, grippers]
         motion = self.replay(layout, action)
         if policy is None or policy.miss is None:
@@ -383,13 +370,17 @@ class EpisodeRecorder:
         bank: str | None = None,
         candidate: int | None = None,
         masked: bool = True,
+        held_out_camera: bool = False,
     ) -> Recording:
-        """Render a motion in a scene and describe it as an episode; with masks of the robot and of things unless told otherwise."""
+        """Render a motion in a scene and describe it as an episode; with masks of the robot and of things unless told otherwise.
+
+        With ``held_out_camera`` the head camera stands where it never stands otherwise.
+        """
         if self._renderer is None:
             self._renderer = SceneRenderer(self.scene)
         # Another layout may have been executed since: this one decides where objects stand and what they look like.
         self.set_up(self._data, layout)
-        self._set_scene(self._renderer, scene_id, jitter)
+        self._set_scene(self._renderer, scene_id, jitter, held_out_camera)
         labels = thing_labels(self.scene, layout)
         frames, masks, things, cameras = self._renderer.render(
             motion.qpos, lambda qpos: light_buttons(self.scene, layout, qpos), labels if masked else None
@@ -398,7 +389,7 @@ class EpisodeRecorder:
         held_out = {
             "look": scene_id.startswith("unseen"),
             "body": self.scene.robot.name == HELD_OUT_BODY,
-            "camera": self.held_out_camera,
+            "camera": held_out_camera,
         }
         shift = "+".join(name for name, holds in held_out.items() if holds and drawn)
         episode = Episode(
@@ -442,7 +433,10 @@ class EpisodeRecorder:
     def record(self, job: Job) -> Recording:
         """Draw, execute and film one episode, a function of the job's ``entropy``; raises as :meth:`draw`."""
         layout, motion, scene_id, random = self.draw(job)
-        return self.film(layout, motion, episode_id=job.episode_id, scene_id=scene_id, split=job.split, jitter=random)
+        return self.film(
+            layout, motion, episode_id=job.episode_id, scene_id=scene_id, split=job.split, jitter=random,
+            held_out_camera=job.held_out_camera,
+        )  # fmt: skip
 
     def tool_positions(self, arm: int, qpos: np.ndarray) -> np.ndarray:
         """(N, 3) of an arm's tool."""
@@ -456,10 +450,12 @@ class EpisodeRecorder:
             positions.append(data.site_xpos[site].copy())
         return np.array(positions)
 
-    def _set_scene(self, renderer: SceneRenderer, scene_id: str, jitter: np.random.Generator) -> None:
+    def _set_scene(
+        self, renderer: SceneRenderer, scene_id: str, jitter: np.random.Generator, held_out_camera: bool
+    ) -> None:
         """Colours, light and cameras of an episode."""
         look = look_of(scene_id)
-        place = HELD_OUT_CAMERA if self.held_out_camera else look.head
+        place = HELD_OUT_CAMERA if held_out_camera else look.head
         azimuth, elevation, distance = (
             jitter.uniform(*limits) for limits in (place.aside_deg, place.elevation_deg, place.distance)
         )
