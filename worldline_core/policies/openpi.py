@@ -18,8 +18,8 @@ import os
 import re
 import socket
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -212,32 +212,16 @@ class MessageSocket:
             UnavailableError: the server is gone, reports an error (a text frame), or does not answer in time.
             DataError: the request cannot be packed, or the reply is no message or too large.
         """
-        from websockets.exceptions import ConnectionClosed
-
         content, begin = pack(message), time.monotonic()
-        try:
+        with self._connected():
             within(self.deadline_s, lambda: self._connection.send(content))
-        except TimeoutError as error:
-            raise self._late() from error
-        except ConnectionClosed as error:
-            raise self._closed(error) from error
         return self.receive(begin)
 
     def receive(self, begin: float | None = None) -> dict[str, Any]:
         """The next message of the server, within the deadline from ``begin`` (monotonic) on; raises as :meth:`request`."""
-        from websockets.exceptions import ConnectionClosed
-
         waited = 0.0 if begin is None else time.monotonic() - begin
-        try:
+        with self._connected():
             reply = self._connection.recv(timeout=max(0.0, self.deadline_s - waited))
-        except TimeoutError as error:
-            raise self._late() from error
-        except ConnectionClosed as error:
-            if error.sent is not None and error.sent.code == 1009 and not error.rcvd_then_sent:
-                raise DataError(
-                    "A reply is too large", where=self.url, expected=f"at most {self.max_bytes:,} bytes"
-                ) from error
-            raise self._closed(error) from error
         if isinstance(reply, str):
             self.close()
             for secret in self._secrets:
@@ -252,17 +236,25 @@ class MessageSocket:
             raise
         return found
 
-    def _late(self) -> UnavailableError:
-        self.close()
-        return UnavailableError(
-            "The server did not answer in time", where=self.url, expected=f"a reply within {self.deadline_s:g} s",
-            next_step="connect again; allow more time where the server needs it",
-        )  # fmt: skip
+    @contextmanager
+    def _connected(self) -> Iterator[None]:
+        from websockets.exceptions import ConnectionClosed
 
-    def _closed(self, error: Exception) -> UnavailableError:
-        return UnavailableError(
-            "The server closed the connection", where=self.url, got=str(error), next_step="connect again"
-        )
+        try:
+            yield
+        except TimeoutError as error:
+            self.close()
+            raise UnavailableError(
+                "The server did not answer in time", where=self.url, expected=f"a reply within {self.deadline_s:g} s",
+                next_step="connect again; allow more time where the server needs it",
+            ) from error  # fmt: skip
+        except ConnectionClosed as error:
+            if error.sent is not None and error.sent.code == 1009 and not error.rcvd_then_sent:
+                most = f"at most {self.max_bytes:,} bytes"
+                raise DataError("A reply is too large", where=self.url, expected=most) from error
+            raise UnavailableError(
+                "The server closed the connection", where=self.url, got=str(error), next_step="connect again"
+            ) from error
 
     def close(self) -> None:
         """End the connection; that of a server which takes nothing any more is cut."""
