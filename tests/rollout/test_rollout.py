@@ -68,9 +68,9 @@ def speed_of(output):
 def test_times_lie_beside_the_predictions_and_outside_their_digest(inputs, predicted, tmp_path):
     output = predicted[0].root
     speed, dtype = speed_of(output), "bfloat16" if CONFIG.bfloat16 else "float32"
-    assert speed.items() >= {"steps": 4, "batch_size": 2, "device": "cpu", "dtype": dtype}.items()
-    assert speed["frames"] == 6 * N  # the first of four batches of two warms up
-    assert speed["seconds_per_frame"] == speed["seconds"] / speed["frames"] > 0
+    # The first of four batches of two warms up.
+    assert speed.items() >= {"steps": 4, "batch_size": 2, "frames": 6 * N, "dtype": dtype}.items()
+    assert speed["seconds_per_frame"] > 0
     rolled(CONFIG, inputs, tmp_path)
     assert digest_folder(tmp_path) == digest_folder(output)
     rollout(CONFIG, inputs, output)  # nothing is left to predict

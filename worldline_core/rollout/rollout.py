@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from worldline_core.actions.action_tracks import changed_tracks
 from worldline_core.actions.episode_tracks import ActionTracks, open_controls
@@ -100,7 +98,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     if left_out:
         write_quarantine(output, left_out)
     writer = RolloutSetWriter(output, config.method, fps / config.stride, crf=config.crf)
-    times: list[tuple[int, int, float]] = []
+    times: list[tuple[int, float]] = []
     refused: dict[str, QuarantineRow] = {}
     with Progress(f"rollout {config.method}", len(planned), "clip") as progress:
         for batch in batches(planned, config.batch_size):
@@ -112,7 +110,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
                 pieces = _predicted(config, world, episodes, tracks, batch)
                 try:
                     seconds = _write(batch, pieces, writer, world.image_size, config.device)
-                    times.append((len(batch), sum(item.frames for item in batch), seconds))
+                    times.append((sum(item.frames for item in batch), seconds))
                 except RefusedPredictionError as error:
                     (item,) = batch  # a server predicts one by one
                     source = episodes.rows[item.position].source
@@ -178,20 +176,15 @@ def _load(
     return world
 
 
-def _observed(world: World, episodes: EpisodeSet, batch: Sequence[Prediction]) -> Float[Tensor, "b v 3 h w"]:
-    """First frames of every view in [-1, 1]."""
-    firsts = []
-    for item in batch:
-        frames = [episodes.frames(item.position, view, [0]) for view in item.views]
-        firsts.append(torch.stack([frames_to_video(frame, world.image_size)[:, 0] for frame in frames]))
-    return torch.stack(firsts)
-
-
 def _predicted(
     config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks | None, batch: Sequence[Prediction]
 ) -> Iterator[Frames]:
     """Frames of a batch, piece by piece."""
-    images = _observed(world, episodes, batch)
+    firsts = []  # of every view, in [-1, 1]
+    for item in batch:
+        frames = [episodes.frames(item.position, view, [0]) for view in item.views]
+        firsts.append(torch.stack([frames_to_video(frame, world.image_size)[:, 0] for frame in frames]))
+    images = torch.stack(firsts)
     if not isinstance(world, WorldLine):
         yield from world.stream(images, batch)
         return
@@ -234,18 +227,15 @@ def _finished(device: str) -> float:
     return time.perf_counter()
 
 
-def _write_speed(output: Path, config: RolloutConfig, world: World, times: Sequence[tuple[int, int, float]]) -> None:
-    """Write ``run/speed.json`` from (clips, frames, seconds) of the batches; the first one warms up, unless it is alone."""
-    clips, frames, seconds = (sum(column) for column in zip(*(times[1:] or times), strict=True))
+def _write_speed(output: Path, config: RolloutConfig, world: World, times: Sequence[tuple[int, float]]) -> None:
+    """Write ``run/speed.json`` from (frames, seconds) of the batches; the first one warms up, unless it is alone."""
+    frames, seconds = (sum(column) for column in zip(*(times[1:] or times), strict=True))
     speed = {
         "steps": world.steps,
         "batch_size": config.batch_size,
-        "device": config.device,
         "device_name": device_name(config.device),
         "dtype": "bfloat16" if config.bfloat16 else "float32",
-        "trajectories": clips,
         "frames": frames,
-        "seconds": seconds,
         "seconds_per_frame": seconds / frames,
     }
     write_json_atomic(output / "run" / "speed.json", speed)
