@@ -37,6 +37,7 @@ from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TrainedClips, WanConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.artifact_files import digest_folder, read_json_lines
 from worldline_core.training.clip_config import EncodeLatentsConfig
@@ -152,7 +153,7 @@ def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_
     assert (world.steps, world.frames_per_unit) == (2, 8)
     passes.clear()
     first, maps = torch.randn(1, 3, 4, 4, 4), torch.randn(1, 3, 9, 5, 4, 4)
-    simulator = world.simulator([42])
+    simulator = BlockCausalSimulator(world.model, world.causal, noise=Noise([42]))
     simulator.start(first, maps[:, :, :, :1])
     for _ in range(4):
         simulator.step(maps[:, :, :, 3:])

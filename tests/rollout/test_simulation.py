@@ -170,8 +170,6 @@ def test_what_does_not_fit_is_refused(observed, causal, models, tmp_path):
         WorldLine.from_pretrained(models / "causal", tokenizer=tmp_path / "none")
     with pytest.raises(CheckpointError, match=r"(?s)wrong kind.*stage2 or causal.*base"):
         WorldLine.from_pretrained(models / "base")
-    with pytest.raises(CheckpointError, match="Only a causal model goes block by block"):
-        WorldLine.from_pretrained(models / "stage2").simulator([42])
 
 
 def test_a_name_that_the_package_lacks_is_an_error():

@@ -120,7 +120,6 @@ def test_views_that_were_not_trained_together_are_refused_everywhere(inputs, mix
             partial(world.predict, embodiment="ur5e_silver"): (shown, np.zeros((17, 14)), cameras),
             partial(world.start, embodiment="ur5e_silver", state=np.zeros(14)): (shown, cameras),
             world.session: (torch.zeros(1, len(wrong), 3, *SIZE), [0], wrong),
-            world.simulator: ([0], wrong),
             partial(WorldLineEnv, model=world, views=wrong): (),
         }
         for door, arguments in doors.items():

@@ -41,8 +41,6 @@ class WorldLine:
         contract: what the controls mean: their rate (``fps``), how they are drawn, the grid of the latents.
         causal: blocks, window and nodes of a causal model; None for Stage II, which predicts a clip at once.
         steps: Euler steps per block, or of the whole clip.
-        clip_frames: of a Stage II model, frames of the longest clip that is predicted at once; longer predictions are
-            chained. None: all at once.
         frames_per_unit: a prediction has 1 + k times this many frames (k blocks, or k latent frames).
         image_size: (H, W) of the predicted frames.
         needs_cameras: controls are drawn into every view; a model that also takes control vectors does without some or all cameras.
@@ -106,13 +104,10 @@ class WorldLine:
             decoder: folder of a small decoder for its latents (train_tokenizer), which decodes in the tokenizer's place.
             expect_kind: refuse checkpoints of another kind.
             bfloat16: mixed precision of the model and the decoder; None: true, except on a processor without native bfloat16.
-            weights: how the model's weights are held, and those of a Wan autoencoder; in bfloat16 they take half the
-                memory and are cast only once, on reading, so that no copy in float32 ever exists.
+            weights: as of `RolloutConfig`.
             compiled: torch.compile of each layer but its attention: faster on a GPU after a minute at the first step.
             steps: Euler steps; by default those of the causal model, 35 for a Stage II model.
-            shift: of a Stage II model's noise levels towards noise (1: even steps, as in the paper).
-            clip_frames: of a Stage II model, frames of the longest clip predicted at once (1 + 4 k); longer predictions are
-                chained. By default all is predicted at once.
+            shift, clip_frames: of a Stage II model, as of `FullClipConfig`.
 
         Raises:
             ArtifactError: files of an artifact differ from its manifest.
@@ -282,13 +277,11 @@ class WorldLine:
         """A running prediction that begins at these images, to be driven unit by unit; arguments as of :meth:`stream`."""
         chosen = self.views if views is None else tuple(views)
         match_views(self.view_sets, chosen)
+        shown = {"noise": Noise(seeds), "views": chosen, "fps": self.contract.fps / stride, "bfloat16": self.bfloat16}
         if self.causal is not None:
-            sampler = self.simulator(seeds, chosen, stride)
+            sampler = BlockCausalSimulator(self.model, self.causal, **shown)
         else:
-            sampler = FullClipSampler(
-                self.model, noise=Noise(seeds), steps=self.steps, shift=self.shift, views=chosen,
-                fps=self.contract.fps / stride, bfloat16=self.bfloat16,
-            )  # fmt: skip
+            sampler = FullClipSampler(self.model, steps=self.steps, shift=self.shift, **shown)
         return Session(sampler, self.tokenizer, images, device=self.device, bfloat16=self.bfloat16)
 
     def unit(self, frames: int) -> int:
@@ -319,16 +312,3 @@ class WorldLine:
         drawing = ControlDrawing(self.contract.grid_size, self.contract.sigma_px_ref, native, count)
         chosen = torch.full((len(cut), len(views)), by_vector)
         return drawing.draw(collate_tracks(cut, views, native), drawn_size(cut), chosen).to(self.device)
-
-    def simulator(
-        self, seeds: Sequence[int], views: Sequence[str] | None = None, stride: int = 1
-    ) -> BlockCausalSimulator:
-        """The causal model, to be driven block by block. Raises: CheckpointError for a Stage II model."""
-        if self.causal is None:
-            raise CheckpointError("Only a causal model goes block by block", expected="causal", got=self.info.kind)
-        chosen = self.views if views is None else tuple(views)
-        match_views(self.view_sets, chosen)
-        return BlockCausalSimulator(
-            self.model, self.causal, noise=Noise(seeds), views=chosen, fps=self.contract.fps / stride,
-            bfloat16=self.bfloat16,
-        )  # fmt: skip
