@@ -104,10 +104,12 @@ class WorldLine:
             decoder: folder of a small decoder for its latents (train_tokenizer), which decodes in the tokenizer's place.
             expect_kind: refuse checkpoints of another kind.
             bfloat16: mixed precision of the model and the decoder; None: true, except on a processor without native bfloat16.
-            weights: as of `RolloutConfig`.
+            weights: of the model, and of a Wan autoencoder, in memory; in bfloat16 no copy in float32 ever exists.
             compiled: torch.compile of each layer but its attention: faster on a GPU after a minute at the first step.
             steps: Euler steps; by default those of the causal model, 35 for a Stage II model.
-            shift, clip_frames: of a Stage II model, as of `FullClipConfig`.
+            shift: of a Stage II model's noise levels towards noise (1: even steps, as in the paper).
+            clip_frames: of a Stage II model, frames of the longest clip predicted at once (1 + 4 k); longer predictions are
+                chained. None: all at once.
 
         Raises:
             ArtifactError: files of an artifact differ from its manifest.

@@ -27,7 +27,7 @@ _Videos = Annotated[np.ndarray, AfterValidator(partial(_finite, "u", 5))]
 
 
 class _Reply(BaseModel):
-    """State of a session, with what else a reply may have: pictures, frames, and the session that begins."""
+    """State of a session, and what else belongs to some replies: pictures, frames, and the session that begins."""
 
     model_config = ConfigDict(frozen=True, strict=True, arbitrary_types_allowed=True)
 
@@ -38,29 +38,10 @@ class _Reply(BaseModel):
     pictures: dict[str, _Pictures] = Field({}, min_length=1)
     frames: dict[str, _Videos] = Field({}, min_length=1)
     seconds: float = 0.0
-
-    def check(self, clips: int, frames: int) -> None:
-        """Raises: ValueError for another number of clips, or of frames of a step."""
-        parts = self.states, self.commands, self.tool_poses, *self.pictures.values(), *self.frames.values()
-        got = {len(part) for part in parts}, {video.shape[1] for video in self.frames.values()} or {frames}
-        if got != ({clips}, {frames}):
-            raise ValueError(f"{clips} clips and steps of {frames} frames wanted, got {got[0]} and {got[1]}")
-
-
-class _Opened(_Reply):
-    session: str
-    frames_per_step: int = Field(ge=1)
-    embodiment: str
-    state_names: list[str]
-    pictures: dict[str, _Pictures] = Field(min_length=1)
-
-
-class _Pictured(_Reply):
-    pictures: dict[str, _Pictures] = Field(min_length=1)
-
-
-class _Stepped(_Reply):
-    frames: dict[str, _Videos] = Field(min_length=1)
+    session: str = ""
+    frames_per_step: int = Field(1, ge=1)
+    embodiment: str = ""
+    state_names: list[str] = []
 
 
 class SimulatorClient(MessageSocket):
@@ -151,25 +132,31 @@ class RemoteSimulation:
 
     def __init__(self, client: SimulatorClient, opened: Mapping[str, Any]) -> None:
         self._client = client
-        reply = self._checked(_Opened, opened)
+        reply = self._checked(opened, "session", "frames_per_step", "embodiment", "state_names", "pictures")
         self.session, self.frames_per_step = reply.session, reply.frames_per_step
         self.embodiment, self.state_names = reply.embodiment, reply.state_names
         self.seconds = 0.0
         self._take(reply, len(reply.states))
 
-    def _checked[R: _Reply](self, kind: type[R], reply: Mapping[str, Any]) -> R:
+    def _checked(self, reply: Mapping[str, Any], *needed: str) -> _Reply:
+        what, url = "A reply of the server is not understood", self._client.url
+        if missing := [name for name in needed if name not in reply]:
+            raise DataError(what, where=f"{url}: {missing[0]}", got="nothing")
         try:
-            return kind.model_validate(reply)
+            return _Reply.model_validate(reply)
         except ValidationError as error:
             found = error.errors()[0]
-            where = f"{self._client.url}: {'.'.join(map(str, found['loc']))}"
-            raise DataError("A reply of the server is not understood", where=where, got=found["msg"]) from error
+            raise DataError(what, where=f"{url}: {'.'.join(map(str, found['loc']))}", got=found["msg"]) from error
 
     def _take(self, reply: _Reply, clips: int) -> None:
-        try:
-            reply.check(clips, self.frames_per_step)
-        except ValueError as error:
-            raise DataError("A reply of the server does not fit", where=self._client.url, got=error) from error
+        parts = reply.states, reply.commands, reply.tool_poses, *reply.pictures.values(), *reply.frames.values()
+        wanted = {clips}, {self.frames_per_step}
+        got = {len(part) for part in parts}, {video.shape[1] for video in reply.frames.values()} or wanted[1]
+        if got != wanted:
+            raise DataError(
+                "A reply of the server does not fit", where=self._client.url,
+                expected=f"{clips} clips and steps of {self.frames_per_step} frames", got=f"{got[0]} and {got[1]}",
+            )  # fmt: skip
         self.num_frames = reply.num_frames
         self.states, self.commands, self.tool_poses = reply.states, reply.commands, reply.tool_poses
         if reply.pictures:
@@ -183,7 +170,7 @@ class RemoteSimulation:
     def step(self, controls: np.ndarray) -> list[dict[str, np.ndarray]]:
         """Predict the next frames under controls ``(b, frames_per_step, j)``; of every clip ``uint8 (n, H, W, 3)`` by view."""
         request = {"op": "step", "session": self.session, "controls": np.asarray(controls, np.float64)}
-        reply = self._checked(_Stepped, self._client.call(request))
+        reply = self._checked(self._client.call(request), "frames")
         self._take(reply, len(self.states))
         self.seconds = reply.seconds
         frames = _by_clip(reply.frames)
@@ -203,7 +190,7 @@ class RemoteSimulation:
     def reset(self) -> None:
         """Go back to the start."""
         reply = self._client.call({"op": "reset", "session": self.session})
-        self._take(self._checked(_Pictured, reply), len(self.states))
+        self._take(self._checked(reply, "pictures"), len(self.states))
 
     def close(self) -> None:
         """End the session."""
