@@ -10,11 +10,7 @@ robot (``agent_pos``) is new at every step.
 Episodes begin at recorded first frames: a seed ``s`` at start ``s`` modulo their number, with noise of seed ``s``; or at any frame of
 a recording that is named, with what happened before it: the robot's motion, and the video so far. They end after
 ``episode_frames`` steps, where a judge looks at the whole video: ``is_success``, and a reward of 1. What the judge cannot see is no
-success. The soft reward comes with every new picture instead: what it adds to the likelihood that the task is done, so that an
-episode's sum is the likelihood at its end less that at its beginning.
-
-An optimised policy finds what one model gets wrong. Further models (``members``) are given the same commands: a success must be one
-in every video, and the soft score is the lowest of all, a lower bound that no single model's error raises.
+success.
 """
 
 from __future__ import annotations
@@ -246,7 +242,6 @@ class RunningEpisode:
     doubted: bool = False
 
     def info(self) -> dict[str, Any]:
-        """Gymnasium's info."""
         known: dict[str, Any] = {"is_success": self.success, "episode_id": self.start.episode_id}
         known["task"] = self.start.instruction
         if self.facts:
@@ -281,8 +276,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
     Args:
         model: a Stage II or causal checkpoint, or a ``WorldLine``; by default the shipped causal one.
-        members: further ones, whose videos are judged as well: a success is one in all, the soft score is the lowest. Observations
-            are of ``model``.
+        members: further ones, given the same commands, because an optimised policy finds what one model gets wrong: a success is one
+            in all videos, the soft score is the lowest. Observations are of ``model``.
         largest_disagreement: of soft scores (``disagreement`` in the infos); an episode with more is ``doubted``: it earns nothing
             more. A batch ends early where all of its episodes are doubted, so a single environment at once.
         recordings: an EpisodeSet, whose first frames are the starts; by default the shipped one.
@@ -292,7 +287,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         observe_every: steps between two observations of pictures, a divisor of the block's length; by default the block.
         success: "measured" (`MeasuredSuccess`), a function, or None: then nothing is a success.
         reward: "success", 1 at the end of an episode that is one; or "soft", at every new picture what it adds to the likelihood
-            that the task is done (`soft_score`); then infos have this likelihood (``score``) and what is measured (``task_state``).
+            that the task is done (`soft_score`), so that an episode's sum is the likelihood at its end less that at its beginning;
+            infos have it (``score``) and what is measured (``task_state``).
         start, frame: name of a recording and number of a frame at which every episode begins; a reset's ``options`` may name others.
         flat_observation: one level of keys, the views and ``agent_pos``.
         normalised_actions: -1 to 1 from one limit of a joint or gripper to the other (`RobotSpaces`).
@@ -434,7 +430,6 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r} for each environment")
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every environment."""
         return self.call(name)
 
     @property
@@ -554,7 +549,6 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         return self.spaces.observed(pictures, np.stack([episode.state for episode in episodes]))
 
     def infos(self) -> list[dict[str, Any]]:
-        """Current facts of each episode."""
         return [episode.info() for episode in self._episodes]
 
     def _infos(self) -> dict[str, Any]:
@@ -602,12 +596,10 @@ class WorldLineEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return self.vector._observed(0), self.vector.infos()[0]
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One command."""
         _, reward, terminated, truncated, _ = self.vector.step(np.asarray(action)[None])
         observed, info = self.vector._observed(0), self.vector.infos()[0]
         return observed, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> np.ndarray | None:
-        """Latest picture, its views side by side."""
         pictures = self.vector.render()
         return None if pictures is None else pictures[0]

@@ -49,7 +49,6 @@ class WorldLineVecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions of the next step."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -68,7 +67,6 @@ class WorldLineVecEnv(VecEnv):
         """Nothing to close."""
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Latest picture of each episode, its views side by side."""
         return self.envs.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:

@@ -126,7 +126,6 @@ class RecordBanksConfig(_AttemptsConfig):
     success_range: tuple[float, float] = (0.25, 0.75)
 
     def specs(self) -> list[BankSpec]:
-        """Every bank to record."""
         return self.banks.specs() if isinstance(self.banks, BankGrid) else list(self.banks)
 
     def draw(self, recorder: EpisodeRecorder, spec: BankSpec) -> tuple[Layout, dict[str, ExecutedMotion]]:
@@ -164,7 +163,6 @@ class RecordPoliciesConfig(_AttemptsConfig):
     starts: BankGrid
 
     def specs(self) -> list[BankSpec]:
-        """Every start."""
         return self.starts.specs()
 
     def draw(self, recorder: EpisodeRecorder, start: BankSpec) -> tuple[Layout, dict[str, ExecutedMotion]]:

@@ -137,7 +137,6 @@ class LookRange:
     fovy_deg: Range
 
     def draw(self, random: np.random.Generator) -> Look:
-        """Draw a look."""
         saturation, value = self.table[int(random.integers(len(self.table)))]
         table = _hsv(random.uniform(), random.uniform(*saturation), random.uniform(*value))
         floor, wall = (

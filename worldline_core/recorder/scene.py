@@ -290,7 +290,6 @@ class Layout:
     look: Look
 
     def acting(self) -> tuple[int, ...]:
-        """Numbers of the arms that act."""
         return tuple(range(len(self.start))) if self.family in TWO_ARMED else (self.arm,)
 
     def named(self) -> list[tuple[str, Thing]]:
@@ -305,7 +304,6 @@ class Layout:
         return names
 
     def rgba(self, thing: Thing) -> list[float]:
-        """Colour of a thing in this look."""
         return [*self.look.paint((OBJECT_COLOURS | NEUTRAL_COLOURS)[thing.colour]), 1.0]
 
 

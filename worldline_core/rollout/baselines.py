@@ -70,7 +70,6 @@ class FirstFrameCopy:
         self.image_size = recorded_size(episodes)
 
     def unit(self, frames: int) -> int:
-        """Frames are copied one by one."""
         return 1
 
     def stream(self, images: Float[Tensor, "b v 3 h w"], batch: Sequence[Prediction]) -> Iterator[Frames]:
@@ -225,7 +224,6 @@ class GeSim:
         return 1
 
     def close(self) -> None:
-        """End the session."""
         try:
             self._post("/close", self._body())
         except (UnavailableError, RefusedPredictionError):

@@ -152,7 +152,6 @@ class RolloutSet:
 
     @property
     def episode_ids(self) -> list[str]:
-        """Predicted episodes, in order."""
         return list(dict.fromkeys(row.episode_id for row in self.rows))
 
     def seeds(self, episode_id: str) -> list[int]:
@@ -160,7 +159,6 @@ class RolloutSet:
         return sorted({row.seed for row in self.rows if row.episode_id == episode_id})
 
     def views(self, episode_id: str) -> list[str]:
-        """Views of an episode."""
         return list(dict.fromkeys(row.view for row in self.rows if row.episode_id == episode_id))
 
     def frames(self, episode_id: str, view: str, seed: int | None = None) -> np.ndarray:

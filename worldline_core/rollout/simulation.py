@@ -239,7 +239,6 @@ class Starts:
         self.image_size = sizes.pop()
 
     def pictures(self, views: Sequence[str], size: tuple[int, int]) -> Float[Tensor, "b v 3 h w"]:
-        """First images at the model's size."""
         return torch.stack(
             [torch.stack([frames_to_video(start[view][None], size)[:, 0] for view in views]) for start in self.images]
         )
@@ -249,7 +248,6 @@ class Starts:
         return project_controls(self.cameras[clip], self.image_size, self.kinematics, controls=controls, fps=fps)
 
     def select(self, clips: Sequence[int]) -> Starts:
-        """The starts of some clips."""
         other = copy(self)
         for name in ("images", "cameras", "seeds", "earlier"):
             setattr(other, name, [getattr(self, name)[clip] for clip in clips])
@@ -368,7 +366,6 @@ class Simulation:
         self._tracks = [self._project(clip, rows[None]) for clip, rows in enumerate(self._drawn)]
 
     def __len__(self) -> int:
-        """Number of clips."""
         return len(self._starts.state)
 
     @property

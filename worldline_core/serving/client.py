@@ -188,12 +188,10 @@ class RemoteSimulation:
         return RemoteSimulation(self._client, self._client.call(request))
 
     def reset(self) -> None:
-        """Go back to the start."""
         reply = self._client.call({"op": "reset", "session": self.session})
         self._take(self._checked(reply, "pictures"), len(self.states))
 
     def close(self) -> None:
-        """End the session."""
         self._client.call({"op": "close", "session": self.session})
 
 

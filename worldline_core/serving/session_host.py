@@ -248,11 +248,10 @@ class SessionHost:
 
     @property
     def shared(self) -> bool:
-        """Returns whether there are several sessions or players, so that computing ahead for one would make others wait."""
+        """True where computing ahead for one session or player would make others wait."""
         return len(self._running) + len(self._players) > 1
 
     def dismiss(self, player: object) -> None:
-        """Free the room of a player."""
         self._players.discard(player)
 
     def _opened(self, owner: object, simulation: Simulation, start: Simulation) -> dict[str, Any]:
@@ -270,11 +269,9 @@ class SessionHost:
         }
 
     def leave(self, owner: object) -> None:
-        """Close all sessions of an owner."""
         self._running = {name: running for name, running in self._running.items() if running.owner is not owner}
 
     def shut_down(self) -> None:
-        """Release all sessions and the worker."""
         self._running.clear()
         self._worker.shutdown(wait=True, cancel_futures=True)
 
