@@ -17,7 +17,6 @@ import os
 import tempfile
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -173,20 +172,17 @@ class PlaySession:
 
     async def receive(self, text: str) -> None:
         """Act on one message; the page is sent any error."""
-        await self._reported(self._act(text))
-
-    async def _reported(self, work: Awaitable[None]) -> None:
         try:
-            await work
+            try:
+                message = _MESSAGE.validate_json(text)
+            except ValidationError as error:
+                found = error.errors()[0]
+                raise DataError("A message is not understood", where=found["loc"], got=found["msg"]) from error
+            await self._act(message)
         except WorldLineError as error:
             await self._send(json.dumps({"type": "error", **error_message(error)}))
 
-    async def _act(self, text: str) -> None:
-        try:
-            message = _MESSAGE.validate_json(text)
-        except ValidationError as error:
-            found = error.errors()[0]
-            raise DataError("A message is not understood", where=found["loc"], got=found["msg"]) from error
+    async def _act(self, message: Message) -> None:
         if isinstance(message, StartMessage):
             await self._begin(message)
             return
@@ -288,15 +284,23 @@ class PlaySession:
         await self._send(json.dumps({"type": "marks", "pending": len(self._pending), **hand.marks()}))
 
     def _work(self, work: Awaitable[None]) -> None:
-        async def done() -> None:
+        async def reported() -> None:
             try:
-                # A page that is gone, or takes no pictures, ends the session where its messages are read.
-                with suppress(WebSocketDisconnect, TimeoutError):
-                    await self._reported(work)
+                await work
+            except WorldLineError as error:
+                await self._send(json.dumps({"type": "error", **error_message(error)}))
             finally:
                 self._working = None
 
-        self._working = asyncio.create_task(done())
+        def ended(task: asyncio.Task[None]) -> None:
+            # A page that is gone, or takes no pictures, ends the session where its messages are read.
+            if not task.cancelled() and not isinstance(
+                task.exception(), (WebSocketDisconnect, TimeoutError, type(None))
+            ):
+                task.get_loop().call_exception_handler({"message": "a block failed", "exception": task.exception()})
+
+        self._working = asyncio.create_task(reported())
+        self._working.add_done_callback(ended)
 
     async def _settled(self) -> None:
         """Wait until no block is being made."""
