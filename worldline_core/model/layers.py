@@ -122,12 +122,6 @@ class TextContext:
     ignored: bool = False
 
 
-class CompiledInHalves(Protocol):
-    """A transformer layer that compiles all but its attention, which differs from pass to pass."""
-
-    def compile_halves(self) -> None: ...
-
-
 class RMSNorm(nn.Module):
     """Root-mean-square normalisation over the last axis, in float32 for half-precision inputs."""
 

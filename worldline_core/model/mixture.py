@@ -144,18 +144,15 @@ class MixtureLayer(nn.Module):
         text: tuple[Tensor, Tensor] | None = None,
     ) -> Float[Tensor, "b n d"]:
         """Advance the video tokens; ``text``: keys and values of the text in this layer, from `understand`."""
-        queries, keys, values = self._before_attention(tokens)
-        return self._after_attention(tokens, attend(layer, queries, keys, values, text))
+        queries, keys, values = self.before_attention(tokens)
+        return self.after_attention(tokens, attend(layer, queries, keys, values, text))
 
-    def compile_halves(self) -> None:
-        """Compile all but attention itself, which differs from pass to pass."""
-        self._before_attention = torch.compile(self._before_attention)  # pyright: ignore[reportUnknownMemberType]
-        self._after_attention = torch.compile(self._after_attention)  # pyright: ignore[reportUnknownMemberType]
-
-    def _before_attention(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def before_attention(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Queries, keys and values of the video tokens."""
         return self.self_attn.project(self.input_layernorm_moe_gen(tokens))
 
-    def _after_attention(self, tokens: Tensor, mixed: Tensor) -> Tensor:
+    def after_attention(self, tokens: Tensor, mixed: Tensor) -> Tensor:
+        """Tokens after what attention mixed, and the feed-forward."""
         tokens = tokens + self.self_attn.to_add_out(mixed)
         return tokens + self.mlp_moe_gen(self.post_attention_layernorm_moe_gen(tokens))
 

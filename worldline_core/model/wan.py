@@ -104,20 +104,17 @@ class WanLayer(nn.Module):
         self, tokens: Float[Tensor, "b n d"], attend: GenerationAttention, layer: int, condition: Condition
     ) -> Float[Tensor, "b n d"]:
         """Advance the video tokens."""
-        queries, keys, values = self._before_attention(tokens, condition.drive)
-        return self._after_attention(tokens, attend(layer, queries, keys, values, None), *condition)
+        queries, keys, values = self.before_attention(tokens, condition.drive)
+        return self.after_attention(tokens, attend(layer, queries, keys, values, None), *condition)
 
-    def compile_halves(self) -> None:
-        """Compile all but self-attention, which differs from pass to pass."""
-        self._before_attention = torch.compile(self._before_attention)  # pyright: ignore[reportUnknownMemberType]
-        self._after_attention = torch.compile(self._after_attention)  # pyright: ignore[reportUnknownMemberType]
-
-    def _before_attention(self, tokens: Tensor, drive: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def before_attention(self, tokens: Tensor, drive: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Queries, keys and values of the video tokens."""
         shift, scale = (self.scale_shift_table + drive)[:, :, :2].unbind(2)
         tokens = driven(tokens, shift, scale, self.eps)
         return self.attn1.project(tokens, tokens)
 
-    def _after_attention(self, tokens: Tensor, mixed: Tensor, drive: Tensor, text: Tensor) -> Tensor:
+    def after_attention(self, tokens: Tensor, mixed: Tensor, drive: Tensor, text: Tensor) -> Tensor:
+        """Tokens after what self-attention mixed, cross-attention and the feed-forward."""
         gate, shift, scale, last_gate = (self.scale_shift_table + drive)[:, :, 2:].unbind(2)
         tokens = gated(tokens, self.attn1.to_out(mixed), gate)
         plain = F.layer_norm(

@@ -14,7 +14,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import torch
 from einops import rearrange, repeat
@@ -35,7 +35,6 @@ from worldline_core.model.block_causal_attention import (
 )
 from worldline_core.model.layers import (
     ActionEncoder,
-    CompiledInHalves,
     GenerationAttention,
     NativeActionFilm,
     Rotation,
@@ -61,7 +60,8 @@ class WorldModel(nn.Module, ABC):
     """Predicts the velocity of multi-view latents from the first frame, action maps, and optionally text.
 
     A network has the parts that are declared here by the same names, says how it turns positions (`rotation`), runs over the
-    tokens (`_run`) and reads a text (`_read_text`). Its layers take (tokens, attention, number, condition).
+    tokens (`_run`) and reads a text (`_read_text`). Its layers take (tokens, attention, number, condition), and compute in
+    `before_attention` and `after_attention`, which can be compiled.
     """
 
     layers: nn.ModuleList
@@ -124,9 +124,10 @@ class WorldModel(nn.Module, ABC):
         return False
 
     def compile_blocks(self) -> None:
-        """Compile what every block computes around its attention; weights and their names stay as they are."""
-        for layer in cast("Sequence[CompiledInHalves]", self.layers):
-            layer.compile_halves()
+        """Compile what every block computes around its attention, which differs from pass to pass; weights keep their names."""
+        for layer in cast("Sequence[Any]", self.layers):
+            for part in ("before_attention", "after_attention"):
+                setattr(layer, part, torch.compile(getattr(layer, part)))  # pyright: ignore[reportUnknownMemberType]
 
     def initialise(self, generator: torch.Generator | None = None) -> None:
         """Starting values for training from scratch.
