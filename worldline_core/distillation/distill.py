@@ -60,7 +60,7 @@ from worldline_core.training.processes import (
     processes,
     wait_for_all,
 )
-from worldline_core.training.stage import HeldOutClips, input_facts, weights_of
+from worldline_core.training.stage import HeldOutClips, weights_of
 from worldline_core.training.trainer import ParameterGroup, batch_plan, train, trained_groups
 from worldline_core.training.training_config import TrainerConfig
 
@@ -350,7 +350,7 @@ class DistillationRun:
                 "tokenizer": self.source.description["tokenizer"],
                 "lpips": self.lpips,
                 "metrics": result.metrics,
-                **input_facts(config.input, self.source),
+                **self.source.facts,
             },
         }
         if processes()[0] == 0:

@@ -47,8 +47,10 @@ STARTS = 4
 """Clips of an episode that are looked at; more where few episodes are held out."""
 
 
-class ClipPredictor(Protocol):
-    """Predicts a batch's latents from its first frames: the objective that trains the model."""
+class MeasuredObjective(Protocol):
+    """An objective that can be measured on held-out clips: by its losses, and by what it predicts from their first frames."""
+
+    def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]: ...
 
     def predict(
         self, batch: Batch, action_maps: Float[Tensor, "b v a t #h #w"], noise: Float[Tensor, "b v c t h w"]
@@ -76,7 +78,7 @@ class ActionFollowing:
     def __init__(
         self,
         config: ActionFollowingConfig,
-        predictor: ClipPredictor,
+        objective: MeasuredObjective,
         loader: ClipLoader,
         rows: Sequence[ClipRow],
         episodes: EpisodeSet,
@@ -92,7 +94,7 @@ class ActionFollowing:
             view_sets: views that are trained together.
             frames_per_unit: clips have 1 + k times so many frames.
         """
-        self.config, self.predictor, self.loader, self.episodes = config, predictor, loader, episodes
+        self.config, self.objective, self.loader, self.episodes = config, objective, loader, episodes
         self.trainer = trainer
         self.tokenizer = _open_tokenizer(tokenizer, loader)
         self.spent, self.longest = 0.0, FIRST_SECONDS
@@ -228,7 +230,7 @@ class ActionFollowing:
     def _pictures(self, batch: Batch, maps: Tensor, noise: Tensor) -> list[np.ndarray]:
         """The first view's picture of each clip after a second."""
         with autocast(self.trainer):
-            latents = self.predictor.predict(batch, maps, noise)[:, 0].float()
+            latents = self.objective.predict(batch, maps, noise)[:, 0].float()
         firsts = [self._recorded(clip, batch.views[0], (0,)) for clip in batch.clips]
         reference = torch.from_numpy(np.concatenate(firsts)).permute(0, 3, 1, 2).to(latents.device) / 127.5 - 1.0
         video = self.tokenizer.decode(latents, reference)

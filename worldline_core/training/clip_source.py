@@ -58,6 +58,7 @@ class ClipSource(Dataset[Tensor | WorldLineError], ABC):
         clip_frames: most frames of a clip; None: all that the episode has.
         description: at least ``tokenizer`` (its fingerprint).
         resident: clips are kept on the training device.
+        facts: how clips are read, for a checkpoint's metadata.
     """
 
     root: Path
@@ -67,6 +68,7 @@ class ClipSource(Dataset[Tensor | WorldLineError], ABC):
     clip_frames: int | None = None
     description: dict[str, Any]
     resident = False
+    facts: Mapping[str, Any] = {}
 
     def __init__(self, rows: Sequence[ClipRow]) -> None:
         self.rows = list(rows)
@@ -276,8 +278,8 @@ class FrameSource(ClipSource):
         self.root, self.episodes, self.start_step = episodes.root, episodes, config.start_step
         self.latent_shape = (self._tokenizer.latent_channels, height // space, width // space)
         self.decoder = FrameDecoder()
-        fingerprint = tokenizer_fingerprint(self._tokenizer, tokenizer)
-        self.description = {"tokenizer": fingerprint, "decoder": FrameDecoder.name}
+        self.description = {"tokenizer": tokenizer_fingerprint(self._tokenizer, tokenizer)}
+        self.facts = {"input": {"kind": config.kind, "decoder": FrameDecoder.name}}
 
     def __getstate__(self) -> dict[str, Any]:
         # Loader processes read frames: they open files themselves and have no use for the tokenizer.

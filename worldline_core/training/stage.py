@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 
@@ -17,17 +17,17 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.model.checkpoint import CheckpointInfo
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, NativeVectors
-from worldline_core.training.action_following import ActionFollowing, ClipPredictor
+from worldline_core.training.action_following import ActionFollowing, MeasuredObjective
 from worldline_core.training.adapters import add_adapters, save_trained, say_price
-from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput
-from worldline_core.training.clip_loader import Batch, ClipLoader
+from worldline_core.training.clip_config import JOINT, ClipSampling
+from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 from worldline_core.training.clip_source import ClipSource, open_source, training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.optimizers import require_one_process
 from worldline_core.training.processes import BatchPlan, join_processes, place_model
-from worldline_core.training.trainer import ParameterGroup, Probe, TrainingResult, batch_plan, held_out_losses, train
+from worldline_core.training.trainer import ParameterGroup, TrainingResult, batch_plan, held_out_losses, train
 from worldline_core.training.training_config import (
     ActionFollowingConfig,
     LossWeighting,
@@ -164,7 +164,7 @@ class Stage:
         objective: FlowMatchingObjective,
         groups: Sequence[ParameterGroup],
         loader: ClipLoader,
-        probe: Probe | None = None,
+        probe: ActionFollowing | None = None,
     ) -> TrainingResult:
         """Train, or continue a killed run.
 
@@ -225,7 +225,7 @@ class Stage:
                 "episodes": len(self.training_rows),
                 "sources": dict(sorted(Counter(row.source for row in self.training_rows).items())),
                 "metrics": result.metrics,
-                **input_facts(self.config.input, self.source),
+                **self.source.facts,
                 **facts,
             },
         }
@@ -248,19 +248,6 @@ def weights_of(
     _, height, width = source.latent_shape
     resident = rows if source.resident else None
     return ObjectWeights(episodes, (height, width), *weighting.things, device=device, resident=resident)
-
-
-def input_facts(reading: ClipInput, source: ClipSource) -> dict[str, Any]:
-    """Facts on how clips were read."""
-    if isinstance(reading, FrameInput):
-        return {"input": {"kind": reading.kind, "decoder": source.description["decoder"]}}
-    return {}
-
-
-class MeasuredObjective(ClipPredictor, Protocol):
-    """An objective that can be measured on held-out clips."""
-
-    def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]: ...
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from safetensors.torch import save
@@ -44,8 +44,10 @@ from worldline_core.training.training_state import (
     identity_digests,
     nan_to_null,
     newest_state,
-    null_to_nan,
 )
+
+if TYPE_CHECKING:
+    from worldline_core.training.action_following import ActionFollowing
 
 
 @dataclass(frozen=True)
@@ -97,18 +99,6 @@ class Objective[BatchT: NamedBatch](Protocol):
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue from saved values."""
         del state
-
-
-class Probe(Protocol):
-    """A measurement of the averaged weights that takes its share of the run's time, and is always made after the last step."""
-
-    def due(self, seconds: float) -> bool:
-        """True when it is to be made, so many seconds after the run began or continued."""
-        ...
-
-    def measure(self, step: int) -> dict[str, float]:
-        """Values to log. Raises: TrainingError: the run is to end."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -190,7 +180,7 @@ def train[BatchT: NamedBatch](
     objective: Objective[BatchT],
     load: Callable[[int], BatchT],
     validate: Callable[[], dict[str, float]] | None = None,
-    probe: Probe | None = None,
+    probe: ActionFollowing | None = None,
     output: Path,
     identity: Mapping[str, Any],
     title: str,
@@ -206,8 +196,8 @@ def train[BatchT: NamedBatch](
     Args:
         load: number of this process's micro-step to batch (a pure function; `BatchPlan` says which clips it has).
         validate: measures held-out losses; called with the averaged weights in the model.
-        probe: measures the averaged weights; when, the clock decides, so its values are logged under ``run/``, and those after
-            the last step among the metrics.
+        probe: measures the averaged weights after the last step, and before where its share of the time allows: the clock decides
+            when, so its values are logged under ``run/``, and those after the last step among the metrics.
         output: ``metrics.jsonl`` is written here, the state to continue from and timings under ``run/``.
         identity: JSON values that name this run (config, start, clips); a state of another run is refused.
         schedule: factor on the base learning rate per step (0-based); by default `learning_rate_factor`.
@@ -226,14 +216,13 @@ def train[BatchT: NamedBatch](
     done, seconds, best = 0, 0.0, math.inf
     means, last = RunningMeans(), dict[str, float]()
     if (facts := states.load(digests)) is not None:
-        done, seconds, last = facts["step"], facts["seconds"], null_to_nan(facts["last"])
+        done, seconds, last = facts["step"], facts["seconds"], facts["last"]
         means, average.updates = RunningMeans(facts["means"]), facts["updates"]
         best = math.inf if facts["best"] is None else facts["best"]
         objective.load_state(facts["objective"])
     rank, world_size = processes()
-    log = MetricsLog(output / "metrics.jsonl", done) if rank == 0 else None
-    timings = MetricsLog(output / "run" / "timings.jsonl", done) if rank == 0 else None
-    probed = MetricsLog(output / PROBE_LOG, done) if rank == 0 and probe is not None else None
+    names = ("metrics.jsonl", "run/timings.jsonl", PROBE_LOG)
+    log, timings, probed = (MetricsLog(output / name, done) for name in names)
     began = saved_at = time.monotonic()
     seen = 0
     length = config.steps or round(60 * (config.minutes or 0))
@@ -255,23 +244,20 @@ def train[BatchT: NamedBatch](
                 current, means = means.values(), RunningMeans()
                 last = {**last, **current}
                 elapsed = time.monotonic() - began
-                if log is not None and timings is not None:
-                    log.add({"step": done, "learning_rate": settings.learning_rate * factor, **current})
-                    timings.add({"step": done, "seconds": elapsed, "clips_per_second": seen / elapsed})
+                log.add({"step": done, "learning_rate": settings.learning_rate * factor, **current})
+                timings.add({"step": done, "seconds": elapsed, "clips_per_second": seen / elapsed})
             score = math.inf
             if validate is not None and (ended or (config.validate_every and done % config.validate_every == 0)):
                 with average.swapped(), torch.no_grad():
                     scores = average_values({f"validation/{key}": value for key, value in validate().items()})
-                if log is not None:
-                    log.add({"step": done, **scores})
+                log.add({"step": done, **scores})
                 run.require_finite_scores(scores, done)
                 last = {**last, **scores}
                 score = scores.get(f"validation/{config.saving.best}", math.inf)
             if probe is not None and (ended or average_values({"due": probe.due(time.monotonic() - began)})["due"]):
                 with average.swapped(), torch.no_grad():
                     found = probe.measure(done)
-                if probed is not None:
-                    probed.add({"step": done, **found})
+                probed.add({"step": done, **found})
                 if ended:
                     last = {**last, **found}
             advanced = 1 if config.steps else round(min(seconds, length)) - progress.done
@@ -298,7 +284,7 @@ def train[BatchT: NamedBatch](
                         "objective": objective.state(),
                         **nan_to_null({"score": score, "best": best}),
                         "means": means.state(),
-                        "last": nan_to_null(last),
+                        "last": last,
                     }
                 )
             if asked["stop"] and not ended:
@@ -307,8 +293,8 @@ def train[BatchT: NamedBatch](
                     where=f"{title}, after step {done}, {100 * config.fraction(done, seconds):.3g} % of the run",
                     next_step=f"the same command continues from the state in {states.folder}",
                 )
-    names = [name for group in groups if group.averaged for name in group.parameters]
-    return TrainingResult(dict(zip(names, average.average.values(), strict=True)), last, done)
+    averaged = [name for group in groups if group.averaged for name in group.parameters]
+    return TrainingResult(dict(zip(averaged, average.average.values(), strict=True)), last, done)
 
 
 class TrainingRun[BatchT: NamedBatch]:

@@ -47,11 +47,6 @@ def nan_to_null(values: Mapping[str, float]) -> dict[str, float | None]:
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
-def null_to_nan(values: Mapping[str, float | None]) -> dict[str, float]:
-    """Metrics read from JSON, with NaN for null."""
-    return {name: math.nan if value is None else value for name, value in values.items()}
-
-
 class RunningMeans:
     """Means of named values, each over the times that it was added.
 
@@ -59,10 +54,8 @@ class RunningMeans:
         state: what `state` returned.
     """
 
-    def __init__(self, state: Mapping[str, tuple[float | None, int]] | None = None) -> None:
-        self._totals = {
-            name: (math.nan if total is None else total, count) for name, (total, count) in (state or {}).items()
-        }
+    def __init__(self, state: Mapping[str, tuple[float, int]] | None = None) -> None:
+        self._totals = dict(state or {})
 
     def add(self, values: Mapping[str, float]) -> None:
         """Take in one value of each name."""
@@ -74,23 +67,28 @@ class RunningMeans:
         """The mean of every name, by name."""
         return {name: total / count for name, (total, count) in sorted(self._totals.items())}
 
-    def state(self) -> dict[str, tuple[float | None, int]]:
+    def state(self) -> dict[str, tuple[float, int]]:
         """JSON values to continue from."""
-        return {name: (total if math.isfinite(total) else None, count) for name, (total, count) in self._totals.items()}
+        return self._totals
 
 
 class MetricsLog:
-    """JSON lines, each with a ``step``; lines later than the resumed step are dropped: they will be written again."""
+    """JSON lines, each with a ``step``, which the first process alone writes; lines later than the resumed step are dropped: they
+    will be written again.
+    """
 
     def __init__(self, path: Path, resume_step: int) -> None:
-        self.path = path
-        kept = [row for row in read_json_lines(path) if row["step"] <= resume_step]
-        write_bytes_atomic(path, "".join(f"{json.dumps(row)}\n" for row in kept).encode())
+        self.path, self._writes = path, processes()[0] == 0
+        if self._writes and path.is_file():
+            kept = [row for row in read_json_lines(path) if row["step"] <= resume_step]
+            write_bytes_atomic(path, "".join(f"{json.dumps(row)}\n" for row in kept).encode())
 
     def add(self, row: Mapping[str, float]) -> None:
         """Append one row."""
-        with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(nan_to_null(row), allow_nan=False) + "\n")
+        if self._writes:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(nan_to_null(row), allow_nan=False) + "\n")
 
 
 def identity_digests(identity: Mapping[str, Any]) -> dict[str, str]:
