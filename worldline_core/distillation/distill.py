@@ -45,7 +45,7 @@ from worldline_core.model.tokenizers import WanTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import match_views
 from worldline_core.store.atomic import write_bytes_atomic
-from worldline_core.training.adapters import add_adapters, save_trained, say_price, share_frozen
+from worldline_core.training.adapters import prepare, save_trained
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
@@ -222,23 +222,10 @@ class DistillationRun:
         expect_kind: CheckpointKind | None = None,
         shared: WorldModel | None = None,
     ) -> tuple[WorldModel, CheckpointInfo]:
-        """A checkpoint's video tower, to be trained, shared out among the processes; the first one alone reads its weights.
-
-        Args:
-            shared: a frozen model of the same weights, in place of those that are not trained.
-        """
+        """A checkpoint's video tower, to be trained, shared out among the processes; the first one alone reads its weights."""
         first = processes()[0] == 0
         model, info = load_checkpoint(folder, expect_kind=expect_kind, towers="generation", weights=first)
-        if (lora := self.config.lora) is not None:
-            add_adapters(model, lora, trainer.seed)
-            if shared is None:
-                say_price(model, lora)
-            else:
-                share_frozen(model, shared)
-        place_model(
-            model, trainer.sharding, precision=trainer.precision, device=trainer.device, weights=trainer.weights
-        )  # fmt: skip
-        return model, info
+        return prepare(model, trainer, self.config.lora, shared=shared), info
 
     def _frozen(self, trainer: TrainerConfig) -> WorldModel:
         """The Stage II model's video tower, which is not trained, shared out among the processes."""

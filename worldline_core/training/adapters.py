@@ -34,8 +34,8 @@ from worldline_core.model.layers import is_action_parameter
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-from worldline_core.training.processes import gathered, processes
-from worldline_core.training.training_config import LoRAConfig, MergeAdapterConfig
+from worldline_core.training.processes import gathered, place_model, processes
+from worldline_core.training.training_config import LoRAConfig, MergeAdapterConfig, TrainerConfig
 
 logger = logging.getLogger(__name__)
 
@@ -88,22 +88,31 @@ def _peft_settings(model: WorldModel, config: LoRAConfig) -> dict[str, Any]:
     return {"r": config.rank, "lora_alpha": config.scale * config.rank, "target_modules": model.adapted}
 
 
-def share_frozen(model: WorldModel, other: WorldModel) -> None:
-    """Put the weights of ``other``, a frozen model of the same checkpoint, in place of those that ``model`` does not train."""
-    own = dict(other.named_parameters())
-    for name, parameter in model.named_parameters():
-        if not parameter.requires_grad:
-            parameter.data = own[name.replace(".base_layer.", ".")].data
+def prepare(
+    model: WorldModel, trainer: TrainerConfig, lora: LoRAConfig | None, *, shared: WorldModel | None = None
+) -> WorldModel:
+    """Give a model that is to be trained its adapters, if any, and put it on its device (`place_model`). What adapters cost is logged.
 
-
-def say_price(model: WorldModel, config: LoRAConfig) -> None:
-    """Log what adapters cost, beside what they train."""
-    trained = sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
-    logger.warning(
-        "LoRA of rank %d trains %.2g %% of the weights. It saves memory, and follows controls less well: on Cosmos3-Edge others "
-        "measured an end effector 14.0 px off after 1 s, and 5.8 px after full fine-tuning (SO-101).",
-        config.rank, 100 * trained / sum(parameter.numel() for parameter in model.parameters()),
-    )  # fmt: skip
+    Args:
+        shared: a frozen model of the same checkpoint, whose weights take the place of those that are not trained.
+    """
+    if lora is not None:
+        add_adapters(model, lora, trainer.seed)
+        if shared is None:
+            trained = sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
+            whole = sum(parameter.numel() for parameter in model.parameters())
+            logger.warning(
+                "LoRA of rank %d trains %.2g %% of the weights. It saves memory, and follows controls less well: on Cosmos3-Edge "
+                "others measured an end effector 14.0 px off after 1 s, and 5.8 px after full fine-tuning (SO-101).",
+                lora.rank, 100 * trained / whole,
+            )  # fmt: skip
+        else:
+            own = dict(shared.named_parameters())
+            for name, parameter in model.named_parameters():
+                if not parameter.requires_grad:
+                    parameter.data = own[name.replace(".base_layer.", ".")].data
+    precision, weights = trainer.precision, trainer.weights
+    return place_model(model, trainer.sharding, precision=precision, device=trainer.device, weights=weights)
 
 
 def save_trained(

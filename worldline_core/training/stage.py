@@ -18,7 +18,7 @@ from worldline_core.model.checkpoint import CheckpointInfo
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ActionContract, NativeVectors
 from worldline_core.training.action_following import ActionFollowing, MeasuredObjective
-from worldline_core.training.adapters import add_adapters, save_trained, say_price
+from worldline_core.training.adapters import prepare, save_trained
 from worldline_core.training.clip_config import JOINT, ClipSampling
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler
@@ -26,7 +26,7 @@ from worldline_core.training.clip_source import ClipSource, open_source, trainin
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.optimizers import require_one_process
-from worldline_core.training.processes import BatchPlan, join_processes, place_model
+from worldline_core.training.processes import BatchPlan, join_processes
 from worldline_core.training.trainer import ParameterGroup, TrainingResult, batch_plan, held_out_losses, train
 from worldline_core.training.training_config import (
     ActionFollowingConfig,
@@ -90,12 +90,7 @@ class Stage:
         require_one_process(trainer, {"lora": config.lora is not None, "text_tower": not trains_text})
         torch.manual_seed(trainer.seed)
         model, info = load_model()
-        if config.lora is not None:
-            add_adapters(model, config.lora, trainer.seed)
-            say_price(model, config.lora)
-        place_model(
-            model, trainer.sharding, precision=trainer.precision, device=device, weights=trainer.weights
-        ).train()
+        prepare(model, trainer, config.lora).train()
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
         source = open_source(config.input, inputs, episodes, device)
         rows = training_rows(
