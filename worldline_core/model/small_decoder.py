@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from copy import copy
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +25,7 @@ from torch import Tensor, nn
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import described, fill, read_description, read_weights
-from worldline_core.model.tokenizers import Residual, VideoTokenizer, check_latents
+from worldline_core.model.tokenizers import Residual, VideoDecoder, VideoTokenizer, check_latents
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 DESCRIPTION, WEIGHTS = "decoder.json", "decoder.safetensors"
@@ -64,7 +63,7 @@ class SmallDecoderConfig(StrictModel):
 _LAYOUT = ("latent_channels", "spatial_compression", "temporal_compression")
 
 
-class SmallDecoder(nn.Module):
+class SmallDecoder(nn.Module, VideoTokenizer):
     """A linear decode of each latent cell, refined by residual convolutions from the latent grid up to half the pictures' size.
 
     Where the observed first picture is given, each frame is ``mask * observed + (1 - mask) * made``, else ``made``. With the
@@ -146,14 +145,7 @@ class SmallDecoder(nn.Module):
         """Latents, as the tokenizer makes them."""
         return self._tokenizer[0].encode(video)
 
-    def decode(
-        self, latents: Float[Tensor, "b c t_l h_l w_l"], reference: Float[Tensor, "b 3 h w"] | None = None
-    ) -> Float[Tensor, "b 3 t h w"]:
-        """Video in [-1, 1]; with the observed first frame, still background keeps its full detail."""
-        return self.decoder(reference)(latents)
-
     def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> SmallDecoding:
-        """Decode as latents arrive, with the frames of :meth:`decode`."""
         return SmallDecoding(self, reference)
 
     def save(self, folder: Path, metadata: Mapping[str, Any] | None = None) -> None:
@@ -205,7 +197,7 @@ def windows(
     return rearrange(window, "b w t h_l w_l -> b t w h_l w_l")
 
 
-class SmallDecoding:
+class SmallDecoding(VideoDecoder):
     """Decodes clips as their latents arrive, one latent frame after the other, however many come at once."""
 
     def __init__(self, network: SmallDecoder, reference: Tensor | None) -> None:
@@ -233,9 +225,4 @@ class SmallDecoding:
         return rearrange(torch.cat(groups, dim=1), "b t c h w -> b c t h w").to(latents.dtype)
 
     def begin(self, first: Float[Tensor, "b c 1 h_l w_l"]) -> None:
-        """Take in the latents of frame 0 where its picture is known."""
         self._first = self._before = first[:, :, 0]
-
-    def copy(self) -> SmallDecoding:
-        """A decoder in the same state that goes on separately."""
-        return copy(self)

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from copy import copy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, Self, cast, runtime_checkable
 
 import cv2
 import numpy as np
@@ -49,28 +50,32 @@ class VideoTokenizer(Protocol):
     def decode(
         self, latents: Float[Tensor, "b c t_l h_l w_l"], reference: Float[Tensor, "b 3 h w"] | None = None
     ) -> Float[Tensor, "b 3 t h w"]:
-        """Latents to video; ``reference``, the observed first frame, helps tokenizers that can use it."""
-        ...
+        """Latents to video in [-1, 1]; with ``reference``, the observed first frame, still background keeps its full detail in
+        tokenizers that can use it.
+        """
+        return self.decoder(reference)(latents)
 
     def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> VideoDecoder:
         """Returns a decoder like :meth:`decode` for latents that arrive one after the other."""
         ...
 
 
-class VideoDecoder(Protocol):
-    """Decodes clips as their latents arrive; it keeps no more of them than later frames need."""
+class VideoDecoder(ABC):
+    """Decodes clips as their latents arrive; it keeps no more of them than later frames need, in values that it replaces and
+    never changes.
+    """
 
+    @abstractmethod
     def __call__(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
         """Frames of the next latents, the first of them those of frame 0."""
-        ...
 
+    @abstractmethod
     def begin(self, first: Float[Tensor, "b c 1 h w"]) -> None:
         """Take in the latents of frame 0 where its picture is known."""
-        ...
 
-    def copy(self) -> VideoDecoder:
+    def copy(self) -> Self:
         """A decoder in the same state that goes on separately."""
-        ...
+        return copy(self)
 
 
 def check_video(tokenizer: VideoTokenizer, video: Tensor) -> None:
@@ -233,7 +238,7 @@ class PatchTokenizerConfig(StrictModel):
     refinement_depth: int = Field(default=2, ge=1)
 
 
-class PatchTokenizer(nn.Module):
+class PatchTokenizer(nn.Module, VideoTokenizer):
     """Linear codes on orthonormal bases, and a decoder that adds what the codes leave out."""
 
     KIND = "patch"
@@ -317,14 +322,7 @@ class PatchTokenizer(nn.Module):
             video = torch.cat((video[:, :1], video[:, self.temporal_compression :]), dim=1)
         return rearrange(video, "b t h w c -> b c t h w")
 
-    def decode(
-        self, latents: Float[Tensor, "b c t_l h_l w_l"], reference: Float[Tensor, "b 3 h w"] | None = None
-    ) -> Float[Tensor, "b 3 t h w"]:
-        """Latents to video in [-1, 1]; with the observed first frame, still background keeps its full detail."""
-        return self.decoder(reference)(latents)
-
     def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> PatchDecoding:
-        """Decode as latents arrive, with the frames of :meth:`decode`."""
         return PatchDecoding(self, reference)
 
     def refine(
@@ -384,29 +382,23 @@ class PatchTokenizer(nn.Module):
         return tokenizer
 
 
-class PatchDecoding:
-    """A `VideoDecoder` of a patch tokenizer: each latent frame is decoded beside the first one and the observed picture."""
+class PatchDecoding(VideoDecoder):
+    """Decodes for a patch tokenizer: each latent frame is decoded beside the first one and the observed picture."""
 
     def __init__(self, tokenizer: PatchTokenizer, reference: Tensor | None) -> None:
         self._tokenizer, self._reference = tokenizer, reference
         self._still: tuple[Tensor, Tensor] | None = None
 
     def begin(self, first: Float[Tensor, "b c 1 h w"]) -> None:
-        """Take in the latents of frame 0 where its picture is known."""
         group = self._tokenizer.decode_groups(first, begins=True)[:, 0]
         self._still = self._tokenizer.still(group, self._reference)
 
     def __call__(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
-        """Frames of the next latents."""
         begins = self._still is None
         groups = self._tokenizer.decode_groups(latents, begins=begins)
         if self._still is None:
             self._still = self._tokenizer.still(groups[:, 0], self._reference)
         return self._tokenizer.unfold(self._tokenizer.refinement(groups, *self._still), begins=begins)
-
-    def copy(self) -> PatchDecoding:
-        """A decoder in the same state that goes on separately."""
-        return copy(self)
 
 
 def fit_patch_tokenizer(
@@ -505,7 +497,7 @@ WAN22_STD = (
 # fmt: on
 
 
-class WanTokenizer(nn.Module):
+class WanTokenizer(nn.Module, VideoTokenizer):
     """``AutoencoderKLWan``: encoding takes the mode of the posterior, latents are ``(mode - mean) / std`` a channel."""
 
     mean: Tensor
@@ -548,7 +540,6 @@ class WanTokenizer(nn.Module):
             return self.vae.decode(codes, return_dict=False)[0].to(latents.dtype)
 
     def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> WanDecoder:
-        """Decode latent frame by latent frame, with the frames of :meth:`decode`."""
         return WanDecoder(self)
 
     @classmethod
@@ -579,7 +570,7 @@ class WanTokenizer(nn.Module):
         return cls(vae.eval().requires_grad_(False), where=root)
 
 
-class WanDecoder:
+class WanDecoder(VideoDecoder):
     """Decodes clips as their latents arrive. The autoencoder's convolutions are causal: what they need of earlier frames
     is held by one cache per convolution, which `AutoencoderKLWan.decode` clears at its end and this keeps.
     """
@@ -590,12 +581,11 @@ class WanDecoder:
         self._begun = False
 
     def __call__(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
-        """Frames of the next latents."""
         from diffusers.models.autoencoders.autoencoder_kl_wan import unpatchify
 
         tokenizer, vae = self._tokenizer, self._tokenizer.vae
         check_latents(tokenizer, latents)
-        frames: list[Tensor] = []
+        frames, self._cache = list[Tensor](), list(self._cache)
         with torch.autocast(device_type=latents.device.type, enabled=False):
             codes = vae.post_quant_conv((latents.float() * tokenizer.std + tokenizer.mean).to(vae.dtype))
             for code in codes.split(1, dim=2):
@@ -610,12 +600,6 @@ class WanDecoder:
     def begin(self, first: Float[Tensor, "b c 1 h w"]) -> None:
         """Take in the latents of frame 0, which costs as much as its picture."""
         self(first)
-
-    def copy(self) -> WanDecoder:
-        """A decoder in the same state that goes on separately; tensors of the cache are replaced, never changed."""
-        other = WanDecoder(self._tokenizer)
-        other._cache, other._begun = list(self._cache), self._begun
-        return other
 
 
 WAN22_SHAPE = {

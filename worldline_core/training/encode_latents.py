@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import batched
+from itertools import batched, product
 from pathlib import Path
 from typing import IO, Any, ClassVar, NoReturn
 
@@ -52,6 +52,26 @@ def encode_clip(
     return latents
 
 
+def clips_to_encode(count: int, layout: Layout, config: EncodeLatentsConfig) -> dict[tuple[int, int], range]:
+    """Frames of each clip that is encoded of an episode of ``count`` frames, by stride, and start or phase (see `latent_key`)."""
+    clips: dict[tuple[int, int], range] = {}
+    for stride, start in product(config.strides, range(0, count, config.start_step)):
+        length = longest_clip(count, start, stride)
+        number = start
+        if layout == "clips":
+            length = min(length, config.clip_frames or length)
+        else:
+            number = (start + stride) % (TEMPORAL_FACTOR * stride)
+        if layout == "clips" or length > 1:  # the first clip of each phase yields every group of that phase
+            clips.setdefault((stride, number), range(start, start + stride * (length - 1) + 1, stride))
+    return clips
+
+
+def _groups_before(clip: range) -> int:
+    """Groups of a clip's phase that begin before the clip; they are stored as zeros."""
+    return (clip.start + clip.step) // (TEMPORAL_FACTOR * clip.step)
+
+
 def encode_episode(
     tokenizer: VideoTokenizer,
     episode_id: str,
@@ -69,40 +89,20 @@ def encode_episode(
     if layout == "groups":
         singles = [stacked(range(start, start + 1)) for start in range(0, count, config.start_step)]
         tensors[latent_key(episode_id, "single")] = torch.cat(singles, 2)
-    for stride in config.strides:
-        period = TEMPORAL_FACTOR * stride
-        for start in range(0, count, config.start_step):
-            frames = longest_clip(count, start, stride)
-            if layout == "clips":
-                frames = min(frames, config.clip_frames or frames)
-            indices = range(start, start + stride * (frames - 1) + 1, stride)
-            if layout == "clips":
-                tensors[latent_key(episode_id, "clips", stride, start)] = stacked(indices)
-                continue
-            # The first clip of each phase yields every group of that phase.
-            key = latent_key(episode_id, "groups", stride, (start + stride) % period)
-            if key in tensors or frames == 1:
-                continue
-            groups = stacked(indices)[:, :, 1:]
-            missing = (start + stride) // period
-            if missing:
-                groups = torch.cat([torch.zeros_like(groups[:, :, :1]).expand(-1, -1, missing, -1, -1), groups], 2)
-            tensors[key] = groups.contiguous()
+    for numbers, clip in clips_to_encode(count, layout, config).items():
+        latents = stacked(clip)
+        if layout == "groups":
+            latents = torch.nn.functional.pad(latents[:, :, 1:], (0, 0, 0, 0, _groups_before(clip), 0)).contiguous()
+        tensors[latent_key(episode_id, layout, *numbers)] = latents
     return tensors
 
 
 def stored_latent_frames(count: int, layout: Layout, config: EncodeLatentsConfig) -> int:
     """Latent frames that `encode_episode` stores of each view of an episode of ``count`` frames."""
-    starts = range(0, count, config.start_step)
-    lengths = {(stride, start): longest_clip(count, start, stride) for stride in config.strides for start in starts}
-    if layout == "clips":
-        return sum(len(latent_frame_indices(min(length, config.clip_frames or length))) for length in lengths.values())
-    total, phases = len(starts), set[tuple[int, int]]()
-    for (stride, start), length in lengths.items():
-        missing, phase = divmod(start + stride, TEMPORAL_FACTOR * stride)
-        if length > 1 and (stride, phase) not in phases:
-            phases.add((stride, phase))
-            total += missing + len(latent_frame_indices(length)) - 1
+    clips = clips_to_encode(count, layout, config).values()
+    total = sum(len(latent_frame_indices(len(clip))) for clip in clips)
+    if layout == "groups":
+        total += len(range(0, count, config.start_step)) + sum(_groups_before(clip) - 1 for clip in clips)
     return total
 
 
