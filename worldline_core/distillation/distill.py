@@ -234,7 +234,6 @@ class DistillationRun:
         return place_model(model, trainer.sharding, precision=trainer.precision, device=trainer.device)
 
     def _sampler(self, trainer: TrainerConfig, clips: ClipSampling, plan: BatchPlan) -> ClipSampler:
-        """Clips of the training splits."""
         rows = [row for row in self.rows if row.split in self.config.splits]
         return ClipSampler(
             rows, clips, views=self.config.views, start_step=self.source.start_step,

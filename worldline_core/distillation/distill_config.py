@@ -200,7 +200,6 @@ class DistillConfig(StrictModel):
 
     @property
     def first_clips(self) -> ClipSampling:
-        """Clips of the first step."""
         first = self.teacher_forcing
         weights = first.view_weights or self.clips.view_weights
         mixed = {"view_weights": weights, "single_view_factor": first.single_view_factor}

@@ -247,7 +247,6 @@ class TrajectoryStore:
         return len(self._clips)
 
     def clips(self, indices: Sequence[int]) -> tuple[Clip, ...]:
-        """The clips of some trajectories."""
         return tuple(self._clips[index][2] for index in indices)
 
     def read(self, name: str, indices: Sequence[int]) -> Tensor:
@@ -356,7 +355,6 @@ class TrajectoryObjective(CausalObjective[TrajectoryBatch]):
         self.perceptual = perceptual
 
     def loss(self, batch: TrajectoryBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Trajectory loss of one batch, and its parts."""
         del step
         blocks = (batch.latents.shape[3] - 1) // self.spec.block_size
         total, terms = self.regression(batch, draw_nodes(len(batch.latents), blocks, self.spec.steps, generator))

@@ -183,7 +183,6 @@ class KVCache:
 
     @property
     def frames(self) -> int:
-        """Latent frames in the window."""
         return self.window.frames
 
     @property

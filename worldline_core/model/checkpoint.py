@@ -223,12 +223,10 @@ class CheckpointInfo(StrictModel):
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Views of the largest trained set."""
         return self.view_sets[0]
 
     @property
     def strides(self) -> tuple[int, ...]:
-        """Strides that the model was trained at."""
         return (1,) if self.trained is None else self.trained.strides
 
     @property

@@ -148,7 +148,6 @@ class MixtureLayer(nn.Module):
         return self.after_attention(tokens, attend(layer, queries, keys, values, text))
 
     def before_attention(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values of the video tokens."""
         return self.self_attn.project(self.input_layernorm_moe_gen(tokens))
 
     def after_attention(self, tokens: Tensor, mixed: Tensor) -> Tensor:

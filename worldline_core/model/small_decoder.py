@@ -142,7 +142,6 @@ class SmallDecoder(nn.Module, VideoTokenizer):
         self.linear.load_state_dict({"weight": weight, "bias": solution[-1]})
 
     def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]:
-        """Latents, as the tokenizer makes them."""
         return self._tokenizer[0].encode(video)
 
     def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> SmallDecoding:

@@ -134,7 +134,6 @@ class Cosmos3Text:
     def __call__(
         self, texts: Sequence[str], clips: Sequence[ClipFacts]
     ) -> tuple[Int[Tensor, "b m"], Bool[Tensor, "b m"]]:
-        """Ids of every clip's prompt."""
         return padded([self.ids(text, clip) for text, clip in zip(texts, clips, strict=True)], self._ending[0])
 
 
@@ -161,7 +160,6 @@ class ByteText:
     def __call__(
         self, texts: Sequence[str], clips: Sequence[ClipFacts]
     ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
-        """Ids of the texts alone."""
         cut = [text.lower().strip().encode()[: self.max_length - 1] for text in texts]
         return padded([[*(byte + BYTE_OFFSET for byte in text), END_OF_TEXT] for text in cut], 0)
 

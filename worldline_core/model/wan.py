@@ -103,12 +103,10 @@ class WanLayer(nn.Module):
     def forward(
         self, tokens: Float[Tensor, "b n d"], attend: GenerationAttention, layer: int, condition: Condition
     ) -> Float[Tensor, "b n d"]:
-        """Advance the video tokens."""
         queries, keys, values = self.before_attention(tokens, condition.drive)
         return self.after_attention(tokens, attend(layer, queries, keys, values, None), *condition)
 
     def before_attention(self, tokens: Tensor, drive: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values of the video tokens."""
         shift, scale = (self.scale_shift_table + drive)[:, :, :2].unbind(2)
         tokens = driven(tokens, shift, scale, self.eps)
         return self.attn1.project(tokens, tokens)

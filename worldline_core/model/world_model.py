@@ -352,7 +352,6 @@ class WorldModel(nn.Module, ABC):
         return torch.cat((torch.zeros_like(velocity[..., :1, :, :]), velocity[..., history:, :, :]), dim=3)
 
     def _patch_grid(self, latents: Tensor) -> tuple[int, int]:
-        """Patch rows and columns of one view."""
         return latents.shape[-2] // self.config.patch_size, latents.shape[-1] // self.config.patch_size
 
     def _rotation(

@@ -413,5 +413,4 @@ class CausalSpec(StrictModel):
 
     @property
     def steps(self) -> int:
-        """Euler steps per block."""
         return len(self.sigmas) - 1

@@ -160,7 +160,6 @@ class LatentStore(ClipSource):
 
     @property
     def stored_bytes(self) -> int:
-        """Bytes of all latents."""
         return sum(path.stat().st_size for path in self.root.glob("*.safetensors"))
 
     def read(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v c t h w"]:

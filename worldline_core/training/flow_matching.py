@@ -126,7 +126,6 @@ class FlowMatchingObjective(Objective[Batch]):
         self.encode_text: Callable[[Tensor, Tensor | None], TextContext] = model.encode_text
 
     def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Loss of one micro-batch and its parts."""
         latents = batch.latents
         sigma = sample_sigmas(self.sigma, latents.shape[0], generator)
         noise = torch.randn(latents.shape, generator=generator, device=latents.device)
@@ -161,17 +160,14 @@ class FlowMatchingObjective(Objective[Batch]):
         return None if batch.text_ids is None else self.encode_text(batch.text_ids, batch.text_mask)
 
     def end_step(self, values: Mapping[str, float]) -> None:
-        """Update the scales of the relational terms with this step's losses."""
         if self.relational is not None:
             means = (values[name] for name in ("flow_matching", "relational_intra", "relational_cross"))
             self.relational.scales.update(*means)
 
     def state(self) -> dict[str, Any]:
-        """Running loss scales."""
         return {} if self.relational is None else dict(self.relational.scales.ratios)
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Continue from saved scales."""
         if self.relational is not None:
             self.relational.scales.ratios = dict(state)
 

@@ -104,7 +104,6 @@ class RelationalScales:
         self.ratios: dict[str, float] = {}
 
     def at(self, step: int) -> tuple[float, float]:
-        """Scales (intra, cross) of this step."""
         ramp = min(1.0, (step + 1) / self.config.ramp_steps) if self.config.ramp_steps else 1.0
         intra, cross = (self.ratios.get(name, 0.0) for name in ("intra", "cross"))
         config = self.config

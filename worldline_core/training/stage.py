@@ -108,7 +108,6 @@ class Stage:
 
     @property
     def training_rows(self) -> list[ClipRow]:
-        """Episodes of the training splits."""
         return [row for row in self.rows if row.split in self.config.splits]
 
     @cached_property

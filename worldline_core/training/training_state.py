@@ -58,17 +58,14 @@ class RunningMeans:
         self._totals = dict(state or {})
 
     def add(self, values: Mapping[str, float]) -> None:
-        """Take in one value of each name."""
         for name, value in values.items():
             total, count = self._totals.get(name, (0.0, 0))
             self._totals[name] = (total + value, count + 1)
 
     def values(self) -> dict[str, float]:
-        """The mean of every name, by name."""
         return {name: total / count for name, (total, count) in sorted(self._totals.items())}
 
     def state(self) -> dict[str, tuple[float, int]]:
-        """JSON values to continue from."""
         return self._totals
 
 
@@ -84,7 +81,6 @@ class MetricsLog:
             write_bytes_atomic(path, "".join(f"{json.dumps(row)}\n" for row in kept).encode())
 
     def add(self, row: Mapping[str, float]) -> None:
-        """Append one row."""
         if self._writes:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("a", encoding="utf-8") as stream:
@@ -179,7 +175,6 @@ class ExponentialAverage:
 
     @torch.no_grad()
     def update(self) -> None:
-        """Take in the current weights."""
         decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
         self.updates += 1
         for name, parameter in self.parameters.items():
@@ -370,7 +365,6 @@ class TrainingStates:
 
     @property
     def busy(self) -> bool:
-        """Returns whether a state is being written."""
         return self._writing is not None and not self._writing.done()
 
     def collect(self, *, wait: bool = False) -> BaseException | None:

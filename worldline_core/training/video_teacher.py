@@ -109,7 +109,6 @@ class SmallVideoTeacher(nn.Module):
     def encode(
         self, tubelets: Float[Tensor, "b t n p"], hidden: Bool[Tensor, "b t n"] | None = None
     ) -> list[Float[Tensor, "b m d"]]:
-        """Outputs of the last four blocks."""
         tokens = self.embed(tubelets * 2 - 1)
         if hidden is not None:
             tokens = torch.where(hidden[..., None], self.mask_token.to(tokens.dtype), tokens)
@@ -137,7 +136,6 @@ class SmallVideoTeacher(nn.Module):
 
     @torch.no_grad()
     def features(self, frames: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b t2 h2 w2 d"]:
-        """Concatenated, normalised outputs of the last four blocks; frames in [0, 1]."""
         return concatenated(self.encode(self.tubelets(frames.to(self.embed.weight.device))), *self.grid)
 
 
@@ -187,7 +185,6 @@ class VJepa2Teacher:
 
     @torch.no_grad()
     def features(self, frames: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b t2 h2 w2 d"]:
-        """Concatenated, normalised outputs of the last four blocks."""
         batch = frames.shape[0]
         pixels = rearrange(frames, "b c t h w -> (b t) c h w")
         pixels = functional.interpolate(pixels, (self.crop, self.crop), mode="bilinear", antialias=True)
