@@ -14,7 +14,7 @@ from flows.pipeline import chain
 from tasks.execution.chain import outline
 from tests.distillation.conftest import SIGMA, trainer
 from tests.rollout.conftest import SIZE, mixed_views, small_model
-from tests.training.conftest import FRAME_INPUT, stage1, stage2, write_tokenizer
+from tests.training.conftest import FRAME_INPUT, Killed, stage1, stage2, write_tokenizer
 from worldline_core.actions.episode_tracks import ActionTracks, write_index
 from worldline_core.config import load_config
 from worldline_core.data.episodes.episode import VIEWS
@@ -204,17 +204,13 @@ def test_a_causal_model_goes_on_beside_its_teacher(finished, tmp_path, make_mode
             distill(config(), given | {"causal": tmp_path / "wrong"}, tmp_path / "no")
 
 
-class KilledError(Exception):
-    pass
-
-
 def killing(function, at_call):
     """The function, but its call number `at_call` raises, as a kill at this moment would end it."""
     calls = iter(range(1, 1000))
 
     def wrapped(*args, **kwargs):
         if next(calls) == at_call:
-            raise KilledError("killed")
+            raise Killed("killed")
         return function(*args, **kwargs)
 
     return wrapped
@@ -228,7 +224,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(finished, tmp_path, monk
     ):  # fmt: skip
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, killing(getattr(owner, name), call))
-            with pytest.raises(KilledError, match="killed"):
+            with pytest.raises(Killed, match="killed"):
                 distill(config(), finished.inputs, tmp_path)
     distill(config(), finished.inputs, tmp_path)
     assert digest_folder(tmp_path) == digest_folder(finished.output)

@@ -1,7 +1,5 @@
 """Distribution matching and the auxiliary losses beside it: who receives which gradient."""
 
-import inspect
-
 import pytest
 import torch
 from einops import repeat
@@ -132,8 +130,6 @@ def test_rollout_equals_the_block_causal_sampler(make_model, make_spec, clip, re
     drawn = [same_noise.draw((3, 4, 2, 4, 4)) for _ in predicted]
     generated = rollout(student, clip, spec=spec, noise=torch.cat((clip.noise[..., :1, :, :], *drawn), dim=3))
     torch.testing.assert_close(generated[..., 1:, :, :], torch.cat(predicted, dim=3), rtol=1e-4, atol=1e-4)
-    with pytest.raises(ConfigError, match="No such exit step"):
-        rollout(student, clip, 4)
 
 
 ZEROS, WEIGHTS, BOTH = (
@@ -285,7 +281,7 @@ def test_the_end_of_a_clip_is_compared_as_the_whole_decoded_clip_shows_it(weight
         video = tokenizer.decode(clip.flatten(0, 1))[:, :, -8:] / 2 + 0.5
         return video.permute(0, 2, 1, 3, 4).flatten(0, 1).clamp(0, 1)
 
-    expected = inspect.unwrap(type(network).forward)(network, decoded(predicted), decoded(target)).mean()
+    expected = network(decoded(predicted), decoded(target)).mean()
     (wanted,) = torch.autograd.grad(expected, predicted)
     value = PerceptualLoss(tokenizer, network)(predicted, target)
     torch.testing.assert_close(value.detach(), expected.detach())

@@ -13,7 +13,6 @@ Axes: b clips, v views, c latent channels, t latent frames (the observed one fir
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -47,8 +46,6 @@ class PerceptualLoss:
         self.tokenizer = tokenizer
         self.latent_frames = latent_frames
         self.network = network
-        # The metric is declared free of gradients; the loss is the same function with them.
-        self._distance = inspect.unwrap(LPIPS.forward)
 
     def __call__(
         self, predicted: Float[Tensor, "b v c t h w"], target: Float[Tensor, "b v c t h w"]
@@ -62,7 +59,7 @@ class PerceptualLoss:
     def _of_view(self, predicted: Float[Tensor, "1 c t h w"], target: Float[Tensor, "1 c t h w"]) -> Float[Tensor, ""]:
         with torch.no_grad():
             reference = self._decode(target)
-        return self._distance(self.network, self._decode(predicted), reference).mean()
+        return self.network(self._decode(predicted), reference).mean()
 
     def _decode(self, latents: Float[Tensor, "1 c t h w"]) -> Float[Tensor, "frames 3 height width"]:
         context = max(1, latents.shape[2] - self.latent_frames)  # the observed frame is never compared

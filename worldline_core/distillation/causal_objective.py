@@ -81,12 +81,8 @@ def self_forced_rollout(
         with_gradient: let gradients flow through the exit pass of each block. All other passes and the cache are free
             of gradients, so memory does not grow with the number of blocks or steps.
 
-    Raises:
-        ConfigError: no such step.
-        DataError: the clip does not divide into blocks.
+    Raises: DataError: the clip does not divide into blocks.
     """
-    if not 0 <= exit_step < spec.steps:
-        raise ConfigError("No such exit step", expected=f"0..{spec.steps - 1}", got=exit_step)
     cache = KVCache(spec.sink_blocks, spec.recent_blocks, fps)
     student.write_block(first, cache, action_maps=action_maps[..., :1, :, :], views=views)
     bounds = block_bounds(noise.shape[3], spec.block_size)

@@ -47,7 +47,6 @@ class LPIPS(nn.Module):
         self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor(_SCALE).view(1, 3, 1, 1))
 
-    @torch.no_grad()
     def forward(self, predicted: Float[Tensor, "n 3 h w"], true: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
         """Distance of each pair; intensities in [0, 1]."""
         distance = torch.zeros(predicted.shape[0], device=predicted.device)
