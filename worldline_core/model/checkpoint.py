@@ -290,7 +290,7 @@ def read_checkpoint_info(folder: Path) -> CheckpointInfo:
     """
     path = folder / DESCRIPTION
     content = read_description(path, FORMAT, "checkpoint", VERSION)
-    return described(CheckpointInfo, {k: v for k, v in content.items() if k not in ("format", "version")}, path)
+    return described(CheckpointInfo, content, path)
 
 
 _KIND_HINTS = {
@@ -373,7 +373,7 @@ def _with_branches(config: WorldModelConfig, stored: WorldModelConfig, tensors: 
 
 
 def read_description(path: Path, form: str, noun: str, version: int) -> dict[str, Any]:
-    """The JSON object that describes some weights (``noun``).
+    """What the JSON object that describes some weights (``noun``) says besides its ``format`` and ``version``.
 
     Raises:
         CheckpointError: it is missing, damaged, or of another ``format`` or ``version``.
@@ -384,7 +384,7 @@ def read_description(path: Path, form: str, noun: str, version: int) -> dict[str
         content = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"The {noun} description is not JSON", where=path, got=str(error)) from error
-    found = (content.get("format"), content.get("version")) if isinstance(content, dict) else type(content)
+    found = (content.pop("format", None), content.pop("version", None)) if isinstance(content, dict) else type(content)
     if found != (form, version):
         raise CheckpointError(f"Not a {noun} of this version", where=path, expected=(form, version), got=found)
     return content

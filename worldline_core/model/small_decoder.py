@@ -9,7 +9,6 @@ Axis legend: b batch, c channel, t frame, g frames of a group, h w pixels; ``_l`
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -19,14 +18,13 @@ import torch.nn.functional as F
 from einops import rearrange, repeat
 from jaxtyping import Float
 from pydantic import Field, ValidationError
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, ConfigError, DataError
-from worldline_core.model.checkpoint import described, fill, read_description, read_weights
+from worldline_core.model.checkpoint import described, fill, read_description, read_weights, write_weights
 from worldline_core.model.tokenizers import Residual, VideoDecoder, VideoTokenizer, check_latents
-from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+from worldline_core.store.atomic import write_json_atomic
 
 DESCRIPTION, WEIGHTS = "decoder.json", "decoder.safetensors"
 FORMAT, VERSION = "worldline.decoder", 1
@@ -149,12 +147,10 @@ class SmallDecoder(nn.Module, VideoTokenizer):
 
     def save(self, folder: Path, metadata: Mapping[str, Any] | None = None) -> None:
         """Write the weights in float16. Equal weights give equal bytes."""
-        state = sorted(self.state_dict().items())
-        content = save({name: tensor.detach().to("cpu", torch.float16).contiguous().clone() for name, tensor in state})
-        write_bytes_atomic(folder / WEIGHTS, content)
+        digest = write_weights(folder / WEIGHTS, self.state_dict(), torch.float16)
         description = {"format": FORMAT, "version": VERSION, "config": self.config.model_dump(mode="json")}
-        digest = {"metadata": dict(metadata or {}), "weights_sha256": hashlib.sha256(content).hexdigest()}
-        write_json_atomic(folder / DESCRIPTION, description | digest)
+        stated = {"metadata": dict(metadata or {}), "weights_sha256": digest}
+        write_json_atomic(folder / DESCRIPTION, description | stated)
 
     @classmethod
     def load(cls, folder: Path, tokenizer: VideoTokenizer, fingerprint: str, device: str = "cpu") -> SmallDecoder:

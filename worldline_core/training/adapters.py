@@ -6,7 +6,6 @@ description of the checkpoint that it becomes with the one it started from.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,6 @@ from types import ModuleType
 from typing import Any, Literal
 
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
 from worldline_core.config import StrictModel
@@ -29,11 +27,12 @@ from worldline_core.model.checkpoint import (
     read_description,
     read_weights,
     save_checkpoint,
+    write_weights,
 )
 from worldline_core.model.layers import is_action_parameter
 from worldline_core.model.networks import build_world_model
 from worldline_core.model.world_model import WorldModel
-from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.processes import gathered, place_model, processes
 from worldline_core.training.training_config import LoRAConfig, MergeAdapterConfig, TrainerConfig
 
@@ -142,17 +141,16 @@ def save_trained(
             save_checkpoint(output, model, state_dict=weights, **description)
         return
     info = described(CheckpointInfo, {**description, "config": config, "dtype": "", "weights_sha256": ""}, output)
-    average = {name: value.detach().float().cpu().contiguous() for name, value in sorted(average.items())}
+    average = {name: value.detach().float().cpu() for name, value in average.items()}
     if lora is not None:
         folder = output / FOLDER
         adapters = {f"{_PREFIX}{name.replace(_NAMED, '.')}": value for name, value in average.items() if _MARK in name}
-        content, full = save(adapters), save({name: value for name, value in average.items() if _MARK not in name})
-        write_bytes_atomic(folder / ADAPTERS, content)
-        write_bytes_atomic(folder / FULL, full)
+        full = {name: value for name, value in average.items() if _MARK not in name}
         write_json_atomic(folder / PEFT_CONFIG, {"peft_type": "LORA", **_peft_settings(model, lora)})
         stated = AdapterInfo(
             start=read_checkpoint_info(start).weights_sha256, lora=lora, checkpoint=info,
-            adapters=hashlib.sha256(content).hexdigest(), full=hashlib.sha256(full).hexdigest(),
+            adapters=write_weights(folder / ADAPTERS, adapters, torch.float32),
+            full=write_weights(folder / FULL, full, torch.float32),
         )  # fmt: skip
         write_json_atomic(
             folder / DESCRIPTION, {"format": FORMAT, "version": VERSION, **stated.model_dump(mode="json")}
@@ -187,7 +185,7 @@ def merge_adapter(config: MergeAdapterConfig, inputs: Mapping[str, Path], output
     del config
     folder, start = Path(inputs["adapter"]), Path(inputs["start"])
     content = read_description(folder / DESCRIPTION, FORMAT, "adapter", VERSION)
-    info = described(AdapterInfo, {k: v for k, v in content.items() if k not in ("format", "version")}, folder)
+    info = described(AdapterInfo, content, folder)
     if (found := read_checkpoint_info(start).weights_sha256) != info.start:
         raise CheckpointError(
             "The adapter started from other weights", where=folder, expected=info.start, got=f"{found}, {start}",

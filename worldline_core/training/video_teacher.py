@@ -16,15 +16,14 @@ import numpy as np
 import torch
 from einops import rearrange
 from jaxtyping import Bool, Float
-from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
-from worldline_core.model.checkpoint import described, fill, read_weights
+from worldline_core.model.checkpoint import described, fill, read_weights, write_weights
 from worldline_core.store.artifact_files import read_json
-from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.clip_source import load_views
 from worldline_core.training.trainer import Objective, ParameterGroup, held_out_losses, train
 from worldline_core.training.training_config import BLOCKS, SmallTeacherShape, TeacherConfig
@@ -140,7 +139,7 @@ class SmallVideoTeacher(nn.Module):
 
 
 class VJepa2Teacher:
-    """V-JEPA 2 (paper: ViT-g/384), weights from a local transformers folder.
+    """V-JEPA 2 (paper: ViT-g/384).
 
     Frames are resized to the encoder's crop size, because its rotary grid follows from it.
     """
@@ -150,7 +149,9 @@ class VJepa2Teacher:
     mean = (0.485, 0.456, 0.406)
     std = (0.229, 0.224, 0.225)
 
-    def __init__(self, folder: Path, device: str = "cpu") -> None:
+    @classmethod
+    def load(cls, folder: Path, device: str) -> Self:
+        """Read a local folder. Raises: UnavailableError: it has no weights."""
         from transformers import VJEPA2Model
 
         if not any(folder.glob("*.safetensors")):
@@ -160,17 +161,10 @@ class VJepa2Teacher:
                 expected="a transformers folder of facebook/vjepa2-vitg-fpc64-384 with model*.safetensors",
                 next_step="download it, use the small teacher, or set relational to null",
             )
-        self._hold(VJEPA2Model.from_pretrained(folder, local_files_only=True, dtype=torch.float32))
-        self.model.to(torch.device(device))  # pyright: ignore[reportArgumentType]
+        model = VJEPA2Model.from_pretrained(folder, local_files_only=True, dtype=torch.float32)
+        return cls(model.to(torch.device(device)))  # pyright: ignore[reportArgumentType]
 
-    @classmethod
-    def of(cls, model: VJEPA2Model) -> Self:
-        """With a model that is here already."""
-        teacher = cls.__new__(cls)
-        teacher._hold(model)
-        return teacher
-
-    def _hold(self, model: VJEPA2Model) -> None:
+    def __init__(self, model: VJEPA2Model) -> None:
         self.model = model.eval().requires_grad_(False)
         self.crop: int = self.model.config.crop_size
         self.side = self.crop // int(self.model.config.patch_size)  # pyright: ignore[reportArgumentType]
@@ -218,7 +212,7 @@ def teacher_outline(folder: Path | None) -> tuple[nn.Module, Callable[[Tensor], 
     if folder is not None and (folder / "config.json").is_file():
         shape = read_json(folder / "config.json")
     model = VJEPA2Model(VJEPA2Config(**shape))
-    return model, VJepa2Teacher.of(model).features
+    return model, VJepa2Teacher(model).features
 
 
 def _small_shape(path: Path) -> SmallTeacherShape:
@@ -242,7 +236,7 @@ def load_teacher(folder: Path, device: str = "cpu") -> VideoTeacher:
         return teacher.eval().requires_grad_(False).to(device)
     config = folder / "config.json"
     if read_json(config).get("model_type") == "vjepa2":
-        return VJepa2Teacher(folder, device)
+        return VJepa2Teacher.load(folder, device)
     raise CheckpointError(
         "This folder holds no relational teacher.",
         where=folder,
@@ -333,8 +327,7 @@ def train_teacher(config: TeacherConfig, inputs: Mapping[str, Path], output: Pat
         identity={"config": config.model_dump(mode="json"), "episodes": [name for name, _ in training]},
         title="teacher",
     )
-    weights = {name: value.to("cpu", torch.float16).contiguous() for name, value in sorted(result.average.items())}
-    write_bytes_atomic(output / WEIGHTS, save(weights))
+    write_weights(output / WEIGHTS, result.average, torch.float16)
     write_json_atomic(
         output / DESCRIPTION,
         {
