@@ -41,21 +41,6 @@ def text_positions(lengths: Tensor, size: int) -> Float[Tensor, "3 b n"]:
     return torch.stack((time, index, index))
 
 
-def rotation(config: MixtureConfig, positions: Float[Tensor, "3 *batch n"]) -> Rotation:
-    """Cosines and sines for ``positions``; frequency ``i`` belongs to axis ``i % 3`` within the sections, else to time."""
-    half = config.head_dim // 2
-    # Angles stay in float32 even under autocast: bfloat16 cannot tell consecutive integers apart beyond 256.
-    exponent = torch.arange(0, config.head_dim, 2, dtype=torch.float32, device=positions.device) / config.head_dim
-    frequencies = 1.0 / (config.rope_theta**exponent)
-    axis_of = torch.zeros(half, dtype=torch.long, device=positions.device)
-    for axis in (1, 2):
-        axis_of[axis : config.rope_sections[axis] * 3 : 3] = axis
-    chosen = positions.to(torch.float32)[axis_of]
-    angles = torch.movedim(chosen, 0, -1) * frequencies
-    angles = torch.cat((angles, angles), dim=-1)
-    return angles.cos(), angles.sin()
-
-
 class FeedForward(nn.Module):
     """SwiGLU, or the squared ReLU without a gate."""
 
@@ -208,7 +193,19 @@ class MixtureModel(WorldModel):
         self.action_encoder, self.action_film = action_branches(config)
 
     def rotation(self, positions: Float[Tensor, "3 *batch n"]) -> Rotation:
-        return rotation(self._mixture, positions)
+        """Cosines and sines; frequency ``i`` belongs to axis ``i % 3`` within the sections, else to time."""
+        config = self._mixture
+        half = config.head_dim // 2
+        # Angles stay in float32 even under autocast: bfloat16 cannot tell consecutive integers apart beyond 256.
+        exponent = torch.arange(0, config.head_dim, 2, dtype=torch.float32, device=positions.device) / config.head_dim
+        frequencies = 1.0 / (config.rope_theta**exponent)
+        axis_of = torch.zeros(half, dtype=torch.long, device=positions.device)
+        for axis in (1, 2):
+            axis_of[axis : config.rope_sections[axis] * 3 : 3] = axis
+        chosen = positions.to(torch.float32)[axis_of]
+        angles = torch.movedim(chosen, 0, -1) * frequencies
+        angles = torch.cat((angles, angles), dim=-1)
+        return angles.cos(), angles.sin()
 
     def is_text_parameter(self, name: str) -> bool:
         return is_text_parameter(name)

@@ -35,17 +35,6 @@ SHIFTS = 6
 """Vectors by which time drives a layer: shift, scale and gate of its self-attention, then of its feed-forward."""
 
 
-def rotation(config: WanConfig, positions: Float[Tensor, "3 *batch n"]) -> Rotation:
-    """Cosines and sines; the frequencies of time come first, then those of height and of width, a third of the head each."""
-    space = 2 * (config.head_dim // 6)
-    angles: list[Tensor] = []
-    for place, size in zip(positions.to(torch.float32), (config.head_dim - 2 * space, space, space), strict=True):
-        exponent = torch.arange(0, size, 2, dtype=torch.float32, device=positions.device) / size
-        angles.append(place[..., None] * config.rope_theta**-exponent)
-    both = torch.cat(angles * 2, dim=-1)
-    return both.cos(), both.sin()
-
-
 def driven(tokens: Tensor, shift: Tensor, scale: Tensor, eps: float) -> Tensor:
     """Layer-normalised tokens ``(b (t n) d)``, scaled and shifted by their latent frame, ``(b t d)``; in float32 inside."""
     grid = rearrange(tokens.float(), "b (t n) d -> b t n d", t=shift.shape[1])
@@ -160,7 +149,15 @@ class WanModel(WorldModel):
         self.register_buffer("prompt", torch.zeros(config.prompt_length, config.text_size))
 
     def rotation(self, positions: Float[Tensor, "3 *batch n"]) -> Rotation:
-        return rotation(self._wan, positions)
+        """Cosines and sines; the frequencies of time come first, then those of height and of width, a third of the head each."""
+        config = self._wan
+        space = 2 * (config.head_dim // 6)
+        angles: list[Tensor] = []
+        for place, size in zip(positions.to(torch.float32), (config.head_dim - 2 * space, space, space), strict=True):
+            exponent = torch.arange(0, size, 2, dtype=torch.float32, device=positions.device) / size
+            angles.append(place[..., None] * config.rope_theta**-exponent)
+        both = torch.cat(angles * 2, dim=-1)
+        return both.cos(), both.sin()
 
     def _text_tokens(self, embeddings: Float[Tensor, "b m s"]) -> Float[Tensor, "b n d"]:
         """Tokens of a text filled up with zeros to the length that the model was trained at, none of them hidden."""
