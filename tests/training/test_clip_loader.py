@@ -13,14 +13,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError, TrainingError
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import FrameSource, LatentStore
-
-VIEWS = ("head", "left_wrist", "right_wrist")
 
 
 class Scripted(LatentStore):

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch.testing._internal.distributed.fake_pg import FakeStore
 
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.errors import ConfigError
 from worldline_core.model.mixture import MixtureModel
@@ -16,7 +17,6 @@ from worldline_core.training.processes import own_part, place_model
 from worldline_core.training.training_config import ShardingConfig
 from worldline_core.training.training_state import ExponentialAverage
 
-VIEWS = ("head", "left_wrist", "right_wrist")
 SPEC = CausalSpec(block_size=2, sink_blocks=1, recent_blocks=1, anchor_blocks=None, sigmas=(1.0, 0.5, 0.0))
 
 Make = Callable[..., WorldModel]

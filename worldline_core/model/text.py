@@ -47,10 +47,10 @@ def video_prompt(instruction: str, clip: ClipFacts) -> str:
     return text
 
 
-def padded(texts: Sequence[Sequence[int]], padding: int) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
-    """Ids of all texts, the shorter ones filled up on the right, and a mask that is True on real tokens."""
+def padded(texts: Sequence[Sequence[int] | Tensor], padding: int = 0) -> tuple[Tensor, Bool[Tensor, "b n"]]:
+    """Ids (or embeddings) of all texts, the shorter ones filled up on the right, and a mask that is True on real tokens."""
     real = pad_sequence([torch.ones(len(ids), dtype=torch.bool) for ids in texts], batch_first=True)
-    return pad_sequence([torch.tensor(ids) for ids in texts], batch_first=True, padding_value=padding), real
+    return pad_sequence([torch.as_tensor(ids) for ids in texts], batch_first=True, padding_value=padding), real
 
 
 class Cosmos3Text:
@@ -161,7 +161,7 @@ class ByteText:
         self, texts: Sequence[str], clips: Sequence[ClipFacts]
     ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
         cut = [text.lower().strip().encode()[: self.max_length - 1] for text in texts]
-        return padded([[*(byte + BYTE_OFFSET for byte in text), END_OF_TEXT] for text in cut], 0)
+        return padded([[*(byte + BYTE_OFFSET for byte in text), END_OF_TEXT] for text in cut])
 
 
 class EmbeddedText:
@@ -185,9 +185,7 @@ class EmbeddedText:
                 "No embedding of this text is stored", where=self.path, expected=f"one of {len(self.embeddings)} texts",
                 got=missing[0], next_step="name every instruction of the recordings in import_backbone.prompts, and import again",
             )  # fmt: skip
-        found = [self.embeddings[text].float() for text in texts]
-        real = [torch.ones(len(value), dtype=torch.bool) for value in found]
-        return pad_sequence(found, batch_first=True), pad_sequence(real, batch_first=True)
+        return padded([self.embeddings[text].float() for text in texts])
 
 
 def load_text_encoder(config: TextConfig, model: WorldModelConfig) -> TextEncoder:

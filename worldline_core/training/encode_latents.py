@@ -250,16 +250,12 @@ class EncodeWork(ShardFilesWork[EncodedEpisode]):
         )
 
     def finish_shard(self, number: int, results: Sequence[EncodedEpisode]) -> None:
-        """Write the latents of a shard into one file; their shape (c, h, w), and bytes by episode, into another."""
+        """Write the latents of a shard into one file, and their bytes by episode into another."""
         tensors = {name: tensor for result in results for name, tensor in result.tensors.items()}
         with atomic_path(self.output / SHARD_FILE.format(number)) as temporary:
             save_file(dict(sorted(tensors.items())), temporary)
-        shape = next(iter(tensors.values())).shape
-        summary = {
-            "latent_shape": [shape[1], *shape[3:]],
-            "stored_bytes": {result.episode_id: result.stored_bytes for result in results},
-        }
-        write_json_atomic(self.summary_path(number), summary)
+        stored = {result.episode_id: result.stored_bytes for result in results}
+        write_json_atomic(self.summary_path(number), {"stored_bytes": stored})
 
 
 def encode_latents(
@@ -281,18 +277,18 @@ def encode_latents(
     with _one_thread():
         video = read_videos(episodes, selected[0], config, _SPAN)[0]
         layout = choose_layout(tokenizer, video, config)
-        size = encode_clip(tokenizer, video[:, :1], config.device).nbytes
-    config = within_disk(config, [episodes.rows[index] for index in selected], layout, size)
+        single = encode_clip(tokenizer, video[:, :1], config.device)
+    config = within_disk(config, [episodes.rows[index] for index in selected], layout, single.nbytes)
     fingerprint = tokenizer_fingerprint(tokenizer, Path(inputs["tokenizer"]))
     del tokenizer  # each process that encodes loads its own
     (output / "run").mkdir(parents=True, exist_ok=True)
     work = EncodeWork(output, inputs["episodes"], config, inputs["tokenizer"], layout)
     pieces = list(batched(selected, config.episodes_per_shard))
     map_episodes(mapper or SerialMapper(), work, pieces)
-    summaries = [work.summary(number) for number in range(len(pieces))]
     rows: list[ClipRow] = []
     account: list[InputRow] = []
-    for number, (members, summary) in enumerate(zip(pieces, summaries, strict=True)):
+    for number, members in enumerate(pieces):
+        summary = work.summary(number)
         for row in (episodes.rows[index] for index in members):
             rows.append(ClipRow.from_episode(row, _views(row, config), shard=SHARD_FILE.format(number)))
             size = summary["stored_bytes"][row.episode_id]
@@ -310,7 +306,7 @@ def encode_latents(
         "views": list(config.views),
         "image_size": list(config.image_size),
         "tokenizer": fingerprint,
-        "latent_shape": summaries[0]["latent_shape"],
+        "latent_shape": [single.shape[0], *single.shape[2:]],
     }
     write_json_atomic(output / DESCRIPTION, description)
     unfit = [row.split for row in episodes.rows if not _views(row, config)]

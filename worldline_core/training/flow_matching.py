@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.rollout.samplers import integrate, shifted_sigmas
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.processes import any_process
+from worldline_core.training.processes import average_values
 from worldline_core.training.relational import RelationalTerm
 from worldline_core.training.trainer import Objective
 from worldline_core.training.training_config import LossWeighting, SigmaSampling
@@ -102,28 +102,21 @@ def flow_matching_loss(
     return (error * noisy).sum() / (noisy.sum().clamp_min(1) * per_frame_values)
 
 
+@dataclass(eq=False)
 class FlowMatchingObjective(Objective[Batch]):
     """Flow matching on clips. The batch decides what conditions the model: text, action maps, or neither."""
 
-    def __init__(
-        self,
-        model: WorldModel,
-        *,
-        sigma: SigmaSampling,
-        weighting: LossWeighting,
-        text_dropout: float = 0.0,
-        action_dropout: float = 0.0,
-        relational: RelationalTerm | None = None,
-        sampler_steps: int = 4,
-    ) -> None:
-        self.model = model
-        self.sigma = sigma
-        self.weighting = weighting
-        self.text_dropout = text_dropout
-        self.action_dropout = action_dropout
-        self.relational = relational
-        self.sampler_steps = sampler_steps
-        self.encode_text: Callable[[Tensor, Tensor | None], TextContext] = model.encode_text
+    model: WorldModel
+    _: KW_ONLY
+    sigma: SigmaSampling
+    weighting: LossWeighting
+    text_dropout: float = 0.0
+    action_dropout: float = 0.0
+    relational: RelationalTerm | None = None
+    sampler_steps: int = 4
+
+    def __post_init__(self) -> None:
+        self.encode_text: Callable[[Tensor, Tensor | None], TextContext] = self.model.encode_text
 
     def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         latents = batch.latents
@@ -140,7 +133,8 @@ class FlowMatchingObjective(Objective[Batch]):
             grid = (latents.shape[3], latents.shape[-2] // patch, latents.shape[-1] // patch)
             targets = self.relational.targets(batch, grid)
         # Where another process reads its text, this one takes part in gathering that tower's weights.
-        text = self._text(batch) if batch.text_ids is not None and any_process(with_text) else None
+        any_reads = batch.text_ids is not None and average_values({"text": with_text})["text"] > 0
+        text = self._text(batch) if any_reads else None
         output = self.model(
             add_noise(latents, noise, sigma),
             sigma,

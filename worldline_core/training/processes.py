@@ -72,11 +72,6 @@ def average_values(values: Mapping[str, float]) -> dict[str, float]:
     return dict(zip(names, numbers.tolist(), strict=True))
 
 
-def any_process(flag: bool) -> bool:
-    """Returns whether a condition is true in at least one process."""
-    return average_values({"flag": float(flag)})["flag"] > 0
-
-
 def another_process_ended(error: BaseException | None) -> bool:
     """Returns whether an error means that another process cannot be reached any more."""
     return isinstance(error, torch.distributed.DistError) or (isinstance(error, RuntimeError) and "gloo" in str(error))

@@ -125,7 +125,7 @@ class StoredText:
         self._numbers = {prompt: number for number, prompt in enumerate(prompts)}
         self._device = device
         # All at one width, as in a batch with the longest: a text's place in time depends on it.
-        ids, self._mask = padded(prompts, 0)
+        ids, self._mask = padded(prompts)
         layers: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in model.layers]
         for number in with_progress(range(len(prompts)), "reading prompts", "prompt"):
             context = model.encode_text(ids[number, None].to(device), self._mask[number, None].to(device))

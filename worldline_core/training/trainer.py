@@ -297,28 +297,27 @@ def train[BatchT: NamedBatch](
     return TrainingResult(dict(zip(averaged, average.average.values(), strict=True)), last, done)
 
 
+@dataclass(eq=False)
 class TrainingRun[BatchT: NamedBatch]:
     """The parts of a run, and its optimiser step."""
 
-    def __init__(
-        self,
-        config: TrainerConfig,
-        groups: Sequence[ParameterGroup],
-        objective: Objective[BatchT],
-        load: Callable[[int], BatchT],
-        models: Sequence[nn.Module],
-        output: Path,
-        title: str,
-    ) -> None:
-        self.config, self.groups, self.objective, self.load = config, groups, objective, load
-        self.models, self.output, self.title = models, output, title
-        self.plan = batch_plan(config, output)
+    config: TrainerConfig
+    groups: Sequence[ParameterGroup]
+    objective: Objective[BatchT]
+    load: Callable[[int], BatchT]
+    models: Sequence[nn.Module]
+    output: Path
+    title: str
+
+    def __post_init__(self) -> None:
+        config, groups = self.config, self.groups
+        self.plan = batch_plan(config, self.output)
         self.optimizer = make_optimizer(config, [list(group.parameters.values()) for group in groups])
         named = {group.name: {f"{group.name}/{key}": p for key, p in group.parameters.items()} for group in groups}
         averaged = {key: p for group in groups if group.averaged for key, p in named[group.name].items()}
         self.average = ExponentialAverage(averaged, config.ema_decay, on_host=config.average == "host")
         parameters = {key: p for group in named.values() for key, p in group.items()}
-        self.states = TrainingStates(output, config.saving, parameters, self.average, self.optimizer)
+        self.states = TrainingStates(self.output, config.saving, parameters, self.average, self.optimizer)
 
     def step(self, step: int) -> tuple[dict[str, float], int]:
         """One optimiser step: mean metrics of its micro-steps over all processes, examples of this process."""
