@@ -132,6 +132,9 @@ def test_a_resident_batch_mixes_episodes_views_starts_and_strides(tmp_path, toke
             ClipBatch(clips, ("y", "x")), ClipBatch((*clips, Clip("c", 6, length, 1)), ("head",), primary=True)
         ):  # fmt: skip
             assert torch.equal(resident.read_batch(batch), store.read_batch(batch))
+    resident._first["b/single" if layout == "groups" else "b/clips/1/0"] = (0, 0)
+    with pytest.raises(ArtifactError, match=r"lack frames[\s\S]*b/(single|clips/1/0)"):
+        read(resident, Clip("b", 0, 5, 1), ("x",))
 
 
 def test_bad_requests_and_bad_values_are_named(world, tmp_path):

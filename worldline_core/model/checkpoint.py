@@ -223,6 +223,7 @@ class CheckpointInfo(StrictModel):
 
     @property
     def views(self) -> tuple[str, ...]:
+        """Views of the largest trained set."""
         return self.view_sets[0]
 
     @property

@@ -238,8 +238,7 @@ class ResidentLatents(LatentStore):
         selected = np.array(list(map(self._stored_views, batch.clips, self.recorded_views(batch))))
         parts = [self._parts(clip) for clip in batch.clips]
         lengths = [stop - first for _, first, stop in parts[0]]
-        placed = (((*self._first[name], start) for name, start, _ in own) for own in parts)
-        found = np.array([[(place + start, frames) for place, frames, start in own] for own in placed])
+        found = np.array([[self._place(*part) for part in own] for own in parts])
         place, count = rearrange(found, "b parts two -> two b 1 parts")
         first = place + count * selected[..., None]
         places = first.repeat(lengths, axis=-1) + np.concatenate([np.arange(length) for length in lengths])
@@ -247,6 +246,16 @@ class ResidentLatents(LatentStore):
         images = rearrange(on_device(places, self._frames.device) * channels, "b v t -> b v 1 t")
         images = images + rearrange(torch.arange(channels, device=images.device), "c -> c 1")
         return self._frames.flatten(0, 1).index_select(0, images.flatten()).float().view(*images.shape, *grid)
+
+    def _place(self, name: str, first: int, stop: int) -> tuple[int, int]:
+        """Place of the wanted frame in a tensor's first view, and how many frames a view has."""
+        place, frames = self._first.get(name, (0, 0))
+        if stop > frames:  # the next frames in memory are another episode's
+            raise ArtifactError(
+                "The latents lack frames of this clip.", where=f"{self.root}, {name}", expected=f"{stop} latent frames",
+                got=frames, next_step="encode the latents again",
+            )  # fmt: skip
+        return place + first, frames
 
 
 class FrameSource(ClipSource):

@@ -66,7 +66,7 @@ class RunningMeans:
         return {name: total / count for name, (total, count) in sorted(self._totals.items())}
 
     def state(self) -> dict[str, tuple[float, int]]:
-        return self._totals
+        return dict(self._totals)
 
 
 class MetricsLog:
