@@ -345,12 +345,12 @@ def test_colours_are_not_shifted(tmp_path: Path) -> None:
 
 def test_what_cannot_be_encoded_is_refused(tmp_path: Path) -> None:
     small = np.zeros((2, 32, 48, 3), np.uint8)
-    for frames, rate, message in (
-        (small[:, :31], 8, "even image sides"),
-        (small.astype(np.float32), 8, "Cannot encode"),
-        (small, 0, "positive number"),
+    for frames, rate, error, message in (
+        (small[:, :31], 8, ConfigError, "odd size cannot be encoded as yuv420p"),
+        (small.astype(np.float32), 8, DataError, "Cannot encode"),
+        (small, 0, DataError, "positive number"),
     ):
-        with pytest.raises(DataError, match=message):
+        with pytest.raises(error, match=message):
             encode_video(tmp_path / "v.mp4", frames, rate)
 
 

@@ -37,7 +37,6 @@ from worldline_core.data.video.clip import (
 )
 from worldline_core.data.video.encoder import Encoding, VideoEncoder, frame_rate, length_prefixed, new_mp4
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, write_thumbnails
-from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import Fit, ImageTransform
 
 VideoMode = Literal["auto", "encode"]
@@ -110,7 +109,7 @@ def store_view(
         the stored one along a side that was enlarged.
 
     Raises: RejectedInputError (length_mismatch, truncated_video, and whatever else reading raises); DataError for
-        pictures that cannot be encoded.
+        pictures that cannot be encoded; ConfigError for a size that no recording can have as yuv420p.
     """
     small = ThumbnailMaker(fps, enlarged_from)
     sampler = ImageSampler(-(-recorded.num_frames // recorded.step))
@@ -166,7 +165,6 @@ def _encoded(
                 image = rgb()
                 if encoder is None or transform is None:
                     transform = ImageTransform.of(image.shape[:2]).fitted(recorded.image_size, recorded.fit)
-                    _check_even_sides(transform.image_size, video.pixel_format, path.stem)
                     encoder = writing.enter_context(VideoEncoder(path, transform.image_size, fps, video))
                 image = transform.frames(image[None])[0]
                 if sampler.wants(encoder.count):
@@ -177,18 +175,6 @@ def _encoded(
     if transform is None or encoder is None:
         raise RejectedInputError("truncated_video", "View has no pictures", where=path.stem)
     return transform, encoder.codec, video.pixel_format
-
-
-def _check_even_sides(size: tuple[int, int], pixel_format: str, view: str) -> None:
-    """Raises: ConfigError for pictures that the configured format cannot hold, as all recordings of this size."""
-    if pixel_format == "yuv420p" and (size[0] % 2 or size[1] % 2):
-        raise ConfigError(
-            "Pictures of an odd size cannot be encoded as yuv420p",
-            where=f"pixel_format, met in view {view}",
-            expected="even height and width",
-            got=f"{size[0]}x{size[1]}",
-            next_step="set image_size to even sides, or pixel_format to yuv444p",
-        )
 
 
 def _pictures(recorded: ViewImages) -> Iterator[tuple[np.ndarray, bool, Callable[[], np.ndarray]]]:

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self, cast
@@ -176,19 +177,19 @@ class VideoEncoder:
     Args:
         size: (height, width); both even for yuv420p.
 
-    Raises: DataError for a size or rate that cannot be encoded.
+    Raises: ConfigError for a size that the pixel format cannot hold, DataError for a rate that cannot be encoded.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: float, encoding: Encoding) -> None:
         height, width = size
         pixel_format = encoding.pixel_format
         if pixel_format == "yuv420p" and (height % 2 or width % 2):
-            raise DataError(
-                "yuv420p needs even image sides",
+            raise ConfigError(
+                "Pictures of an odd size cannot be encoded as yuv420p",
                 where=path,
                 expected="even height and width",
                 got=f"{height}x{width}",
-                next_step="choose another image size, or pixel_format yuv444p",
+                next_step="set image_size to even sides, or pixel_format to yuv444p",
             )
         self.path = path
         self.size = size
@@ -196,7 +197,8 @@ class VideoEncoder:
         self.count = 0
         self._rate = frame_rate(fps)
         self._pixel_format: PixelFormat = pixel_format
-        self._out = av.open(str(path), "w", format="mp4", options=BITEXACT)
+        self._writing = ExitStack()
+        self._out = self._writing.enter_context(new_mp4(path))
         stream = cast("VideoStream", self._out.add_stream(_ENCODERS[self.codec], rate=self._rate))
         stream.width, stream.height, stream.pix_fmt = width, height, pixel_format
         context = stream.codec_context
@@ -220,22 +222,11 @@ class VideoEncoder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if isinstance(error, OSError):  # see `new_mp4`
-            with suppress(OSError):
-                self._out.close()
-        else:
-            self.close()
-
-    def close(self) -> None:
-        """Write what the encoder still holds. Of a picture that was refused nothing is in the file."""
-        try:
+        with self._writing:
+            if error is not None:
+                raise error
             if self.count:
-                self._out.mux(self._stream.encode(None))
-        except OSError:
-            with suppress(OSError):
-                self._out.close()
-            raise
-        self._out.close()
+                self._out.mux(self._stream.encode(None))  # what the encoder still holds
 
     def add(self, image: np.ndarray) -> None:
         """The next picture, uint8 (H, W, 3) RGB.
@@ -271,25 +262,21 @@ def encode_video(
         frames: uint8 (H, W, 3) RGB one after the other; H and W even for yuv420p.
         crf: quality, 0 (exact up to the colour conversion) .. 51.
 
-    Raises: DataError for empty, wrongly shaped or wrongly typed frames.
+    Raises: DataError for empty, wrongly shaped or wrongly typed frames; ConfigError for odd sides as yuv420p.
     """
-    encoder: VideoEncoder | None = None
-    with ExitStack() as stack:
-        for frame in frames:
-            if encoder is None and (frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8):
-                raise _not_frames(path, f"{frame.dtype} {frame.shape}")
-            if encoder is None:
-                encoding = Encoding(crf, preset, pixel_format)
-                encoder = stack.enter_context(VideoEncoder(path, (frame.shape[0], frame.shape[1]), fps, encoding))
+    remaining = iter(frames)
+    first = next(remaining, None)
+    if first is None or first.ndim != 3 or first.shape[2] != 3 or first.dtype != np.uint8:
+        raise DataError(
+            "Cannot encode these frames as video",
+            where=path,
+            expected="uint8 (H, W, 3), one or more",
+            got="none" if first is None else f"{first.dtype} {first.shape}",
+        )
+    encoding = Encoding(crf, preset, pixel_format)
+    with VideoEncoder(path, (first.shape[0], first.shape[1]), fps, encoding) as encoder:
+        for frame in chain([first], remaining):
             encoder.add(frame)
-    if encoder is None:
-        raise _not_frames(path, "none")
-
-
-def _not_frames(path: Path, got: str) -> DataError:
-    return DataError(
-        "Cannot encode these frames as video", where=path, expected="uint8 (H, W, 3), one or more", got=got
-    )
 
 
 def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float) -> None:
