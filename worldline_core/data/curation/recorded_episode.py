@@ -11,7 +11,6 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import lru_cache, partial
 from hashlib import sha256
-from itertools import islice
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from worldline_core.data.episodes.episode import (
     with_instruction,
 )
 from worldline_core.data.episodes.recorded_poses import camera_pose, check_intrinsics
-from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, LoadedEpisode, Masks, for_evaluation_only
+from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, LoadedEpisode, for_evaluation_only
 from worldline_core.data.episodes.view_recording import ViewImages
 from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_finite, check_length, collect_faults
 from worldline_core.data.video.clip import frame_times
@@ -349,21 +348,9 @@ def trimmed(config: CurateConfig, loaded: LoadedEpisode) -> LoadedEpisode:
     common = min(episode.num_frames, *counts.values())
     found = ", ".join(f"{name} {count}" for name, count in {"states": episode.num_frames, **counts}.items())
     cut = episode.cut(0, common)
-
-    def shortened(read: Callable[[str], Masks | None], view: str) -> Masks | None:
-        values = read(view)
-        return None if values is None else values[:common]
-
-    return replace(
-        loaded,
-        episode=replace(cut, conventions={**cut.conventions, TRIMMED: f"the first {common} frames of {found}"}),
-        images=lambda view: islice(loaded.images(view), common),
-        robot_masks=partial(shortened, loaded.robot_masks),
-        thing_labels=partial(shortened, loaded.thing_labels),
-        clips={
-            view: replace(clip, num_frames=common, file_frames=counts.get(view)) for view, clip in loaded.clips.items()
-        },
-    )
+    cut = replace(cut, conventions={**cut.conventions, TRIMMED: f"the first {common} frames of {found}"})
+    counted = {view: replace(clip, file_frames=counts.get(view)) for view, clip in loaded.clips.items()}
+    return replace(loaded, clips=counted).cut(cut, lambda _: range(common))
 
 
 def prepare_episode(

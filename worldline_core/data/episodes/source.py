@@ -9,7 +9,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import PurePosixPath
 from typing import Annotated, Any, Literal, Protocol
@@ -28,7 +28,13 @@ from worldline_core.data.episodes.episode import (
     Split,
     TaskFamily,
 )
-from worldline_core.data.guards.rejection import RejectedInputError, check_rate, check_texts, collect_faults
+from worldline_core.data.guards.rejection import (
+    RejectedInputError,
+    check_length,
+    check_rate,
+    check_texts,
+    collect_faults,
+)
 from worldline_core.data.guards.source_paths import AnyPath, SourceFolder, inside, relative_name
 from worldline_core.data.video.clip import VideoClip, read_clip, video_size
 from worldline_core.data.video.frames import MadeFrames
@@ -105,6 +111,38 @@ class LoadedEpisode:
         Raises: RejectedInputError for whatever cannot be read.
         """
         return np.stack(list(self.each_image(view)))
+
+    def cut(self, episode: Episode, kept: Callable[[str], range]) -> LoadedEpisode:
+        """These consecutive frames of each view, with the episode that they belong to.
+
+        Raises: RejectedInputError (length_mismatch), while a view is read, for another number of pictures than states.
+        """
+        recorded = self.episode
+
+        def check_count(found: int, view: str) -> None:
+            where = f"episode {recorded.episode_id}, view {view}"
+            check_length("Video", where, states=recorded.num_video_frames, unit="frames", found=found)
+
+        def images(view: str) -> Iterator[np.ndarray]:
+            count, wanted = 0, kept(view)
+            for count, image in enumerate(self.images(view), 1):
+                if count - 1 in wanted:
+                    yield image
+            check_count(count, view)
+
+        def part(found: Masks | None, view: str) -> Masks | None:
+            if found is not None:
+                check_count(len(found), view)
+            return None if found is None else found[kept(view).start : kept(view).stop]
+
+        return replace(
+            self,
+            episode=episode,
+            images=images,
+            robot_masks=lambda view: part(self.robot_masks(view), view),
+            thing_labels=lambda view: part(self.thing_labels(view), view),
+            clips={view: clip.cut(kept(view).start, kept(view).stop) for view, clip in self.clips.items()},
+        )
 
 
 def sorted_views[T](

@@ -58,7 +58,7 @@ Reason = Literal[
 ]
 REASONS: tuple[str, ...] = get_args(Reason)
 
-RATE_TOLERANCE = 1e-2
+_RATE_TOLERANCE = 1e-2
 """Largest deviation of a video's rate, as a share of the stated one: containers round times."""
 MAX_SIDE_PX = 16_384
 MAX_COLUMNS = 1_000
@@ -244,9 +244,12 @@ def check_length(what: str, where: object, *, states: int, unit: str, found: int
         )
 
 
-def check_rate(rate: float, wanted: float, where: object, *, tolerance: float, what: str = "Video") -> None:
-    """Raises: RejectedInputError (wrong_fps) where a rate is further than `tolerance` [fps] from the wanted one."""
-    if not abs(rate - wanted) <= tolerance:
+def check_rate(
+    rate: float, wanted: float, where: object, *, tolerance: float | None = None, what: str = "Video"
+) -> None:
+    """Raises: RejectedInputError (wrong_fps) where a rate is further than `tolerance` [fps] (by default what containers round)
+    from the wanted one."""
+    if not abs(rate - wanted) <= (_RATE_TOLERANCE * wanted if tolerance is None else tolerance):
         raise RejectedInputError(
             "wrong_fps",
             f"{what} has another frame rate than its recording",

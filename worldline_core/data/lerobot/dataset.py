@@ -29,13 +29,7 @@ from worldline_core.data.guards.plain_files import (
     read_table,
     validated,
 )
-from worldline_core.data.guards.rejection import (
-    RATE_TOLERANCE,
-    RejectedInputError,
-    check_columns,
-    check_length,
-    check_rate,
-)
+from worldline_core.data.guards.rejection import RejectedInputError, check_columns, check_length, check_rate
 from worldline_core.data.guards.source_paths import (
     AnyPath,
     fill_template,
@@ -467,7 +461,7 @@ class LeRobotV3Dataset(LeRobotDataset):
         """
         frames = (end - begin) * self.fps
         if abs(frames - length) >= 0.5:
-            check_rate(video_size(path)[2], self.fps, where, tolerance=RATE_TOLERANCE * self.fps)
+            check_rate(video_size(path)[2], self.fps, where)
             raise RejectedInputError(
                 "length_mismatch",
                 "Video window and rows differ in length",

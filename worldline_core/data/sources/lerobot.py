@@ -30,14 +30,7 @@ from worldline_core.data.episodes.source import (
     says_droid,
     sorted_views,
 )
-from worldline_core.data.guards.rejection import (
-    RATE_TOLERANCE,
-    RejectedInputError,
-    all_of,
-    check_rate,
-    collect_faults,
-    depth_picture,
-)
+from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_rate, collect_faults, depth_picture
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, relative_name
 from worldline_core.data.lerobot.dataset import DatasetInfo, LeRobotV3Dataset, LeRobotV21Dataset, check_files, is_depth
 from worldline_core.data.sources.calibration_file import calibrated, read_calibration
@@ -94,11 +87,8 @@ class JointColumns(ColumnChoice):
         return self
 
 
-class GripperColumn(ColumnChoice):
+class GripperColumn(GripperRange, ColumnChoice):
     """The one column of a gripper, and its readings when it is closed and open."""
-
-    closed: float
-    open: float
 
 
 class ArmTrack(StrictModel):
@@ -364,8 +354,7 @@ def state_columns(config: LeRobotSourceConfig, features: Features, where: str) -
                 gripper = places(track.gripper, features, f"{at}, gripper")
                 if len(gripper) != 1:
                     raise ConfigError("A gripper is one column", where=at, expected=1, got=len(gripper))
-                span = GripperRange(closed=track.gripper.closed, open=track.gripper.open)
-                blocks[name].append(_Block(track.gripper.feature, gripper, span))
+                blocks[name].append(_Block(track.gripper.feature, gripper, track.gripper))
                 widths[name].append(1)
         if len(set(map(tuple, widths.values()))) > 1:
             raise ConfigError("State and action of an arm differ in size", where=where, got=widths)
@@ -453,8 +442,7 @@ class LeRobotSource:
                 dataset.image_size(index, key)
                 return None
             clip = dataset.clip(index, key)
-            rate = video_size(clip.path)[2]
-            check_rate(rate, dataset.fps, f"{episode_id}, view {view}", tolerance=RATE_TOLERANCE * dataset.fps)
+            check_rate(video_size(clip.path)[2], dataset.fps, f"{episode_id}, view {view}")
             return clip
 
         faults: list[RejectedInputError] = []

@@ -21,7 +21,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as, with_rigid_poses
 from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode, Masks, SourceConfigBase
 from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
-from worldline_core.data.guards.rejection import RATE_TOLERANCE, RejectedInputError, check_length, check_rate
+from worldline_core.data.guards.rejection import RejectedInputError, check_rate
 from worldline_core.data.guards.source_paths import AnyPath, SourceFolder, exists
 from worldline_core.data.sources.agibot import (
     AgibotGesimSource,
@@ -106,8 +106,7 @@ class EpisodeSetSource:
         episode = with_rigid_poses(self._set.episode(position))
         clips = {view: self._set.clip(position, view) for view in self._set.rows[position].views}
         for view, clip in clips.items():
-            rate = video_size(clip.path)[2]
-            check_rate(rate, episode.fps, f"{episode_id}, view {view}", tolerance=RATE_TOLERANCE * episode.fps)
+            check_rate(video_size(clip.path)[2], episode.fps, f"{episode_id}, view {view}")
         return LoadedEpisode(
             episode,
             tuple(clips),
@@ -196,39 +195,15 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
     recorded = loaded.episode
     declared = {f"declared_{field}": str(getattr(conventions, field)) for field in conventions.departures}
     repaired = apply_conventions(recorded, conventions)
-    loaded = replace(loaded, episode=replace(repaired, conventions={**repaired.conventions, **declared}))
+    episode = replace(repaired, conventions={**repaired.conventions, **declared})
     if not (conventions.camera_lag_frames or conventions.image_lag_frames):
-        return loaded
+        return replace(loaded, episode=episode)
 
     def kept(view: str) -> range:
         images = range(recorded.num_video_frames)[image_frames(recorded.num_frames, conventions, view)]
         return images[: repaired.num_video_frames]
 
-    each_image, robot_masks, thing_labels = loaded.each_image, loaded.robot_masks, loaded.thing_labels
-
-    def check_count(found: int, view: str) -> None:
-        where = f"episode {recorded.episode_id}, view {view}"
-        check_length("Video", where, states=recorded.num_video_frames, unit="frames", found=found)
-
-    def images(view: str) -> Iterator[np.ndarray]:
-        count, wanted = 0, kept(view)
-        for count, image in enumerate(each_image(view), 1):
-            if count - 1 in wanted:
-                yield image
-        check_count(count, view)
-
-    def cut(found: Masks | None, view: str) -> Masks | None:
-        if found is not None:
-            check_count(len(found), view)
-        return None if found is None else found[kept(view).start : kept(view).stop]
-
-    return replace(
-        loaded,
-        images=images,
-        robot_masks=lambda view: cut(robot_masks(view), view),
-        thing_labels=lambda view: cut(thing_labels(view), view),
-        clips={view: clip.cut(kept(view).start, kept(view).stop) for view, clip in loaded.clips.items()},
-    )
+    return loaded.cut(episode, kept)
 
 
 def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
