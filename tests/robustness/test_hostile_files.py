@@ -31,7 +31,7 @@ from worldline_core.data.guards.plain_files import (
     read_table,
 )
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.lerobot.dataset import _numeric_column
+from worldline_core.data.lerobot.dataset import numeric_column
 from worldline_core.data.sources.hdf5 import ArmPlace, Columns, open_hdf5
 from worldline_core.data.video.clip import VideoClip, read_clip
 
@@ -195,7 +195,7 @@ def test_states_of_more_columns_than_a_robot_has_are_refused(tmp_path: Path, sha
     with open_hdf5(tmp_path / "a.h5") as file, rejected("too_large", "more columns than a robot"):
         file.array("state", [None] * len(shape))
     with rejected("too_large", "more columns than a robot"):
-        _numeric_column(pa.chunked_array([pa.array([np.zeros(int(np.prod(shape[1:])))] * 3)]), 3, "data")
+        numeric_column(pa.chunked_array([pa.array([np.zeros(int(np.prod(shape[1:])))] * 3)]), 3, "data")
 
 
 def test_png_and_jpeg_come_as_rgb() -> None:

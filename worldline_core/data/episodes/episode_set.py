@@ -21,7 +21,7 @@ from worldline_core.data.guards.plain_files import parse_json
 from worldline_core.data.guards.rejection import check_rate
 from worldline_core.data.guards.source_paths import inside
 from worldline_core.data.lerobot.dataset import IMAGE_PREFIX, LeRobotV3Dataset
-from worldline_core.data.video.clip import VideoClip, read_clip
+from worldline_core.data.video.clip import VideoClip, decode_frames, read_clip
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, cache_path, read_thumbnails
 from worldline_core.errors import DataError
@@ -139,14 +139,6 @@ class EpisodeSet:
             )
         return whole if (row.start, row.stop) == (0, whole.num_frames) else whole.cut(row.start, row.stop)
 
-    def _row_with(self, i: int, view: str) -> EpisodeRow:
-        row = self.rows[i]
-        if view not in row.views:
-            raise DataError(
-                "Episode has no such view", where=f"episode {row.episode_id}", expected=", ".join(row.views), got=view
-            )
-        return row
-
     def frames(self, i: int, view: str, indices: Sequence[int] | None = None) -> np.ndarray:
         """uint8 (len, H, W, 3) RGB frames of a view.
 
@@ -155,24 +147,18 @@ class EpisodeSet:
 
         Raises: DataError when the view, the file or a frame is missing, or the video is truncated.
         """
-        row = self._row_with(i, view)
-        dataset, _ = self._open(i)
-        wanted = range(row.video_frames) if indices is None else [int(index) for index in indices]
-        if any(index < 0 or index >= row.video_frames for index in wanted):
-            raise DataError(
-                "Frame index outside of the episode",
-                where=f"episode {row.episode_id}",
-                expected=f"0 <= index < {row.video_frames}",
-                got=str(list(wanted)),
-            )
-        return dataset.frames(row.episode_index, IMAGE_PREFIX + view, [row.start + index for index in wanted])
+        return decode_frames(self.clip(i, view), indices)
 
     def clip(self, i: int, view: str) -> VideoClip:
         """The encoded video of a view of row i, cut to its segment, for callers that decode it themselves.
 
         Raises: DataError when the view is missing.
         """
-        row = self._row_with(i, view)
+        row = self.rows[i]
+        if view not in row.views:
+            raise DataError(
+                "Episode has no such view", where=f"episode {row.episode_id}", expected=", ".join(row.views), got=view
+            )
         dataset, _ = self._open(i)
         whole = dataset.clip(row.episode_index, IMAGE_PREFIX + view)
         return replace(whole, num_frames=row.video_frames, skip=row.start)

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from worldline_core.data.episodes.episode import Episode
-from worldline_core.data.lerobot.dataset import DATA_PATH, IMAGE_PREFIX, VERSION, VIDEO_PATH
+from worldline_core.data.lerobot.dataset import DATA_PATH, IMAGE_PREFIX, VERSION, VIDEO_PATH, numeric_column
 from worldline_core.data.video.encoder import concatenate_videos
 from worldline_core.data.video.thumbnails import cache_path
 from worldline_core.store.atomic import atomic_path, write_json_atomic, write_table_atomic
@@ -185,16 +185,10 @@ def _link(existing: Path, name: Path) -> None:
         shutil.copyfile(existing, name)
 
 
-def _column(table: pa.Table, name: str) -> np.ndarray:
-    values = table[name].combine_chunks()
-    if pa.types.is_fixed_size_list(values.type):
-        return values.flatten().to_numpy().reshape(len(values), -1)
-    return values.to_numpy(zero_copy_only=False)
-
-
 def _statistics(table: pa.Table, histograms: Mapping[str, Sequence[np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
     """Feature -> statistics over the episodes that have these rows, and by view these counts of pixels."""
-    statistics = {name: vector_statistics(_column(table, name)) for name in table.column_names}
+    columns = {name: numeric_column(table[name], len(table), name) for name in table.column_names}
+    statistics = {name: vector_statistics(values) for name, values in columns.items()}
     for view, counts in histograms.items():
         statistics[IMAGE_PREFIX + view] = image_statistics(counts, len(table))
     return statistics

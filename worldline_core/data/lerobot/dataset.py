@@ -39,7 +39,7 @@ from worldline_core.data.guards.source_paths import (
     regular_file,
     relative_name,
 )
-from worldline_core.data.video.clip import VideoClip, decode_frames, video_size
+from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.errors import DataError
 
 VERSION = "v3.0"
@@ -246,7 +246,7 @@ class LeRobotDataset(ABC):
         Raises: DataError when the file or column is missing, or another length than listed.
         """
         where, values = self.values(episode_index, name)
-        return _numeric_column(values, len(values), where)
+        return numeric_column(values, len(values), where)
 
     @abstractmethod
     def values(self, episode_index: int, name: str) -> tuple[str, pa.ChunkedArray]:
@@ -377,7 +377,7 @@ class LeRobotV3Dataset(LeRobotDataset):
         rows = table.slice(int(places[0]), length) if consecutive else table.take(pa.array(places))
         _check_numbering(rows, where, index=begin, frame_index=0)
         if "timestamp" in rows.column_names:  # LeRobot shows the picture at from_timestamp + timestamp
-            first = float(_numeric_column(rows["timestamp"], length, f"{where}, column timestamp").reshape(-1)[0])
+            first = float(numeric_column(rows["timestamp"], length, f"{where}, column timestamp").reshape(-1)[0])
             if abs(first) * self.fps >= 0.5:
                 raise _contradiction(where, "timestamp 0 in its first row, where its video begins", f"{first:.6g} s")
         self._episode = episode_index, where, rows
@@ -415,11 +415,8 @@ class LeRobotV3Dataset(LeRobotDataset):
     def _load(self, path: AnyPath, episode_index: int) -> np.ndarray:
         """Places of an episode's rows in a data file, which stays in memory: episodes are read in the order of files."""
         if path not in self._data:
-            table = read_table(path)
-            for needed in (INDEX, "index"):
-                if needed not in table.column_names:
-                    raise RejectedInputError("missing_column", "Data file lacks a column", where=path, expected=needed)
-            numbers = _numeric_column(table[INDEX], len(table), f"{path}, column {INDEX}")
+            table = read_table(path, lambda names: list(dict.fromkeys((INDEX, "index", *names))))
+            numbers = numeric_column(table[INDEX], len(table), f"{path}, column {INDEX}")
             self._data = {path: (table, numbers)}
         return np.flatnonzero(self._data[path][1] == episode_index)
 
@@ -500,13 +497,6 @@ class LeRobotV3Dataset(LeRobotDataset):
         near &= np.abs((stops - starts) * self.fps - lengths) < 0.5  # others are refused themselves
         return self.episodes.indices[near], starts[near], stops[near]
 
-    def frames(self, episode_index: int, key: str, indices: Sequence[int]) -> np.ndarray:
-        """uint8 (len, H, W, 3) frames of one episode.
-
-        Raises: DataError when the video is missing, truncated or too short.
-        """
-        return decode_frames(self.clip(episode_index, key), indices)
-
 
 def _number_of(row: object, name: str) -> float | None:
     """A row's number; None for anything else, which whoever needs the number then refuses."""
@@ -586,7 +576,7 @@ def _check_numbering(rows: pa.Table, where: object, **first: int) -> None:
     for name, begin in first.items():
         if name not in rows.column_names:
             continue
-        numbers = _numeric_column(rows[name], len(rows), f"{where}, column {name}").reshape(-1)
+        numbers = numeric_column(rows[name], len(rows), f"{where}, column {name}").reshape(-1)
         wrong = np.flatnonzero(numbers != begin + np.arange(len(rows)))
         if len(wrong):
             raise _contradiction(
@@ -594,7 +584,7 @@ def _check_numbering(rows: pa.Table, where: object, **first: int) -> None:
             )
 
 
-def _numeric_column(column: pa.ChunkedArray, length: int, where: str) -> np.ndarray:
+def numeric_column(column: pa.ChunkedArray, length: int, where: str) -> np.ndarray:
     """(N,) or, for lists of equal length, (N, D).
 
     Raises: RejectedInputError (length_mismatch, nan_state, unreadable) for another number of rows than listed, empty rows,
