@@ -6,10 +6,10 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from worldline_core.data.curation.curate_config import CurateConfig, DrawnSplits
 from worldline_core.data.curation.recorded_episode import is_drawn
 from worldline_core.data.episodes.episode import Split
 from worldline_core.data.episodes.episode_index import QuarantineRow
+from worldline_core.data.episodes.episode_set_writer import Part
 from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
@@ -28,10 +29,8 @@ TESTING = ("test", "ood_test")
 CURATION_FILE = "curation.json"
 
 
-class Described(Protocol):
-    """A waiting episode, by the entries of its part.json."""
-
-    def __getitem__(self, key: str) -> Any: ...
+type Described = Part | Mapping[str, Any]
+"""A waiting episode, by the entries of its part.json."""
 
 
 def decided_rows(config: CurateConfig, parts: Sequence[Described], output: Path) -> list[QuarantineRow]:
@@ -311,10 +310,7 @@ def find_near_duplicates(prints: Sequence[Fingerprint]) -> list[NearDuplicate]:
                         compared = moved[heads[low]]
                         found[high] = NearDuplicate(moved[high], -1, compared, float(share), float(bits))
                         group[group == high] = low
-    return [
-        NearDuplicate(seen.position, moved[group[number]], seen.compared_with, seen.motion_overlap, seen.frame_distance)
-        for number, seen in sorted(found.items())
-    ]
+    return [replace(seen, original=moved[group[number]]) for number, seen in sorted(found.items())]
 
 
 def _frame_distance(first: np.ndarray, others: np.ndarray, shared: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ multilingual and multi-robot training use (Conneau et al. 2020).
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -106,7 +106,11 @@ def write_source_weights(output: Path, rows: Sequence[EpisodeRow], alpha: float)
     A weight is that of one episode; the mean over episodes is 1. A sampler that draws episodes by these weights draws a
     source with the probability of its share.
     """
-    hours, counts = _hours_and_counts(rows)
+    hours, counts = defaultdict[str, float](float), Counter[str]()
+    for row in rows:
+        if row.split == "train" and row.stage1_ok:
+            hours[row.source] += row.video_frames / row.fps / 3600
+            counts[row.source] += 1
     total, episodes = sum(value**alpha for value in hours.values()), sum(counts.values())
     shares = {source: hours[source] ** alpha / total for source in sorted(counts)}
     table = {
@@ -119,14 +123,3 @@ def write_source_weights(output: Path, rows: Sequence[EpisodeRow], alpha: float)
         for source, share in shares.items()
     }
     write_json_atomic(output / WEIGHTS_FILE, table)
-
-
-def _hours_and_counts(rows: Sequence[EpisodeRow]) -> tuple[dict[str, float], dict[str, int]]:
-    """Hours of video and number of episodes by source, of the episodes that train."""
-    hours: dict[str, float] = {}
-    counts: dict[str, int] = {}
-    for row in rows:
-        if row.split == "train" and row.stage1_ok:
-            hours[row.source] = hours.get(row.source, 0.0) + row.video_frames / row.fps / 3600
-            counts[row.source] = counts.get(row.source, 0) + 1
-    return hours, counts

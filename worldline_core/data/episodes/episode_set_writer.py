@@ -205,7 +205,8 @@ class EpisodeSetWriter:
             safe_name(view, "View")
             if isinstance(images, np.ndarray):
                 _check_images(images, episode, f"{where}, view {view}")
-            views[view] = ViewImages.of(images) if isinstance(images, np.ndarray) else images
+                images = ViewImages(images.__iter__, len(images))
+            views[view] = images
         robot_masks, thing_labels = robot_masks or {}, thing_labels or {}
         final = self._parts / part_name(episode.episode_id)
         # Not by the process id, which the containers that share a store have in common.
@@ -296,8 +297,8 @@ class EpisodeSetWriter:
         """Take back an added episode (before it is quarantined instead)."""
         shutil.rmtree(self._parts / part_name(episode_id), ignore_errors=True)
 
-    def close(self) -> dict[str, Any]:
-        """Assemble datasets, index and quarantine; returns the counts {"kept", "quarantined", "reasons"}.
+    def close(self) -> None:
+        """Assemble datasets, index and quarantine.
 
         Raises: DataError when nothing was kept; the quarantine is written all the same.
         """
@@ -331,8 +332,6 @@ class EpisodeSetWriter:
         shutil.rmtree(leftovers, ignore_errors=True)
         self._work.rename(leftovers)
         shutil.rmtree(leftovers)
-        reasons = Counter(row.reason for row in rejected)
-        return {"kept": len(parts), "quarantined": len(rejected), "reasons": dict(sorted(reasons.items()))}
 
 
 def _count_videos(parts: Sequence[Part]) -> dict[str, Any]:

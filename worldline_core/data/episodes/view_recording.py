@@ -70,11 +70,6 @@ class ViewImages:
     fit: Fit = "stretch"
     calibrated: bool = False
 
-    @classmethod
-    def of(cls, frames: np.ndarray) -> ViewImages:
-        """A recording of pictures in memory, uint8 (N, H, W, 3), kept as they are."""
-        return cls(lambda: iter(frames), len(frames))
-
 
 RECORDED_SIZE = "recorded_size."
 """Begins the note, in an episode's conventions, of the size (HEIGHTxWIDTH) that a view had before it was enlarged."""
