@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import PurePosixPath
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -257,6 +257,14 @@ class ForeignSourceConfig(SourceConfigBase):
         " or an absolute path",
     )
 
+    @model_validator(mode="after")
+    def _not_for_training(self) -> ForeignSourceConfig:
+        if getattr(self, "evaluation_only", False) and self.split in TRAINING_SPLITS:
+            raise ValueError(
+                f"these recordings are for evaluation only: split {self.split} is refused, use test or ood_test"
+            )
+        return self
+
     def declared(self, scene: str) -> dict[str, Any]:
         """Fields of an `Episode` that the configuration decides.
 
@@ -274,13 +282,7 @@ class ForeignSourceConfig(SourceConfigBase):
 class EvaluationSourceConfig(ForeignSourceConfig):
     """A source that results are compared on, and that therefore never trains or selects a model."""
 
-    @model_validator(mode="after")
-    def _not_for_training(self) -> EvaluationSourceConfig:
-        if self.split in TRAINING_SPLITS:
-            raise ValueError(
-                f"these recordings are for evaluation only: split {self.split} is refused, use test or ood_test"
-            )
-        return self
+    evaluation_only: ClassVar[bool] = True
 
 
 class LensConfig(StrictModel):

