@@ -156,13 +156,8 @@ class CurateWork(EpisodeWork[SourceEpisode, InputRow]):
     @cached_property
     def source(self) -> Callable[[int], EpisodeSource]:
         """Opens source `number`; the last few stay open."""
-        sources, roots = self.config.sources, self.roots
-
-        @lru_cache(maxsize=_OPEN_SOURCES)
-        def opened(number: int) -> EpisodeSource:
-            return open_source(sources[number], parse_location(roots[number]))
-
-        return opened
+        sources, places = self.config.sources, [parse_location(root) for root in self.roots]
+        return lru_cache(maxsize=_OPEN_SOURCES)(lambda number: open_source(sources[number], places[number]))
 
     def label(self, source: int) -> str:
         """Name of a source in quarantine rows."""

@@ -50,7 +50,7 @@ from worldline_core.data.episodes.view_recording import (
     recorded_size,
     store_view,
 )
-from worldline_core.data.guards.rejection import RejectedInputError, check_length
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import safe_name
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.data.video.frames import Frames, packed_images
@@ -204,8 +204,14 @@ class EpisodeSetWriter:
         for view, images in frames.items():
             safe_name(view, "View")
             if isinstance(images, np.ndarray):
-                _check_images(images, episode, f"{where}, view {view}")
-                images = ViewImages(images.__iter__, len(images))
+                if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
+                    raise DataError(
+                        "Images have a wrong size or type",
+                        where=f"{where}, view {view}",
+                        expected="uint8 (N, H, W, 3)",
+                        got=f"{images.dtype} {images.shape}",
+                    )
+                images = ViewImages(images.__iter__, episode.num_video_frames)
             views[view] = images
         robot_masks, thing_labels = robot_masks or {}, thing_labels or {}
         final = self._parts / part_name(episode.episode_id)
@@ -241,12 +247,7 @@ class EpisodeSetWriter:
                 "num_frames": episode.num_frames,
                 "video_frames": episode.num_video_frames,
                 "videos": {
-                    view: {
-                        "size": kept.size,
-                        "codec": kept.codec,
-                        "pixel_format": kept.pixel_format,
-                        "copied": kept.copied,
-                    }
+                    view: {name: getattr(kept, name) for name in ("size", "codec", "pixel_format", "copied")}
                     for view, kept in stored.items()
                 },
                 "cameras": {view: [camera.width, camera.height] for view, camera in episode.cameras.items()},
@@ -339,13 +340,6 @@ def _count_videos(parts: Sequence[Part]) -> dict[str, Any]:
     copied = sum(video["copied"] for video in videos)
     codecs = Counter(f"{video['codec']} {video['pixel_format']}" for video in videos)
     return {"copied": copied, "encoded": len(videos) - copied, "codecs": dict(sorted(codecs.items()))}
-
-
-def _check_images(images: np.ndarray, episode: Episode, where: str) -> None:
-    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
-        got = f"{images.dtype} {images.shape}"
-        raise DataError("Images have a wrong size or type", where=where, expected="uint8 (N, H, W, 3)", got=got)
-    check_length("Images", where, states=episode.num_video_frames, unit="frames", found=len(images))
 
 
 def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:

@@ -55,13 +55,13 @@ _POSE_NAMES = tuple(
     f"{arm}/{name}" for arm in ("left", "right") for name in ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
 )
 _EFFECTORS = Columns("{track}/effector/position", widths=(2,))
-_ARMS = (
+_ARMS = tuple(
     ArmPlace(
-        "left", Columns("{track}/joint/position", slice(0, 7), (14,)), Columns(_EFFECTORS.dataset, slice(0, 1), (2,))
-    ),
-    ArmPlace(
-        "right", Columns("{track}/joint/position", slice(7, 14), (14,)), Columns(_EFFECTORS.dataset, slice(1, 2), (2,))
-    ),
+        arm,
+        Columns("{track}/joint/position", slice(7 * n, 7 * n + 7), (14,)),
+        Columns(_EFFECTORS.dataset, slice(n, n + 1), (2,)),
+    )
+    for n, arm in enumerate(("left", "right"))
 )
 _GRIPPER_STATE = GripperRange(closed=120.0, open=35.0)
 """Readings of `state/effector/position`, checked on images."""
