@@ -39,12 +39,9 @@ def episode(arms: tuple[str, ...] = ("left", "right"), **changes: object) -> Epi
     phase = np.arange(8 * len(arms))
     motion = np.array([0.1, -0.4, 0.3, -1.6, 0.2, 1.5, 0.4, 0.5] * len(arms)) + 0.3 * np.sin(1.3 * time + phase)
     values = motion.astype(np.float32)
-    described = {
-        "episode_id": "a", "source": "test", "embodiment": "none", "scene": "s", "task_family": "unknown", "instruction": "",
-        "outcome": "unknown", "split": "test", "fps": 30.0, "state": values[:LENGTH], "action": values[5:],
-        "timestamps": np.arange(LENGTH) / 30, "state_names": joint_names(dict.fromkeys(arms, 7)),
-    }  # fmt: skip
-    return Episode(**{**described, **changes})  # type: ignore[arg-type]
+    tracks = {"state": values[:LENGTH], "action": values[5:], "state_names": joint_names(dict.fromkeys(arms, 7))}
+    described = {"embodiment": "none", "fps": 30.0, "timestamps": np.arange(LENGTH) / 30, "cameras": {}, **tracks}
+    return make_sample(num_frames=LENGTH, views=(), **{**described, **changes})[0]
 
 
 def refused(check: Callable[[Episode], None], told: Episode, message: str) -> str:

@@ -1,26 +1,22 @@
-"""Sources that hold nothing, or of which a part is missing: all that is wrong is said at once; sources whose folder is a URL."""
+"""Sources that hold nothing, or of which a part is missing: all that is wrong is said at once."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import fsspec
 import numpy as np
 import pytest
-import yaml
 
 from tests.data import test_source_robomind as robomind
 from tests.data import test_source_robotwin as robotwin
 from tests.data import test_source_unitree_h5 as unitree
-from tests.data.curating import preset, run
-from tests.data.published_lerobot import FRAMES, HEIGHT, WIDTH, write_droid, write_robocoin
+from tests.data.curating import run
+from tests.data.published_lerobot import FRAMES, write_droid
 from tests.data.test_lerobot import DATA, edit
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
-from worldline_core.store.artifact_files import digest_folder
 
 
 def videos(folder: Path, seed: int) -> dict[str, Any]:
@@ -135,36 +131,3 @@ def test_what_the_contract_refuses_is_said_at_once(tmp_path: Path) -> None:
         run(tmp_path, source | {"embodiment": "so101"})
     for fault in ("State has another size than the embodiment", "exterior_1_left", "wrist_left"):
         assert fault in str(refused.value)
-
-
-POSE = [[1.0, 0, 0, 0.1], [0, 0, 1.0, -0.4], [0, -1.0, 0, 1.3], [0, 0, 0, 1.0]]
-CAMERA = {"width": WIDTH, "height": HEIGHT, "K": [[60.0, 0, 63.5], [0, 60.0, 35.5], [0, 0, 1]], "T": POSE}
-
-
-def remote_robocoin(root: Path) -> dict[str, Any]:
-    write_robocoin(root / "one", episodes=2)
-    camera = {**CAMERA, "maps": "camera_to_base", "axes": "opencv"}
-    (root / "one/meta/calibration.yaml").write_text(yaml.safe_dump({"views": {"head": camera}}))
-    return preset("robocoin", root, calibration="meta/calibration.yaml")
-
-
-def remote_robomind(root: Path) -> dict[str, Any]:
-    robomind.write_franka(root)
-    (root / "instr.csv").write_text("task,instruction\nbread_in_basket,take the bread\n")
-    declared = {"layout": "h5_franka_3rgb", "fps": 10, "gripper_state": robomind.GRIPPER, "instructions": "instr.csv"}
-    return {"kind": "robomind", **declared}
-
-
-@pytest.mark.parametrize("make", [remote_robocoin, remote_robomind])
-@pytest.mark.usefixtures("reading_in_this_process")  # which alone has a file system in memory
-def test_a_source_in_an_object_store(tmp_path: Path, make: Callable[[Path], dict[str, Any]]) -> None:
-    root = tmp_path / "raw"
-    root.mkdir()
-    source, bucket = make(root), f"/{make.__name__}"
-    fsspec.filesystem("memory").put(f"{root}/", f"{bucket}/", recursive=True)
-    digests = set()
-    for number, path in enumerate((str(root), f"memory:/{bucket}")):
-        counts, curated = run(tmp_path / str(number), {**source, "path": path, "name": "same"})
-        assert counts["quarantined"] == 0
-        digests.add(digest_folder(curated.root))
-    assert len(digests) == 1

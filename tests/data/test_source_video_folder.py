@@ -17,7 +17,6 @@ from tests.data.conftest import make_sample
 from tests.data.curating import reasons, record, run
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.render_actions import render_actions
-from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.video_folder import caption_table
 from worldline_core.data.video.clip import frame_times
@@ -170,12 +169,10 @@ def test_frame_times_are_those_of_decoding(tmp_path: Path) -> None:
 
 
 def test_a_state_without_columns_is_none_and_only_that() -> None:
-    about: dict[str, Any] = dict.fromkeys(("episode_id", "source", "embodiment", "scene", "instruction"), "x")
-    about |= {"task_family": "unknown", "outcome": "unknown", "split": "test", "fps": 8.0, "timestamps": np.zeros(1)}
     for width, kind in ((0, "joints"), (1, "none")):
-        values = np.zeros((1, width), np.float32)
+        values = np.zeros((9, width), np.float32)
         with pytest.raises(DataError, match="State has"):
-            Episode(**about, state=values, action=values, state_kind=kind)
+            make_sample(state=values, action=values, state_names=None, state_kind=kind)
 
 
 def test_from_a_folder_of_videos_to_the_clips_of_stage_1(tmp_path: Path, project_root: Path) -> None:

@@ -13,6 +13,7 @@ from unittest.mock import Mock
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from fsspec.implementations.memory import MemoryFileSystem
 from upath import UPath
 
@@ -20,6 +21,7 @@ from tests.data.conftest import make_sample  # pyright: ignore[reportMissingImpo
 from tests.data.curating import record, run
 from tests.scale.conftest import BUCKET, ObjectStore
 from tools.corrupted import lerobot_v21, mcap
+from tools.corrupted.content import HEIGHT, WIDTH
 from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
@@ -204,6 +206,7 @@ def one_of_each(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
     [
         "lerobot_v21",
         "mcap",
+        "robomind",
         *(pytest.param(name, marks=pytest.mark.slow) for name in ("robotwin", "video_folder", "droid_annotation")),
     ],
 )
@@ -214,11 +217,18 @@ def test_the_same_bytes_from_a_folder_and_from_elsewhere(
         source = lerobot_v21.write(tmp_path / layout, 2, 0, np.random.default_rng(0))[1]
         for number, table in enumerate(sorted(tmp_path.rglob("data/chunk-000/*.parquet"))):  # whole, and cut
             pq.write_table(pq.read_table(table).drop(["frame_index"]).slice(0, (99, 9)[number]), table)
+        camera = {"width": WIDTH, "height": HEIGHT, "K": [[80, 0, 48], [0, 80, 36], [0, 0, 1]], "T": np.eye(4).tolist()}
+        views = dict.fromkeys(source["views"].values(), camera | {"maps": "camera_to_base", "axes": "opencv"})
+        (Path(source["path"]) / "meta/cameras.yaml").write_text(yaml.safe_dump({"views": views}))
+        source |= {"calibration": "meta/cameras.yaml", "collection": True}
     elif layout == "mcap":
         source = mcap.write(tmp_path / layout, 1, 0, np.random.default_rng(0))[1]
     else:
         source = request.getfixturevalue("one_of_each")[layout]
     local = Path(source["path"])
+    if layout == "robomind":
+        (local / "texts.csv").write_text("task,instruction\nopen_drawer,pull it open\n")
+        source |= {"instructions": "texts.csv"}
     if broken := {"mcap": "broken.mcap", "video_folder": "broken.mp4"}.get(layout):
         (local / broken).write_bytes(b"no recording")
     remote = UPath(f"memory://{tmp_path.name}/{local.name}")
