@@ -11,6 +11,7 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import lru_cache, partial
 from hashlib import sha256
+from itertools import islice
 
 import numpy as np
 
@@ -350,7 +351,8 @@ def trimmed(config: CurateConfig, loaded: LoadedEpisode) -> LoadedEpisode:
     cut = episode.cut(0, common)
     cut = replace(cut, conventions={**cut.conventions, TRIMMED: f"the first {common} frames of {found}"})
     counted = {view: replace(clip, file_frames=counts.get(view)) for view, clip in loaded.clips.items()}
-    return replace(loaded, clips=counted).cut(cut, lambda _: range(common))
+    part = replace(loaded, clips=counted).cut(cut, lambda _: range(common))
+    return replace(part, images=lambda view: islice(loaded.images(view), common))
 
 
 def prepare_episode(
