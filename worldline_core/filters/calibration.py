@@ -326,10 +326,7 @@ def detect_mistake(
         gray: by view, uint8 (n, h, w).
         bad_frames: bool (n,), frames that other detectors dropped; the longest stretch without any is judged.
     """
-    stretches = runs(~bad_frames)
-    if not stretches:
-        return Verdict(_UNEXPLAINED, True, {"verdict": "too_little_evidence"})
-    start, stop = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
+    start, stop = max(runs(~bad_frames), key=lambda stretch: stretch[1] - stretch[0], default=(0, 0))
     step = max(1, round(episode.fps / config.rate_hz))
     if stop - start < _MIN_FRAMES * step:
         return Verdict(_UNEXPLAINED, True, {"verdict": "too_little_evidence"})
