@@ -27,7 +27,7 @@ from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.object_weights import ObjectWeights
 from worldline_core.training.optimizers import require_one_process
 from worldline_core.training.processes import BatchPlan, join_processes
-from worldline_core.training.trainer import ParameterGroup, TrainingResult, batch_plan, held_out_losses, train
+from worldline_core.training.trainer import ParameterGroup, Probe, TrainingResult, batch_plan, held_out_losses, train
 from worldline_core.training.training_config import (
     ActionFollowingConfig,
     LossWeighting,
@@ -158,7 +158,7 @@ class Stage:
         objective: FlowMatchingObjective,
         groups: Sequence[ParameterGroup],
         loader: ClipLoader,
-        probe: ActionFollowing | None = None,
+        probe: Probe | None = None,
     ) -> TrainingResult:
         """Train, or continue a killed run.
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import torch
 from safetensors.torch import save
@@ -45,9 +45,6 @@ from worldline_core.training.training_state import (
     nan_to_null,
     newest_state,
 )
-
-if TYPE_CHECKING:
-    from worldline_core.training.action_following import ActionFollowing
 
 
 @dataclass(frozen=True)
@@ -99,6 +96,18 @@ class Objective[BatchT: NamedBatch](Protocol):
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue from saved values."""
         del state
+
+
+class Probe(Protocol):
+    """A measurement of the averaged weights that takes its share of the run's time, and is always made after the last step."""
+
+    def due(self, seconds: float) -> bool:
+        """True when it is to be made, so many seconds after the run began or continued."""
+        ...
+
+    def measure(self, step: int) -> dict[str, float]:
+        """Values to log. Raises: TrainingError: the run is to end."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -180,7 +189,7 @@ def train[BatchT: NamedBatch](
     objective: Objective[BatchT],
     load: Callable[[int], BatchT],
     validate: Callable[[], dict[str, float]] | None = None,
-    probe: ActionFollowing | None = None,
+    probe: Probe | None = None,
     output: Path,
     identity: Mapping[str, Any],
     title: str,
