@@ -4,7 +4,7 @@ from tasks.execution.artifact_task import ArtifactTask
 
 train_tokenizer = ArtifactTask(
     name="train_tokenizer",
-    version=5,
+    version=6,
     function="worldline_core.training.train_tokenizer:train_tokenizer",
     config="worldline_core.training.training_config:TokenizerConfig",
     inputs=("episodes",),

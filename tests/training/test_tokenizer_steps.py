@@ -96,7 +96,7 @@ def test_a_decoder_is_trained_further_for_the_same_codes(world, trained, tmp_pat
         train_tokenizer(CONFIG, {**inputs, "encoder": trained}, tmp_path / "both")
 
 
-def test_blurred_edges_are_weaker_and_dots_are_no_edges():
+def test_blurred_edges_are_weaker_and_dots_are_no_edges_but_colours_of_equal_grey_are():
     step = torch.zeros(1, 3, 2, 32, 32)
     step[..., 14:] = 1.0
     blurred = torch.nn.functional.avg_pool3d(step, (1, 5, 5), stride=1, padding=(0, 2, 2), count_include_pad=False)
@@ -105,6 +105,8 @@ def test_blurred_edges_are_weaker_and_dots_are_no_edges():
     assert edge_strength(blurred).max() < 0.8 * strongest
     # Patterns that alternate from pixel to pixel would be the cheapest way to look sharp.
     torch.testing.assert_close(edge_strength(step + dots), edge_strength(step), rtol=0, atol=1e-5)
+    coloured = step * torch.tensor([1.0, -1.0, 0.0]).view(1, 3, 1, 1, 1)
+    torch.testing.assert_close(edge_strength(coloured).max(), strongest)
 
 
 def test_a_wan_autoencoder_gets_one_too(world, tmp_path):

@@ -145,14 +145,14 @@ def decode_windows(
 
 
 def edge_strength(video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "n 1 y x"]:
-    """Mean size of the Laplacian of the grey picture within 4 x 4 pixels, for each frame but the first.
+    """Mean size of the Laplacian of each colour within 4 x 4 pixels, for each frame but the first.
 
     The picture is averaged over 2 x 2 pixels before, which takes out what alternates from pixel to pixel: a decoder gains
-    nothing by drawing dots where it does not know the edge.
+    nothing by drawing dots where it does not know the edge. A grey picture does not show the edges of small coloured things.
     """
-    grey = rearrange(video[:, :, 1:], "b c t h w -> (b t) c h w").mean(dim=1, keepdim=True)
+    colours = rearrange(video[:, :, 1:], "b c t h w -> (b t c) 1 h w")
     laplacian = video.new_tensor([[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]])
-    return F.avg_pool2d(F.conv2d(F.avg_pool2d(grey, 2, stride=1), laplacian[None, None]).abs(), 4, stride=2)
+    return F.avg_pool2d(F.conv2d(F.avg_pool2d(colours, 2, stride=1), laplacian[None, None]).abs(), 4, stride=2)
 
 
 class DecoderObjective(Objective[DecoderBatch]):

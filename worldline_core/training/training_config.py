@@ -323,7 +323,7 @@ class TokenizerConfig(StrictModel):
     warmup_steps: int = Field(default=100, ge=0)
     average_decay: float = Field(default=0.998, ge=0, lt=1)
     reference_dropout: float = Field(default=0.1, ge=0, le=1)
-    disturbance: float = Field(default=0.5, ge=0)
+    disturbance: float = Field(default=0.3, ge=0)
     """Largest standard deviation of the noise added to the codes of the groups (0 trains on exact codes only)."""
     edge_weight: float = Field(default=10.0, ge=0)
     """Weight of the difference between the strength of decoded and true edges, which keeps uncertain ones sharp."""
