@@ -182,6 +182,13 @@ def test_wan_latents_are_the_normalised_mode(wan):
     torch.testing.assert_close(wan.decode(latents), theirs, rtol=1e-4, atol=1e-4)
 
 
+def test_other_statistics_than_a_wan_autoencoder_has_channels_are_refused():
+    vae = small_wan_autoencoder()
+    vae.register_to_config(latents_mean=[0.0] * 17)
+    with pytest.raises(CheckpointError, match=r"statistics[\s\S]*48[\s\S]*17"):
+        tokenizers.WanTokenizer(vae)
+
+
 @torch.no_grad()
 def test_latents_are_decoded_as_they_arrive(fitted, wan):
     """In pieces of 1, 1 and 2 latent frames: the frames of the whole clip's decoding, also after another clip."""

@@ -497,6 +497,10 @@ WAN22_STD = (
 # fmt: on
 
 
+_DEFAULT_CHANNELS = 16
+"""Of the statistics that ``AutoencoderKLWan`` has where a folder states none: those of Wan 2.1."""
+
+
 class WanTokenizer(nn.Module, VideoTokenizer):
     """``AutoencoderKLWan``: encoding takes the mode of the posterior, latents are ``(mode - mean) / std`` a channel."""
 
@@ -510,7 +514,7 @@ class WanTokenizer(nn.Module, VideoTokenizer):
         self.spatial_compression = int(vae.config["scale_factor_spatial"])
         self.temporal_compression = int(vae.config["scale_factor_temporal"])
         mean, std = vae.config["latents_mean"], vae.config["latents_std"]
-        if self.latent_channels == len(WAN22_MEAN) != len(mean):
+        if self.latent_channels == len(WAN22_MEAN) and len(mean) == len(std) == _DEFAULT_CHANNELS:
             mean, std = WAN22_MEAN, WAN22_STD
         if len(mean) != self.latent_channels or len(std) != self.latent_channels:
             raise CheckpointError(
