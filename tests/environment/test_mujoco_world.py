@@ -171,6 +171,8 @@ def test_a_start_is_drawn_by_the_policies_in_the_order_of_their_recording(compar
     again = MujocoEnv(compared, embodiment=ROBOT)
     again.reset(seed=1)
     assert drawn == [["expert", "blind", "late"]]
+    # A button that nobody has touched.
+    np.testing.assert_allclose(again.target(), [0.0], atol=1e-3)
     again.close()
 
 

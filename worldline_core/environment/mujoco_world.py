@@ -201,6 +201,12 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             np.concatenate([self._episode.picture[view] for view in self.views], axis=1) if self.render_mode else None
         )
 
+    def target(self) -> np.ndarray:
+        """Current position ``(3)`` of the thing that the task moves, or travel ``(1)`` of a drawer or button [m]."""
+        address = self._recorder.scene.model.joint(f"{self._layout.target.kind}_0").qposadr[0]
+        count = 1 if self._layout.family in ("close", "press") else 3
+        return self._qpos[-1][address : address + count].copy()
+
     def _observed(self) -> dict[str, Any]:
         episode = self._episode
         return self.spaces.observed({view: picture.copy() for view, picture in episode.picture.items()}, episode.state)
