@@ -53,7 +53,10 @@ class HiddenCameras(EpisodeRecorder):
         self.eye = self.target + max(distance, 0.6) * away
         self.roll = np.radians(random.normal(0, UPRIGHT_ROLL_DEG))
 
-    def _set_scene(self, renderer: SceneRenderer, scene_id: str, jitter: np.random.Generator) -> None:
+    def _set_scene(
+        self, renderer: SceneRenderer, scene_id: str, jitter: np.random.Generator, held_out_camera: bool
+    ) -> None:
+        del held_out_camera
         renderer.set_look(SCENES[scene_id])
         self._paint_body(jitter, repaint=False)
         renderer.place_cameras(self.eye, self.target)
