@@ -328,9 +328,9 @@ def load_config[Model: BaseModel](
 ) -> Model:
     """Load a preset or a file, apply overrides, and validate.
 
-    A file may begin with ``extends: PRESET``: it then states only what differs from that preset. An override with null takes away what the
-    file has (one of its rollouts), as in a file that extends it, where null is no value of its own. A value that begins with TODO is
-    refused, whichever section is asked for.
+    A file may begin with ``extends: PRESET``: it then states only what differs from that preset. Null takes a key
+    of the preset or file away (one of its rollouts), in a file that extends it and in an override, unless null is one of its values.
+    Values that still begin with TODO, as `worldline init` writes them, are refused, whichever section is loaded.
 
     Args:
         section: one top-level mapping of the file; overrides are still written from the top (``train_stage2.steps=10``).

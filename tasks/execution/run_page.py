@@ -142,7 +142,7 @@ def write_finished_page(folder: Path, report: Path) -> Path:
 
 
 def finished_step(folder: Path, name: str, artifact: Path, seconds: float | None) -> dict[str, Any]:
-    """What the page in ``folder`` shows of a finished step, which took ``seconds``; None where it was found in the store."""
+    """Describe a finished step for the page in ``folder``; ``seconds`` is None for a step that was cached."""
     pictures = [path for pattern in PICTURES for path in sorted(artifact.glob(pattern))]
     metrics = read_json(artifact / "manifest.json").get("metrics") or {}
     numbers = [

@@ -81,6 +81,7 @@ def test_recordings_of_every_kind_take_cameras_from_a_file(tmp_path: Path, kind:
 
 
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {
+    "K of other proportions": ({"head": {**STILL, "width": 96}}, "missing_calibration"),
     "a feature": (
         {"head": {**SIZE, "maps": "camera_to_base", "axes": "opencv", "T_feature": {"name": "a", "format": "matrix"}}},
         "missing_column",

@@ -101,7 +101,7 @@ def test_segments_cut_every_array(tmp_path: Path) -> None:
     mask = segment.robot_masks(0, "head")
     assert mask is not None
     assert np.array_equal(mask, samples[1][2]["head"][2:7])
-    with pytest.raises(DataError, match="outside of the clip"):
+    with pytest.raises(DataError, match="outside of the episode"):
         segment.frames(0, "head", [5])
     (tmp_path / "elsewhere").mkdir()
     for name in ("curated", "filtered"):  # both together may be moved

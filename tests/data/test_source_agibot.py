@@ -384,16 +384,23 @@ def gone(name: str) -> Damage:
     return lambda folder: (folder / name).unlink()
 
 
+def cut_to(name: str, part: slice) -> Damage:
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[part])
+
+
 PROPRIO, POSES = "proprio_stats.h5", "head_extrinsic_params_aligned.json"
 CLIP_FAULTS: dict[Write, dict[str, tuple[Damage, str]]] = {
     write_clip: {
         "no proprioception": (gone(PROPRIO), "missing_file"),
         "no video": (gone("head_color.mp4"), "missing_file"),
         "no intrinsics": (gone("head_intrinsic_params.json"), "missing_file"),
+        "no end poses": (h5(without("state/end/position")), "missing_column"),
         "no commands of the grippers": (h5(without("action/effector/position")), "missing_column"),
+        "NaN place": (h5(replaced("state/end/position", with_nan)), "nan_state"),
         "turn without direction": (h5(replaced(TURN, np.zeros_like)), "nan_state"),
         "NaN joint": (h5(replaced("state/joint/position", with_nan)), "nan_state"),
         "hands": (h5(replaced("state/effector/position", lambda v: np.repeat(v, 6, axis=1))), "invalid_gripper"),
+        "a joint less": (h5(replaced("state/joint/position", lambda v: v[:, 1:])), "length_mismatch"),
         "a command less": (h5(replaced("action/joint/position", lambda v: v[1:])), "length_mismatch"),
         "a camera pose less": (changed(POSES, lambda poses: poses[1:]), "length_mismatch"),
         "another rate": (lambda folder: black_video(folder / "head_color.mp4", LENGTH, 15.0), "wrong_fps"),
@@ -407,6 +414,8 @@ CLIP_FAULTS: dict[Write, dict[str, tuple[Damage, str]]] = {
         "no rotation": (changed("extrinsics.npy", lambda v: 2 * v), "invalid_extrinsics"),
         "singular K": (changed("intrinsics.npy", np.zeros_like), "singular_intrinsics"),
         "no picture": (gone("frame.png"), "missing_file"),
+        "truncated picture": (cut_to("frame.png", slice(60)), "unreadable"),
+        "truncated array": (cut_to("action.npy", slice(-8)), "unreadable"),
         "an array elsewhere": (lambda folder: moved_out(folder / "action.npy"), "path_traversal"),
     },
 }

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tests.data.curating import Damage, check_faults, edit, replaced, run, without
+from tests.data.curating import Damage, check_faults, edit, replaced, run, with_nan, without
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.sources.hdf5 import open_hdf5
 from worldline_core.errors import DataError
@@ -212,8 +212,10 @@ JOINTS = "puppet/joint_position"
 FAULTS: dict[str, tuple[Damage, str]] = {
     "no joints": (without(JOINTS), "missing_column"),
     "joints of another robot": (replaced(JOINTS, lambda v: v[:, :7]), "length_mismatch"),
+    "a joint that is no number": (replaced(JOINTS, with_nan), "nan_state"),
     "one state fewer": (replaced(JOINTS, lambda v: v[:-1]), "length_mismatch"),
     "no such camera": (without("observations/rgb_images/camera_top"), "missing_view"),
+    "an image that is none": (image(lambda v: v[::-1].copy()), "unreadable"),
     "an image of another size": (image(smaller), "unreadable"),
     "joints in degrees": (replaced(JOINTS, lambda v: np.rad2deg(v) * [*[1] * 7, 0]), "joint_out_of_range"),
 }

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tests.data.curating import Damage, check_faults, replaced, run, without
+from tests.data.curating import Damage, check_faults, replaced, run, with_nan, without
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.errors import ConfigError
 
@@ -108,6 +108,7 @@ FAULTS: dict[str, tuple[Damage, str]] = {
     "an image less": (replaced(f"{HEAD}/rgb", lambda images: images[1:]), "length_mismatch"),
     "a joint row less": (replaced("joint_action/right_arm", lambda joints: joints[1:]), "length_mismatch"),
     "quaternions missing": (replaced("endpose/left_endpose", lambda poses: poses[:, :6]), "length_mismatch"),
+    "NaN": (replaced("joint_action/left_arm", with_nan), "nan_state"),
     "pose never written": (replaced("endpose/right_endpose", np.zeros_like), "nan_state"),
     "camera matrices disagree": (replaced(f"{HEAD}/cam2world_gl", shifted), "invalid_extrinsics"),
     "extrinsics the other way round": (

@@ -16,10 +16,12 @@ from tests.data.curating import (
     Damage,
     black_video,
     check_faults,
+    cut,
     moved_out,
     rejected,
     replaced,
     run,
+    with_nan,
     without,
 )
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -202,17 +204,20 @@ IMAGES = "observations/images/cam_left_high"
 FAULTS: dict[Write, dict[str, tuple[Damage, str]]] = {
     write_transitions: {
         "no states": (without("observation.state"), "missing_column"),
+        "NaN state": (replaced("observation.state", with_nan), "nan_state"),
         "hands": (replaced("action", lambda v: np.hstack([v, v])), "length_mismatch"),
         "a command less": (replaced("action", lambda v: v[1:]), "length_mismatch"),
         "poses for joints": (other_type, "unreadable"),
         "a file elsewhere": (moved_out, "path_traversal"),
         "no video": (lambda path: video_of(path).unlink(), "missing_file"),
         "a video elsewhere": (lambda path: moved_out(video_of(path)), "path_traversal"),
+        "truncated video": (lambda path: cut(video_of(path)), "truncated_video"),
         "a frame less": (lambda path: black_video(video_of(path), LENGTH - 1, 30.0), "truncated_video"),
         "another rate": (lambda path: black_video(video_of(path), LENGTH, 15.0), "wrong_fps"),
         "not in the table": (not_in_the_table, "missing_column"),
     },
     write_hdf5: {
+        "no joints": (without("observations/qpos"), "missing_column"),
         "no camera": (without(IMAGES), "missing_view"),
         "an image less": (replaced(IMAGES, lambda v: v[1:]), "length_mismatch"),
         "grey images": (replaced(IMAGES, lambda v: v[..., 0]), "unreadable"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.data.curating import Damage, check_faults, replaced, run, without
+from tests.data.curating import Damage, check_faults, replaced, run, with_nan, without
 from worldline_core.data.video.encoder import encode_video
 
 T, HEIGHT, WIDTH = 6, 48, 64
@@ -116,6 +116,7 @@ def test_the_camera_of_a_file_is_that_of_all_episodes(tmp_path: Path) -> None:
 FAULTS: dict[str, tuple[Damage, str]] = {
     "no trajectory": (without("joint_action"), "missing_column"),
     "another robot": (replaced("joint_action/vector", lambda rows: rows[:, :7]), "length_mismatch"),
+    "NaN": (replaced("joint_action/vector", with_nan), "nan_state"),
     "a gripper in millimetres": (replaced("joint_action/vector", lambda rows: 80 * rows + 20), "invalid_gripper"),
     "a row less than the video": (replaced("joint_action/vector", lambda rows: rows[1:]), "length_mismatch"),
     "no first frame": (lambda path: picture_of(path).unlink(), "missing_file"),

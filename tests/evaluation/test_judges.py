@@ -83,6 +83,7 @@ def test_first_pass_is_denser_towards_the_end():
     assert indices[1] == round(np.sqrt(1 / 11) * 128)
     assert np.all(np.diff(np.diff(indices)) <= 1)
     assert judging.frames_at(judging.VERIFICATION_POSITIONS, 101) == (0, 65, 78, 88, 95, 100)
+    assert len(judging.frames_at(np.linspace(0.0, 1.0, judging.MOTION_COUNT), 129)) == 12
     assert judging.first_pass_indices(3) == (0, 1, 2)
 
 

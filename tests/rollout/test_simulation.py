@@ -144,7 +144,10 @@ def test_a_camera_that_cannot_be_right_is_refused(observed, causal, change, erro
 def test_what_does_not_fit_is_refused(observed, causal, models, tmp_path):
     images, controls = observed.images, observed.controls
     grippers = np.isin(np.arange(14), [6, 13])
-    beyond = np.degrees(controls), controls.astype(complex), np.where(grippers, 2.0, controls)
+    beyond = (
+        np.degrees(controls), controls * 100, controls.astype(complex), np.where(grippers, 2.0, controls),
+        np.ma.masked_less(controls, 0.0),
+    )  # fmt: skip
     for changes, error, message in (
         ({"controls": controls[:16]}, DataError, r"1 \+ k \* 16 rows.*got: 16"),
         ({"controls": controls[:17, :7]}, DataError, r"where: controls, .*got: \(17, 7\)"),

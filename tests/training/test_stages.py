@@ -343,6 +343,15 @@ def test_resident_latents_train_the_same_bytes(world, latents, first_stage, tmp_
         short_stage2(input={"kind": "latents", "resident": True, "workers": 1})
 
 
+def test_a_damaged_recording_stops_the_run(recorded, tmp_path):
+    inputs = recorded | {"episodes": shutil.copytree(recorded["episodes"], tmp_path / "set")}
+    (video,) = inputs["episodes"].rglob("*head*/**/*.mp4")
+    half = video.stat().st_size // 2
+    video.write_bytes(video.read_bytes()[:half] + bytes(half))
+    with pytest.raises(DataError, match="A clip cannot be read"):
+        train_stage1(short_stage1(input=FRAME_INPUT), inputs, tmp_path / "strict")
+
+
 def test_a_stage_is_given_what_it_reads(world, tmp_path):
     for values, name in (({}, "latents"), ({"input": FRAME_INPUT}, "tokenizer")):
         with pytest.raises(ConfigError, match=f"need the input {name}"):

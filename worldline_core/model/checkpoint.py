@@ -374,7 +374,7 @@ def _with_branches(config: WorldModelConfig, stored: WorldModelConfig, tensors: 
 
 
 def read_description(path: Path, form: str, noun: str, version: int) -> dict[str, Any]:
-    """What the JSON object that describes some weights (``noun``) says besides its ``format`` and ``version``.
+    """Read the JSON description of weights (``noun`` in errors), without its ``format`` and ``version``, which are checked.
 
     Raises:
         CheckpointError: it is missing, damaged, or of another ``format`` or ``version``.

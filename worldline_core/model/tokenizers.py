@@ -498,7 +498,7 @@ WAN22_STD = (
 
 
 _DEFAULT_CHANNELS = 16
-"""Of the statistics that ``AutoencoderKLWan`` has where a folder states none: those of Wan 2.1."""
+"""Channels of Wan 2.1, whose statistics are ``AutoencoderKLWan``'s default for a folder that states none."""
 
 
 class WanTokenizer(nn.Module, VideoTokenizer):

@@ -1,4 +1,4 @@
-"""Configurations of the rollout steps and of the import of other simulators' videos (docs/rollout.md); imports no torch."""
+"""Configurations of the rollout steps and of the import of other simulators' videos; imports no torch."""
 
 from __future__ import annotations
 
@@ -34,7 +34,14 @@ class _ModelSampler(StrictModel):
 
 
 class FullClipConfig(_ModelSampler):
-    """A Stage II model predicts a clip at once, or chains clips of ``clip_frames`` (1 + 4 k)."""
+    """A Stage II model predicts a clip at once.
+
+    Attributes:
+        steps: Euler steps.
+        shift: moves the noise levels of the steps towards noise, which helps few steps.
+        clip_frames: frames of the longest clip that is predicted at once (1 + 4 k). Longer predictions are chained: each clip
+            begins at the last predicted frame of the one before. None: all at once.
+    """
 
     kind: Literal["full_clip"] = "full_clip"
     steps: int = Field(default=FULL_STEPS, ge=1)
@@ -50,7 +57,11 @@ class FullClipConfig(_ModelSampler):
 
 
 class BlockCausalConfig(_ModelSampler):
-    """A causal model predicts block by block, each in ``steps`` Euler steps; None: as it was trained."""
+    """A causal model predicts block by block.
+
+    Attributes:
+        steps: Euler steps per block; None: as the model was trained.
+    """
 
     kind: Literal["block_causal"] = "block_causal"
     steps: int | None = Field(default=None, ge=1)
@@ -59,7 +70,9 @@ class BlockCausalConfig(_ModelSampler):
 class TextToVideoConfig(_ModelSampler):
     """A base or Stage I model predicts each view from its first image and the instruction.
 
-    ``text``: how instructions become ids; None: as the checkpoint says that it was trained.
+    Attributes:
+        steps, shift: as of :class:`FullClipConfig`.
+        text: how instructions become ids; None: as the checkpoint says that it was trained.
     """
 
     kind: Literal["text_to_video"] = "text_to_video"
@@ -75,7 +88,13 @@ class CopyFirstFrameConfig(StrictModel):
 
 
 class GeSimConfig(StrictModel):
-    """A simulator behind HTTP in the protocol of GE-Sim 2.0; ``image_size``: (H, W) of the pictures that it takes and gives."""
+    """A simulator behind HTTP in the protocol of GE-Sim 2.0.
+
+    Attributes:
+        url: of the server, such as http://127.0.0.1:9000.
+        image_size: (H, W) of the pictures that it takes and gives.
+        timeout_s: for each whole answer.
+    """
 
     kind: Literal["ge_sim"] = "ge_sim"
     url: str = Field(pattern=r"^https?://[^/\s@]+/?$")
@@ -99,9 +118,19 @@ class RolloutConfig(StrictModel):
     """Selection of episodes, and the sampler that predicts them.
 
     Attributes:
+        method: name of the predictions in scores and reports.
+        actions: controls that drive the predictions.
+        banks, embodiments: only episodes of these candidate banks, of these robots; None: all.
+        views: ``all_present``: the largest set of views that each episode has and that the model was trained on; the model's
+            first one is always among them. Or names of views: episodes that lack one of them are left out.
+        cameras: false: as if no camera were known, so that a model that also takes control vectors is driven by these alone.
         num_frames: longest prediction; shorter episodes are predicted as far as whole blocks (or latent frames) go.
             ``whole``: every recording to its end; the last block (or clip) keeps the last controls, and its frames after the
             end are cut off.
+        stride: predict every ``stride``-th frame; the model must have been trained at this stride.
+        bfloat16: compute in mixed precision; false by default on a processor without native bfloat16.
+        weights: type of the model's weights in memory, and of those of a Wan autoencoder, which then computes in bfloat16
+            too: half the memory, without any copy in float32.
         compile: torch.compile of each layer but its attention, for a GPU.
     """
 
@@ -147,9 +176,14 @@ class RolloutConfig(StrictModel):
 
 
 class PolicyRolloutConfig(StrictModel):
-    """A policy that drives the simulator from recorded first frames on (docs/policies.md).
+    """A policy that drives the simulator from recorded first frames on.
 
-    The cache knows a policy by its address alone, so each needs a ``method`` of its own.
+    Attributes:
+        method: name of the predictions. The cache knows a policy by its address alone: name each one.
+        down_sample: take every so-many-th of the policy's actions, which come at its own rate.
+        length_scale: frames of a video for each ``down_sample``-th frame of the recording.
+        splits: recordings that are starts.
+        steps: Euler steps of the model; None: as it was trained.
     """
 
     method: str = Field(min_length=1)
@@ -172,8 +206,11 @@ NAME_FIELD = re.compile(r"\{(\w+)\}|(\*)")
 class VideoLayout:
     """Layout in which a benchmark or another simulator writes its videos of one view.
 
-    ``name`` and ``episode_id`` are those of :class:`ImportRolloutsConfig`; ``size`` is the least (H, W), and the proportions, of
-    their pictures; ``frames: whole``: as many as the recording. None: any.
+    Attributes:
+        name, episode_id: as of :class:`ImportRolloutsConfig`, where it says nothing else.
+        size: the least (H, W), and the proportions, of their pictures; None: any.
+        fps: their rate; None: any.
+        frames: how many each has; None: any; ``whole``: as many as its recording.
     """
 
     name: str

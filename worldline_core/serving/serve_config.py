@@ -1,4 +1,4 @@
-"""Settings of `worldline serve` (docs/serve.md): the model, the address, the limits, and the policies that may drive."""
+"""Settings of `worldline serve`: the model, the address, the limits, and the policies that may drive."""
 
 from __future__ import annotations
 
@@ -18,7 +18,24 @@ TOKEN_VARIABLE = "WORLDLINE_TOKEN"  # noqa: S105  # the variable's name
 
 
 class ServeConfig(StrictModel):
-    """Configuration of `worldline serve`; ``max_clips`` counts those of all sessions together, ``max_blocks`` those of one page."""
+    """Configuration of `worldline serve`.
+
+    Attributes:
+        model: folder of a causal or Stage II checkpoint.
+        tokenizer: its tokenizer's folder; by default the one found by the checkpoint.
+        decoder: folder of a small decoder for the latents of its tokenizer.
+        steps: Euler steps; by default the model's own.
+        compile: torch.compile of each layer but its attention, for a GPU.
+        episodes: EpisodeSet whose recordings sessions may start from.
+        output: where sessions of the page are saved.
+        host: address to listen at. Anything but loopback needs a token (environment variable WORLDLINE_TOKEN).
+        origins: pages of other servers that may connect (http://host:port).
+        max_sessions, max_clips: at a time, those of the page included; clips of all sessions together.
+        max_sessions_per_connection: at a time.
+        max_message_bytes: of one request or reply.
+        idle_s: seconds after which an idle connection is closed, with its sessions.
+        max_blocks: blocks that one session of the page keeps for rewinding and saving.
+    """
 
     model: Path = SHIPPED / "models" / "causal"
     tokenizer: Path | None = None

@@ -147,7 +147,15 @@ class EpisodeSet:
 
         Raises: DataError when the view, the file or a frame is missing, or the video is truncated.
         """
-        return decode_frames(self.clip(i, view), indices)
+        row, clip = self.rows[i], self.clip(i, view)
+        if indices is not None and not all(0 <= index < row.video_frames for index in indices):
+            raise DataError(
+                "Frame index outside of the episode",
+                where=f"episode {row.episode_id}",
+                expected=f"0 <= index < {row.video_frames}",
+                got=str(list(indices)),
+            )
+        return decode_frames(clip, indices)
 
     def clip(self, i: int, view: str) -> VideoClip:
         """The encoded video of a view of row i, cut to its segment, for callers that decode it themselves.
