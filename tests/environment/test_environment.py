@@ -17,9 +17,9 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment import ENVIRONMENT
 from worldline_core.environment.environment import (
     RobotSpaces,
+    SideBySide,
     WorldLineEnv,
     WorldLineVectorEnv,
-    _side_by_side,
     shipped_segmenter,
 )
 from worldline_core.errors import ConfigError, DataError
@@ -235,11 +235,11 @@ def test_the_soft_reward_is_what_a_new_picture_adds_to_the_score(world, starts):
         soft_score(segmenter, replace(video, instruction="tidy up"))
 
 
-def test_videos_are_judged_side_by_side():
+def test_clips_are_worked_on_side_by_side():
     before, both = torch.get_num_threads(), threading.Barrier(2, timeout=10)
     torch.set_num_threads(4)
     try:
-        found = _side_by_side(lambda one: (one, torch.get_num_threads(), both.wait() < 2), range(2))
+        found = SideBySide(2)(lambda one: (one, torch.get_num_threads(), both.wait() < 2), range(2))
         assert found == [(0, 2, True), (1, 2, True)]
         assert torch.get_num_threads() == 4
     finally:

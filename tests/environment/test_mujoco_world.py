@@ -126,7 +126,7 @@ def test_both_worlds_begin_alike_at_any_frame_and_score_alike(physics, world, sh
         one.reset(seed=5)
         one.step(one.spaces.actions(far))
     commanded = inside.spaces.commands(inside.spaces.actions(far))[None, None]
-    followed = inside.vector._running.simulation.follow(commanded)[0][:, -1]
+    followed = inside.vector._running[0].simulation.follow(commanded)[0][:, -1]
     np.testing.assert_allclose(twin._robot.command, followed, atol=1e-9)
     for asked, said in (({"frame": 33}, "No such frame"), ({"start": "x"}, "No recording of this name")):
         with pytest.raises(DataError, match=said):

@@ -6,6 +6,7 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("stable_baselines3")
 
@@ -25,11 +26,13 @@ FORM = {"embodiment": "ur5e_silver", "flat_observation": True, "normalised_actio
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Number of environments that each call of the model stepped."""
-    counts = []
-    original = Session.step
-    monkeypatch.setattr(Session, "step", lambda one, maps: counts.append(len(maps)) or original(one, maps))
-    return counts
+    """Number of environments that each call of the model stepped, on one thread."""
+    counts, threads = [], torch.get_num_threads()
+    original = Session.step_lazily
+    monkeypatch.setattr(Session, "step_lazily", lambda one, maps: counts.append(len(maps)) or original(one, maps))
+    torch.set_num_threads(1)
+    yield counts
+    torch.set_num_threads(threads)
 
 
 @pytest.mark.slow

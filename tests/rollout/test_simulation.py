@@ -17,13 +17,13 @@ from worldline_core.errors import CalibrationError, CheckpointError, ConfigError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.model.tokenizers import frames_to_video
+from worldline_core.model.tokenizers import PatchDecoding, frames_to_video
 from worldline_core.rollout.recorded_starts import RecordedStarts
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
-from worldline_core.rollout.simulation import CommandedRobot, Session
+from worldline_core.rollout.simulation import CommandedRobot, LazyFrames, Session, Undecoded
 
 FRAMES = 17
 
@@ -213,6 +213,55 @@ def test_steps_give_the_bytes_of_a_prediction(causal, start):
         assert equal(simulation.pictures[0], last(predicted))
     # Limits change nothing of commands within them.
     assert equal(videos(start.begin(causal, limits=True), start.controls[None])[0], predicted)
+
+
+@pytest.mark.slow
+def test_frames_that_are_decoded_when_they_are_read_are_the_same(causal, start, held_out):
+    """In any order, by number, slice and list; each latent frame once; beyond the picture at which a clip begins anew."""
+    two = [start, held_out[1]]
+    rows = np.stack([one.controls for one in two])
+    begun = lambda: causal.start(  # noqa: E731
+        [one.images for one in two], [one.cameras for one in two], embodiment=ROBOT, state=rows[:, 0], seed=[0, 1]
+    )
+    whole, lazy = begun(), begun()
+    decoded = []
+    one_by_one = PatchDecoding.__call__
+    for begin in (1, 17, 17):  # the last one is of another clip of the model: it begins anew
+        frames, later = whole.step(rows[:, begin : begin + 16]), lazy.step_lazily(rows[:, begin : begin + 16])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                PatchDecoding, "__call__", lambda own, codes: decoded.append(len(codes)) or one_by_one(own, codes)
+            )
+            for own, other in zip(frames, later, strict=True):
+                for view in causal.views:
+                    assert len(other[view]) == 16
+                    assert np.array_equal(other[view][-1], own[view][-1])
+                    assert not decoded  # it was at hand
+                    for index in (5, [9, 4, 4, 15], [], slice(0, 12, 5), slice(None)):
+                        np.testing.assert_allclose(other[view][index].astype(int), own[view][index], atol=1)
+                    assert len(decoded) == 3 and decoded.clear() is None  # those of 5, of 9, and of 0
+                    assert np.array_equal(np.asarray(other[view]), other[view][:])
+        assert equal(whole.pictures[0], lazy.pictures[0], grey_levels=1)
+
+
+def test_joined_videos_share_what_is_decoded():
+    video = np.arange(12, dtype=np.uint8).repeat(12).reshape(12, 2, 2, 3)
+    asked = []
+
+    def decode(latents):
+        asked.append(latents[0, 0, :, 0, 0].tolist())
+        return [np.concatenate([video[4 * int(number) :][:4] for number in asked[-1]])]
+
+    undecoded = Undecoded(decode, torch.arange(2.0).reshape(1, 1, 2, 1, 1), 4)
+    first = LazyFrames([undecoded, video[8:10]])
+    joined = LazyFrames.joined(first, video[10:])
+    assert (len(first), len(joined)) == (10, 12)
+    assert np.array_equal(joined[[11, 6, 8]], video[[11, 6, 8]])
+    assert asked == [[1.0]]
+    assert np.array_equal(first[:], video[:10])
+    assert np.array_equal(joined[:], video)
+    assert asked == [[1.0], [0.0]]
+    assert joined[[]].shape == (0, 2, 2, 3)
 
 
 def test_a_simulation_begins_in_the_middle_of_a_recording(small_world, shipped):

@@ -38,7 +38,7 @@ from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, Embodiment, 
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.rollout.observation import project_controls, require_drivable
 from worldline_core.rollout.recorded_starts import RecordedStart, RecordedStarts
-from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Simulation
+from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, LazyFrames, Simulation
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.shipped import shipped_folder
 
@@ -185,6 +185,27 @@ def each_start(
     return list(zip(*columns, strict=True))
 
 
+class SideBySide:
+    """Maps over several clips at once, because one of them does not fill the cores.
+
+    Args:
+        count: threads, which share those of torch.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        share = torch.get_num_threads() // count
+        self._pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(share,))
+
+    def __call__[T](self, work: Callable[..., T], *arguments: Sequence[Any]) -> list[T]:
+        if self.count == 1 or len(arguments[0]) == 1:
+            return list(map(work, *arguments))
+        threads = torch.get_num_threads()
+        results = list(self._pool.map(work, *arguments))
+        torch.set_num_threads(threads)  # what a thread of the pool sets is also the default of threads that begin later
+        return results
+
+
 class CommandedSimulation:
     """A simulation that takes one command at a time, and predicts a block where it is asked to.
 
@@ -204,8 +225,8 @@ class CommandedSimulation:
         executed, states = self.simulation.follow(np.stack(self.commands, axis=1))
         return executed[:, -1], states[:, -1]
 
-    def predict(self) -> tuple[Simulation, Frames]:
-        """The simulation after at most a block of the commands, and their videos.
+    def predict(self) -> tuple[Simulation, list[dict[str, LazyFrames]]]:
+        """The simulation after at most a block of the commands, and their videos, which are decoded where they are read.
 
         A copy predicts an unfinished block with the last command held: it is predicted again when there are more commands.
         """
@@ -214,10 +235,11 @@ class CommandedSimulation:
         count = block.shape[1]
         simulation = self.simulation if count == frames else self.simulation.copy()
         held = np.repeat(block[:, -1:], frames - count, axis=1)
-        clips = simulation.step(np.concatenate((block, held), axis=1))
+        clips = simulation.step_lazily(np.concatenate((block, held), axis=1))
         if count == frames:
             self.commands = self.commands[frames:]
-        return simulation, [{view: video[:count] for view, video in clip.items()} for clip in clips]
+            return simulation, clips
+        return simulation, [{view: LazyFrames([video[:count]]) for view, video in clip.items()} for clip in clips]
 
 
 @dataclass
@@ -263,10 +285,10 @@ class RunningEpisode:
         self.reward = 0.0 if self.doubted else self.score - before
 
 
-def longer(video: Trajectory, clip: Mapping[str, np.ndarray], points: np.ndarray | None) -> Trajectory:
+def longer(video: Trajectory, clip: Mapping[str, np.ndarray | LazyFrames], points: np.ndarray | None) -> Trajectory:
     """A video that goes on with a clip, and the tools in its head view where they are known."""
     seen: Any = video.frames
-    frames: dict[str, Any] = {view: np.concatenate((seen[view], more)) for view, more in clip.items()}
+    frames: dict[str, Any] = {view: LazyFrames.joined(seen[view], more) for view, more in clip.items()}
     known = None if video.points is None or points is None else np.concatenate((video.points, points))
     return Trajectory(video.instruction, frames, video.fps, known)
 
@@ -361,7 +383,10 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         self._largest_disagreement = 1.0 if largest_disagreement is None else largest_disagreement
         self._random = [np.random.default_rng() for _ in range(num_envs)]
         self._episodes: list[RunningEpisode] = []
-        self._running: CommandedSimulation
+        self._side_by_side = SideBySide(min(torch.get_num_threads(), num_envs))
+        parts = self._side_by_side.count if self.world.device == "cpu" else 1
+        self._parts = np.array_split(np.arange(num_envs), parts)
+        self._running: list[CommandedSimulation] = []  # one for each part of the batch
         # Refuses before an episode begins what is not there, or what the model cannot be driven at.
         (first,) = self._chosen([0], each_start(None, self._usual_start, 1))
         require_drivable(self.world.info, self.views, first.cameras, self.kinematics.embodiment.name)
@@ -434,7 +459,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
     @property
     def _over(self) -> bool:
-        return self._running.age == self.episode_frames or all(episode.doubted for episode in self._episodes)
+        return self._running[0].age == self.episode_frames or all(episode.doubted for episode in self._episodes)
 
     def _member(
         self,
@@ -473,19 +498,25 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         named = [(start.episode_id, frame) for start, (_, frame) in zip(starts, asked, strict=True)]
         for member in self._members:
             member._begin(seeds, named)
-        simulation = self.world.start(
-            [start.images for start in starts], [start.cameras for start in starts], embodiment=self.kinematics,
-            state=np.stack([start.state for start in starts]), seed=seeds, limits=self._limits,
-            earlier=[start.earlier for start in starts],
-        )  # fmt: skip
-        self._running = CommandedSimulation(simulation)
+
+        def begun(part: np.ndarray) -> CommandedSimulation:
+            own = [starts[slot] for slot in part]
+            return CommandedSimulation(self.world.start(
+                [start.images for start in own], [start.cameras for start in own], embodiment=self.kinematics,
+                state=np.stack([start.state for start in own]), seed=[seeds[slot] for slot in part], limits=self._limits,
+                earlier=[start.earlier for start in own],
+            ))  # fmt: skip
+
+        self._running = self._side_by_side(begun, self._parts)
+        first = [
+            (picture, simulated_points(running.simulation, slot), running.simulation.state[slot])
+            for running in self._running
+            for slot, picture in enumerate(running.simulation.pictures)
+        ]
         self._episodes = [
-            RunningEpisode(
-                start, self._video_so_far(start, picture, simulated_points(simulation, slot)), picture,
-                simulation.state[slot],
-            )
-            for slot, (start, picture) in enumerate(zip(starts, simulation.pictures, strict=True))
-        ]  # fmt: skip
+            RunningEpisode(start, self._video_so_far(start, picture, points), picture, state)
+            for start, (picture, points, state) in zip(starts, first, strict=True)
+        ]
         if self._segmenter is not None:
             self._look([episode.video for episode in self._episodes])
             for episode in self._episodes:
@@ -506,23 +537,29 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         """Take one command for each episode; predict and judge when it is time."""
         for member in self._members:
             member._advance(commands)
-        running = self._running
-        for episode, state in zip(self._episodes, running.take(commands)[1], strict=True):
+        states = [running.take(commands[part])[1] for part, running in zip(self._parts, self._running, strict=True)]
+        for episode, state in zip(self._episodes, np.concatenate(states), strict=True):
             episode.state, episode.reward = state, 0.0
-        count, last = len(running.commands), running.age == self.episode_frames
+        count, last = len(self._running[0].commands), self._running[0].age == self.episode_frames
         if not last and count % self.observe_every:
             return
-        simulation, clips = running.predict()
+        # A block of a few clips does not fill several cores.
+        predicted = self._side_by_side(CommandedSimulation.predict, self._running)
+        shown = [
+            (clip, simulated_points(simulation, slot)[:count])
+            for simulation, clips in predicted
+            for slot, clip in enumerate(clips)
+        ]
         videos = []
-        for slot, (episode, clip) in enumerate(zip(self._episodes, clips, strict=True)):
+        for episode, (clip, points) in zip(self._episodes, shown, strict=True):
             episode.picture = {view: video[-1] for view, video in clip.items()}
-            videos.append(longer(episode.video, clip, simulated_points(simulation, slot)[:count]))
+            videos.append(longer(episode.video, clip, points))
             if count == self.frames_per_step:
                 episode.video = videos[-1]
         if last and self._succeeds is not None:
             # A user's function is called for one video at a time.
             beside = isinstance(self._succeeds, MeasuredSuccess)
-            judged = _side_by_side(self._succeeds, videos) if beside else map(self._succeeds, videos)
+            judged = self._side_by_side(self._succeeds, videos) if beside else map(self._succeeds, videos)
             for slot, (episode, found) in enumerate(zip(self._episodes, judged, strict=True)):
                 if not isinstance(found, bool | np.bool_ | None):
                     raise DataError("Not a judgement", where="success", expected="True, False or None", got=found)
@@ -537,7 +574,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
     def _look(self, videos: Sequence[Trajectory]) -> None:
         """Measure how far each episode is in its video so far."""
         others = [[member._episodes[slot].score for member in self._members] for slot in range(self.num_envs)]
-        _side_by_side(RunningEpisode.look, self._episodes, [self._segmenter] * self.num_envs, videos, others)
+        self._side_by_side(RunningEpisode.look, self._episodes, [self._segmenter] * self.num_envs, videos, others)
 
     def _observed(self, slot: int) -> dict[str, Any]:
         episode = self._episodes[slot]
@@ -556,18 +593,6 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         for slot, info in enumerate(self.infos()):
             gathered = self._add_info(gathered, info, slot)
         return gathered
-
-
-def _side_by_side[T](work: Callable[..., T], *arguments: Sequence[Any]) -> list[T]:
-    """Map `work` over the arguments on as many threads as torch uses, because one video does not fill the cores."""
-    threads = torch.get_num_threads()
-    count = min(threads, len(arguments[0]))
-    if count == 1:
-        return list(map(work, *arguments))
-    with ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(threads // count,)) as pool:
-        results = list(pool.map(work, *arguments))
-    torch.set_num_threads(threads)  # what a thread of the pool sets is also the default of threads that begin later
-    return results
 
 
 def _opened(model: Path | str | WorldLine, options: Mapping[str, Any]) -> WorldLine:

@@ -1,4 +1,4 @@
-"""Batched episodes for Stable-Baselines3 (extra ``rl``): one call of the model for all of them, as many as there are.
+"""Batched episodes for Stable-Baselines3 (extra ``rl``): one call of the model for all of them on each thread.
 
 ``PPO("MultiInputPolicy", VecMonitor(WorldLineVecEnv(8, embodiment="ur5e_silver", reward="soft")))``. The twin in MuJoCo needs no
 adapter: ``make_vec_env`` of Stable-Baselines3 takes it with ``flat_observation`` and ``normalised_actions``.

@@ -52,10 +52,12 @@ class Trajectory:
     def num_frames(self) -> int:
         return min(len(frames) for frames in self.frames.values())
 
-    def at(self, indices: Iterable[int]) -> tuple[dict[str, NDArray[Any]], NDArray[Any] | None]:
-        """Chosen frames by view, and the tool centres in them."""
+    def at(
+        self, indices: Iterable[int], views: Sequence[str] = VIEWS
+    ) -> tuple[dict[str, NDArray[Any]], NDArray[Any] | None]:
+        """Chosen frames of those of ``views`` that there are, and the tool centres in them."""
         chosen = list(indices)
-        frames = {view: video[chosen] for view, video in self.frames.items()}
+        frames = {view: video[chosen] for view, video in self.frames.items() if view in views}
         return frames, None if self.points is None else self.points[chosen]
 
 

@@ -73,6 +73,12 @@ class VideoDecoder(ABC):
     def begin(self, first: Float[Tensor, "b c 1 h w"]) -> None:
         """Take in the latents of frame 0 where its picture is known."""
 
+    def out_of_order(self, row: int) -> VideoDecoder | None:
+        """A decoder of one clip of the batch for any of its later latents in any order; None before a clip begins, and where a frame
+        needs those before it.
+        """
+        return None
+
     def copy(self) -> Self:
         """A decoder in the same state that goes on separately."""
         return copy(self)
@@ -399,6 +405,14 @@ class PatchDecoding(VideoDecoder):
         if self._still is None:
             self._still = self._tokenizer.still(groups[:, 0], self._reference)
         return self._tokenizer.unfold(self._tokenizer.refinement(groups, *self._still), begins=begins)
+
+    def out_of_order(self, row: int) -> PatchDecoding | None:
+        if self._still is None:
+            return None
+        features, shown = self._still
+        other = PatchDecoding(self._tokenizer, None)
+        other._still = features[row : row + 1], shown[row : row + 1]
+        return other
 
 
 def fit_patch_tokenizer(

@@ -18,6 +18,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,65 @@ Frames = list[dict[str, np.ndarray]]
 """Videos of every clip: ``uint8 (n, H, W, 3)`` RGB by view."""
 
 
+class LazyFrames:
+    """A video of one view ``uint8 (n, H, W, 3)``, indexed like an array, of which some is decoded only when it is read.
+
+    Args:
+        parts: frames in their order.
+    """
+
+    def __init__(self, parts: Iterable[np.ndarray | Undecoded]) -> None:
+        self._parts = list(parts)
+        counts = [len(part) for part in self._parts]
+        self._part_of = np.repeat(np.arange(len(counts)), counts)
+        self._within = np.concatenate([np.arange(count) for count in counts])
+
+    def __len__(self) -> int:
+        return len(self._part_of)
+
+    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> np.ndarray:
+        parts, within = np.atleast_1d(self._part_of[index]), np.atleast_1d(self._within[index])
+        read = {part: self._parts[part][within[parts == part]] for part in parts.tolist() or [-1]}
+        frames = np.empty((len(parts), *next(iter(read.values())).shape[1:]), np.uint8)
+        for part, some in read.items():
+            frames[parts == part] = some
+        return frames[0] if np.ndim(self._part_of[index]) == 0 else frames
+
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:], dtype)
+
+    @classmethod
+    def joined(cls, *videos: LazyFrames | np.ndarray) -> LazyFrames:
+        """Videos one after the other."""
+        return cls(part for video in videos for part in (video._parts if isinstance(video, LazyFrames) else [video]))
+
+
+class Undecoded:
+    """Frames of latents; those of a latent frame are decoded when one of them is read, and kept.
+
+    Args:
+        decode: videos ``uint8 (n, H, W, 3)`` of some of the latents of each clip.
+        group: frames of a latent frame.
+    """
+
+    def __init__(
+        self, decode: Callable[[Tensor], list[np.ndarray]], latents: Float[Tensor, "1 c t h w"], group: int
+    ) -> None:
+        self._decode, self._latents, self._group = decode, latents, group
+        self._decoded: dict[int, np.ndarray] = {}
+
+    def __len__(self) -> int:
+        return self._group * self._latents.shape[2]
+
+    def __getitem__(self, index: np.ndarray) -> np.ndarray:
+        groups = (index // self._group).tolist()
+        if missing := sorted(set(groups) - self._decoded.keys()):
+            (decoded,) = self._decode(self._latents[:, :, missing])
+            frames = np.split(decoded, len(missing))
+            self._decoded.update(zip(missing, frames, strict=True))
+        return np.stack([self._decoded[group][row % self._group] for group, row in zip(groups, index, strict=True)])
+
+
 class Session:
     """One running prediction of a batch of clips that share their views.
 
@@ -74,7 +134,7 @@ class Session:
         self._decoders: list[VideoDecoder]
         self._first: Tensor | None  # observed latents of a clip that no step has begun
         self._units: int  # predicted since the observed picture
-        self._last: Frames = []  # of the last unit, where a clip may begin
+        self._last: Sequence[Mapping[str, np.ndarray | LazyFrames]] = []  # of the last unit, where a clip may begin
         self.observed = self._decode(rearrange(self._begin(images), "b v c h w -> b v c 1 h w"))
 
     @torch.no_grad()
@@ -86,8 +146,8 @@ class Session:
         """
         if self._clip_ended:
             self._begin_anew()
-        self._last = self._decode(self._sample(maps))
-        return self._last
+        self._last = frames = self._decode(self._sample(maps))
+        return frames
 
     def steps(
         self, maps: Iterable[Float[Tensor, "b v a t h w"]], *, overlapped: bool | None = None
@@ -106,8 +166,8 @@ class Session:
             for given in maps:
                 if self._clip_ended:
                     if waiting is not None:
-                        self._last, waiting = waiting.result(), None
-                        yield self._last
+                        self._last, waiting = (frames := waiting.result()), None
+                        yield frames
                     self._begin_anew()
                 latents = self._sample(given)
                 if beside is not None:
@@ -117,8 +177,16 @@ class Session:
                     yield waiting.result()
                 waiting = following
             if waiting is not None:
-                self._last = waiting.result()
-                yield self._last
+                self._last = frames = waiting.result()
+                yield frames
+
+    @torch.no_grad()
+    def step_lazily(self, maps: Float[Tensor, "b v a t h w"]) -> list[dict[str, LazyFrames]]:
+        """Like `step`, but only the last latent frame is decoded now, where the tokenizer can decode the others alone."""
+        if self._clip_ended:
+            self._begin_anew()
+        self._last = frames = self._decode_lazily(self._sample(maps))
+        return frames
 
     @property
     def _clip_ended(self) -> bool:
@@ -170,10 +238,31 @@ class Session:
         """Frames of latents; on a stream of its own where another thread decodes."""
         if stream is not None:
             latents.record_stream(stream)
-        with torch.cuda.stream(stream), self._precision():
+        with torch.cuda.stream(stream):
             # One clip at a time: the decoder works on whole images, which take a hundred times the memory of latents.
-            videos = (decode(clip) for decode, clip in zip(self._decoders, latents, strict=True))
-            return [{view: video_to_frames(clip[v]) for v, view in enumerate(self._sampler.views)} for clip in videos]
+            videos = (self._frames(decoder, clip) for decoder, clip in zip(self._decoders, latents, strict=True))
+            return [dict(zip(self._sampler.views, frames, strict=True)) for frames in videos]
+
+    def _decode_lazily(self, latents: Tensor) -> list[dict[str, LazyFrames]]:
+        videos: list[dict[str, LazyFrames]] = []
+        for decoder, clip in zip(self._decoders, latents, strict=True):
+            alone = [decoder.out_of_order(row) for row in range(len(clip))]
+            newest = self._frames(decoder, clip if None in alone else clip[:, :, -1:])
+            videos.append(
+                {view: LazyFrames([frames]) for view, frames in zip(self._sampler.views, newest, strict=True)}
+            )
+            for row, (view, later) in enumerate(zip(self._sampler.views, alone, strict=True)):
+                if later is not None:
+                    decode = partial(self._frames, later)
+                    earlier = Undecoded(decode, clip[row : row + 1, :, :-1], len(newest[row]))
+                    videos[-1][view] = LazyFrames([earlier, newest[row]])
+        return videos
+
+    @torch.no_grad()
+    def _frames(self, decoder: VideoDecoder, latents: Float[Tensor, "v c t h w"]) -> list[np.ndarray]:
+        """Decoded frames of each view; on any thread."""
+        with self._precision():
+            return [video_to_frames(video) for video in decoder(latents)]
 
 
 @torch.no_grad()
@@ -400,16 +489,11 @@ class Simulation:
         Raises:
             DataError: the shape is another one, or a command is not finite or in another unit.
         """
-        commands = self._checked(controls)
-        robot, executed, states = self._robot.follow(commands)
-        drawn = executed if self._draws_commands else states
-        tracks = [self._project(clip, rows) for clip, rows in enumerate(drawn)]
-        frames = self._session.step(self._maps(tracks))
-        self._robot, self.commands, self.states = robot, executed, states
-        self._tracks, self._drawn = tracks, drawn[:, -1]
-        self.num_frames += self.frames_per_step
-        self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in frames]
-        return frames
+        return self._step(controls, self._session.step)
+
+    def step_lazily(self, controls: np.ndarray) -> list[dict[str, LazyFrames]]:
+        """Like `step`; all but the last few frames are decoded when they are read, where the tokenizer allows that."""
+        return self._step(controls, self._session.step_lazily)
 
     def follow(self, controls: Float[np.ndarray, "b n j"]) -> tuple[np.ndarray, np.ndarray]:
         """Executed commands and states ``(b, n, j)`` under commands from here on, however many; no picture is predicted."""
@@ -452,6 +536,20 @@ class Simulation:
     def copy(self) -> Simulation:
         """A snapshot to go back to; it shares the history's tensors."""
         return self.select(range(len(self)))
+
+    def _step[Video: np.ndarray | LazyFrames](
+        self, controls: np.ndarray, predict: Callable[[Tensor], list[dict[str, Video]]]
+    ) -> list[dict[str, Video]]:
+        commands = self._checked(controls)
+        robot, executed, states = self._robot.follow(commands)
+        drawn = executed if self._draws_commands else states
+        tracks = [self._project(clip, rows) for clip, rows in enumerate(drawn)]
+        frames = predict(self._maps(tracks))
+        self._robot, self.commands, self.states = robot, executed, states
+        self._tracks, self._drawn = tracks, drawn[:, -1]
+        self.num_frames += self.frames_per_step
+        self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in frames]
+        return frames
 
     def _project(self, clip: int, rows: np.ndarray) -> EpisodeTracks:
         """Tracks of the start, of the last frame that is known, and of ``rows``."""

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import DataError
 from worldline_core.evaluation.policy.judge import (
     SCHEMAS,
@@ -331,6 +332,11 @@ def _edges(share: np.ndarray) -> tuple[float, float]:
     return float(np.searchsorted(rows, 0.1 * rows[-1])), float(np.searchsorted(rows, 0.9 * rows[-1]))
 
 
+def measured_views(family: EvidenceFamily) -> tuple[str, ...]:
+    """Views that `measure` looks at."""
+    return VIEWS if family in ("grasp", "lift") else (HEAD,)
+
+
 def measure(
     segmenter: Segmenter,
     instruction: str,
@@ -367,11 +373,12 @@ def soft_score(segmenter: Segmenter, trajectory: Trajectory) -> tuple[float, dic
     Raises: DataError where nothing can be measured.
     """
     chosen = list(first_pass_indices(trajectory.num_frames))
-    frames, points = trajectory.at([0] * (LATE_COUNT - len(chosen)) + chosen)
-    measured = measure(segmenter, trajectory.instruction, route(trajectory.instruction), frames, points)
+    family = route(trajectory.instruction)
+    frames, points = trajectory.at([0] * (LATE_COUNT - len(chosen)) + chosen, measured_views(family))
+    measured = measure(segmenter, trajectory.instruction, family, frames, points)
     if measured is None:
         raise DataError(
-            "The task has no soft score", got=f"{trajectory.instruction!r}, views {', '.join(frames)}",
+            "The task has no soft score", got=f"{trajectory.instruction!r}, views {', '.join(trajectory.frames)}",
             expected="the head view, and a thing named by its colour to lift, place, push closed or press",
             next_step="take reward='success' with a success function of your own, or other recordings",
         )  # fmt: skip
@@ -424,7 +431,7 @@ class MeasuredEvidenceJudge:
         return MotionEvidence(task_effect_completed=done, observations=evidence.observations), True
 
     def _facts(self, trajectory: Trajectory, family: EvidenceFamily, indices: tuple[int, ...]) -> Evidence:
-        frames, points = trajectory.at(indices)
+        frames, points = trajectory.at(indices, measured_views(family))
         measured = measure(self.segmenter, trajectory.instruction, family, frames, points)
         evidence = facts(measured, trajectory.instruction, family)
         if measured is None:
