@@ -112,6 +112,33 @@ def test_a_batch_is_its_environments_side_by_side(world, starts):
     assert [picture.shape for picture in ours.call("render")] == [(64, 3 * 96, 3)] * 2
 
 
+def test_a_batch_on_several_threads_is_the_batch_on_one(small_world, starts):
+    """Clips keep their places: pictures, states and what a user's function sees of three, in parts of two and one."""
+    driven, threads, found = commands(starts, [0, 1, 2], 6), torch.get_num_threads(), []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            videos = []
+            environment = WorldLineVectorEnv(
+                3, model=small_world, embodiment=ROBOT, episode_frames=6, success=videos.append
+            )
+            first, _ = environment.reset(seed=0)
+            assert [len(running.simulation) for running in environment._running] == [[3], [2, 1]][count - 1]
+            *_, (last, _, _, ended, infos) = (environment.step(command) for command in driven)
+            assert ended.all()
+            assert [video.instruction for video in videos] == [starts[slot].instruction for slot in range(3)]
+            shown = [np.asarray(video.frames["right_wrist"]) for video in videos]
+            found.append((first["agent_pos"], last["agent_pos"], infos["episode_id"].tolist(), [first, last], shown))
+        (*one, pictures, shown), (*other, theirs, seen) = found
+        assert data_equivalence(one, other)
+        for mine, another in zip(pictures, theirs, strict=True):
+            for view in VIEWS:
+                np.testing.assert_allclose(mine["pixels"][view].astype(int), another["pixels"][view], atol=1)
+        np.testing.assert_allclose(np.array(shown).astype(int), np.array(seen), atol=1)
+    finally:
+        torch.set_num_threads(threads)
+
+
 def test_what_cannot_be_seen_is_no_success(small_world, starts):
     for verdict, rewarded in ((None, False), (True, True), (False, False), (np.True_, True)):
         options = SHORT | {"success": lambda _, v=verdict: v}

@@ -43,7 +43,7 @@ from worldline_core.rollout.worldline import WorldLine
 from worldline_core.shipped import shipped_folder
 
 Success = Callable[[Trajectory], bool | None]
-"""True for a video that shows its task done; None where that cannot be seen."""
+"""True for a video that shows its task done; None where that cannot be seen. Frames are decoded as they are indexed (`LazyFrames`)."""
 
 
 Reward = Literal["success", "soft"]
