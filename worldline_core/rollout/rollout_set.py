@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -13,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.clip import VideoClip, decode_video
 from worldline_core.data.video.encoder import Encoding, VideoEncoder
 from worldline_core.errors import ArtifactError, DataError
@@ -20,7 +20,6 @@ from worldline_core.store.artifact_files import read_table, row_schema
 from worldline_core.store.atomic import atomic_path
 
 INDEX_FILE = "index.parquet"
-_LONGEST_NAME = 200
 
 
 @dataclass(frozen=True)
@@ -42,11 +41,8 @@ _SCHEMA = row_schema(RolloutRow)
 
 
 def video_path(episode_id: str, seed: int, view: str) -> str:
-    """Path of a prediction in its set; odd characters of the id are replaced, long ones cut; a digest keeps names apart."""
-    safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in episode_id)
-    if safe != episode_id or safe.startswith(".") or not 0 < len(safe) <= _LONGEST_NAME:
-        safe = f"{safe.lstrip('.')[:_LONGEST_NAME]}-{hashlib.sha256(episode_id.encode()).hexdigest()[:8]}"
-    return f"videos/{safe}/seed-{seed}/{view}.mp4"
+    """Path of a prediction in its set."""
+    return f"videos/{safe_stem(episode_id)}/seed-{seed}/{view}.mp4"
 
 
 class RolloutSetWriter:

@@ -18,6 +18,7 @@ from einops import rearrange
 from torch import Tensor
 
 from worldline_core.calibration.observation import CELL_PX
+from worldline_core.geometry.transforms import rotation_about_axis
 
 AZIMUTHS, ELEVATIONS_DEG, ROLLS_DEG = 20, (-5.0, 10.0, 25.0, 40.0, 55.0, 70.0, 85.0), (-12.0, 0.0, 12.0, 180.0)
 FOCALS = (0.65, 1.0, 1.6)
@@ -185,7 +186,8 @@ def _changed(
     for f, T in zip(focal.tolist(), pose.double().numpy(), strict=True):
         for _ in range(CHILDREN):
             scale = size * random.choice([1.0, 0.4])
-            turn = _rotation(random.normal(0, 0.25 * scale, 3))
+            vector = random.normal(0, 0.25 * scale, 3)
+            turn = rotation_about_axis(vector, float(np.linalg.norm(vector)))
             R = T[:3, :3] @ turn
             seen = (middle - T[:3, 3]) @ T[:3, :3]
             zoom = np.exp(random.normal(0, 0.25 * scale))
@@ -213,7 +215,7 @@ def _grid(motion: MotionOfSteps) -> tuple[Tensor, Tensor]:
     focals, poses = [], []
     angles = product(np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS, np.radians(ELEVATIONS_DEG), np.radians(ROLLS_DEG))
     for azimuth, rise, roll in angles:
-        R = looking_down(azimuth, rise) @ _rotation(np.array([0.0, 0.0, roll]))
+        R = looking_down(azimuth, rise) @ rotation_about_axis(np.array([0.0, 0.0, 1.0]), roll)
         for f, scale in product(FOCALS, SCALES):
             # In a picture the spread is of two of three directions.
             distance = scale * f * radius * np.sqrt(2 / 3) / max(float(spread), 0.02)
@@ -229,12 +231,3 @@ def looking_down(azimuth: float, elevation: float) -> np.ndarray:
     z = -np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     x = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     return np.stack([x, np.cross(z, x), z], axis=1)
-
-
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
