@@ -4,7 +4,7 @@ from tasks.execution.artifact_task import ArtifactTask
 
 import_rollouts = ArtifactTask(
     name="import_rollouts",
-    version=4,
+    version=5,
     function="worldline_core.rollout.import_rollouts:import_rollouts",
     config="worldline_core.rollout.rollout_config:ImportRolloutsConfig",
     inputs=("videos", "episodes"),

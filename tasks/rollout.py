@@ -4,7 +4,7 @@ from tasks.execution.artifact_task import ArtifactTask
 
 rollout = ArtifactTask(
     name="rollout",
-    version=8,
+    version=9,
     function="worldline_core.rollout.rollout:rollout",
     config="worldline_core.rollout.rollout_config:RolloutConfig",
     inputs=("episodes",),

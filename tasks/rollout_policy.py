@@ -4,7 +4,7 @@ from tasks.execution.artifact_task import ArtifactTask
 
 rollout_policy = ArtifactTask(
     name="rollout_policy",
-    version=1,
+    version=2,
     function="worldline_core.rollout.policy_rollout:rollout_policy",
     config="worldline_core.rollout.rollout_config:PolicyRolloutConfig",
     inputs=("checkpoint", "tokenizer", "episodes"),
