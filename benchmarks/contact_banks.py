@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.harness import command_line
 from worldline_core.errors import DataError
-from worldline_core.evaluation.planning.evaluate_planning import rule_choosers, tree_scores_by_shortcut
+from worldline_core.evaluation.planning.evaluate_planning import rule_choosers, rule_scores, tree_scores_by_shortcut
 from worldline_core.evaluation.scores import bootstrap_mean
 from worldline_core.evaluation.shortcuts import BankFacts, Reach, named_places
 from worldline_core.recorder.attempts import BankSpec, RecordBanksConfig
@@ -84,7 +84,7 @@ def measure(
             shares["knowing"] += [float(motion.outcome == "success") for motion in good if motion is not None]
     everyone, chosen = list(range(candidates)), {}
     for name, own in facts.items():
-        for rule, chooser in rule_choosers(own).items():
+        for rule, chooser in rule_choosers(own, rule_scores(own)).items():
             chosen.setdefault(rule, []).append(ends[name][chooser(everyone)] if chooser else False)
     for rule, scores in tree_scores_by_shortcut(facts, ends).items():
         chosen[rule] = [ends[name][int(np.argmax(own))] for name, own in scores.items()]

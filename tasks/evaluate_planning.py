@@ -4,7 +4,7 @@ from tasks.execution.artifact_task import ArtifactTask
 
 evaluate_planning = ArtifactTask(
     name="evaluate_planning",
-    version=11,
+    version=12,
     function="worldline_core.evaluation.planning.evaluate_planning:evaluate_planning",
     config="worldline_core.evaluation.evaluation_config:PlanningConfig",
     inputs=("banks", "rollouts.*"),

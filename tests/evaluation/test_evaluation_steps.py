@@ -26,7 +26,13 @@ from worldline_core.evaluation.evaluation_config import PlanningConfig, VideoEva
 from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, metric_of
 from worldline_core.evaluation.metrics import SceneFrames, scene_consistency
 from worldline_core.evaluation.planning import evaluate_planning as outcomes
-from worldline_core.evaluation.planning.evaluate_planning import CHOICES_FILE, SEALED_FILE, evaluate_planning
+from worldline_core.evaluation.planning.evaluate_planning import (
+    CANDIDATE_SCORES_FILE,
+    CHOICES_FILE,
+    SEALED_FILE,
+    area_under_curve,
+    evaluate_planning,
+)
 from worldline_core.evaluation.policy.evaluate_policy import choose_trajectories, evaluate_policy
 from worldline_core.evaluation.policy.judge import SCHEMAS, MotionEvidence, Reconciliation
 from worldline_core.evaluation.video import episode_measurement
@@ -285,6 +291,26 @@ def test_planning_chooses_by_predicted_videos(planned):
     best, over = max(found["6"]["mean"] for found in summary["shortcuts"].values()), budgets["6"]["over_shortcut"]
     assert summary["shortcuts"][over["shortcut"]]["6"]["mean"] == best
     assert over["gain"]["mean"] == pytest.approx(1.0 - best)
+    # The fifth candidate alone succeeds, and alone looks like it; in a copied first frame all look the same.
+    areas = summary["areas"]["methods"]
+    assert {name: areas[name]["all"]["mean"] for name in areas} == {"true": 1.0, "good": 1.0, "copy": 0.5}
+    scored = pq.read_table(output / CANDIDATE_SCORES_FILE).to_pylist()
+    of_good = {row["episode_id"]: row["value"] for row in scored if row["method"] == "good"}
+    assert len(of_good) == 6
+    assert max(of_good, key=of_good.__getitem__) == "cand-4"
+
+
+@pytest.mark.parametrize(
+    ("scores", "ends", "area"),
+    [
+        ([3, 2, 1], [True, False, False], 1.0),
+        ([1, 2, 3], [True, False, False], 0.0),
+        ([2, 2, 1, 3], [True, False, True, False], 0.125),
+        ([1, 2], [True, True], None),
+    ],
+)
+def test_the_area_counts_pairs_of_a_success_and_a_failure(scores, ends, area):
+    assert area_under_curve(scores, ends) == area
 
 
 @pytest.mark.slow

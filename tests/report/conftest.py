@@ -213,6 +213,7 @@ def write_planning_scores(folder: Path) -> None:
         "selector": "measured", "methods": methods, "direct_execution": interval(0.45), "oracle": interval(0.9),
         "banks": {f"bank_{i}": {"task_family": "lift", "candidates": 32, "direct_success": 0.45} for i in range(3)},
         "shortcuts": {"medoid": {str(n): interval(0.5) for n in numbers}},
+        "areas": {"methods": {"true": {"all": interval(0.87), "lift": interval(0.87)}}, "shortcuts": {}},
     }  # fmt: skip
     write_json_atomic(folder / "summary.json", summary)
 

@@ -141,6 +141,7 @@ def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
         r"0\.91</span><span[^>]*>\[0\.70, 0\.97\]",
         r"<td[^>]*>10</td><td[^>]*>2</td>\s*<td[^>]*><span[^>]*>0\.61</span><span[^>]*>\[0\.50, 0\.72\]",
         "too few wrong verdicts",
+        r"0\.87</span><span[^>]*>\[0\.77, 0\.97\]",  # area under the curve
         r"<td[^>]*>40\u202f%</td><td[^>]*>\d+\u202f%</td>",  # undecided verdicts; right of the others
     ):
         assert re.search(cells, found["decisions"]), cells

@@ -305,6 +305,10 @@ def planning_evaluation(summary: JsonObject) -> dict[str, object]:
         "success": success,
         "budgets": budgets,
         "families": families,
+        "areas": [
+            *((m.long_label, summary["areas"]["methods"][m.name]) for m in order if m.name in summary["areas"]["methods"]),
+            *((words(name), areas) for name, areas in summary["areas"]["shortcuts"].items()),
+        ],
         "headings": [
             *(f"N = {n}" for n in budgets), f"Gain at {most}", "over the best shortcut",
             *(f"{words(family)}, {most}" for family in families),

@@ -26,6 +26,7 @@ from worldline_core.evaluation.evaluation_config import PlanningConfig
 from worldline_core.evaluation.planning.bracket import (
     CandidateVideo,
     Choice,
+    ScoringSelector,
     Selector,
     VLMSelector,
     choose,
@@ -61,6 +62,7 @@ from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic
 
 CHOICES_FILE = "choices.parquet"
+CANDIDATE_SCORES_FILE = "candidate_scores.parquet"
 SEALED_FILE = "sealed_outcomes.parquet"
 DIRECT = "direct_execution"
 SHORTCUT = "shortcut_"
@@ -72,7 +74,8 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
     """Choose in every bank, for every method and budget; then open the labels.
 
     Inputs: banks, rollouts.<method>; tracks, segmenter and judge where the selector uses them.
-    Output: choices.parquet, scores.parquet (metric ``success@N``), summary.json. Shortcuts are methods ``shortcut_<name>``.
+    Output: choices.parquet, candidate_scores.parquet (where the selector scores videos one by one), scores.parquet (metric
+    ``success@N``), summary.json. Shortcuts are methods ``shortcut_<name>``.
     """
     episodes = EpisodeSet.open(inputs["banks"])
     rollouts = open_rollouts(inputs)
@@ -80,21 +83,28 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
     banks = list_banks(episodes.rows)
     selector = open_selector(config, inputs)
 
-    def choose_in_bank(method: str, bank: str) -> list[dict[str, Any]]:
+    def choose_in_bank(method: str, bank: str) -> dict[str, Any]:
         load = candidate_loader(config.views, episodes, tracks, rollouts.get(method), method, banks[bank])
         task = banks[bank][0].instruction
 
         def by_video(scene: str, shown: Sequence[int]) -> Choice:
             return choose(selector, task, shown, load, scene=scene, seed=config.seed)
 
-        return choices_of_bank(config, bank, banks[bank], by_video)
+        chosen = choices_of_bank(config, bank, banks[bank], by_video)
+        shown = max((choice["budget"] for choice in chosen), default=0)
+        scoring = isinstance(selector, ScoringSelector)
+        scores = [selector.score(task, load(number))[0] for number in range(shown)] if scoring else []
+        return {"choices": chosen, "scores": scores}
 
     choices: list[dict[str, Any]] = []
+    candidate_scores: dict[str, dict[str, Sequence[float]]] = defaultdict(dict)
     for method in (TRUE_METHOD, *rollouts):
         for bank in with_progress(banks, f"evaluate_planning {method}", "bank"):
             part = part_file(output / "run" / "parts", method, bank)
             found = kept_part(part, partial(choose_in_bank, method, bank))
-            choices += [{"method": method, "bank": bank, **choice} for choice in found]
+            choices += [{"method": method, "bank": bank, **choice} for choice in found["choices"]]
+            if found["scores"]:
+                candidate_scores[method][bank] = found["scores"]
     found, kept = len(banks), len({choice["bank"] for choice in choices})
     if not kept:
         raise DataError(
@@ -104,10 +114,19 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
         )  # fmt: skip
     in_progress = with_progress(banks, "evaluate_planning shortcuts", "bank")
     facts = {bank: bank_facts(episodes, tracks, banks[bank]) for bank in in_progress}
+    rules = {bank: rule_scores(own) for bank, own in facts.items()}
     for bank, rows in banks.items():
-        choices += shortcut_choices(config, bank, rows, rule_choosers(facts[bank]))
+        choices += shortcut_choices(config, bank, rows, rule_choosers(facts[bank], rules[bank]))
     table = [choice | {"trace": json.dumps(choice["trace"], sort_keys=True)} for choice in choices]
     write_table(output / CHOICES_FILE, table, _CHOICE_COLUMNS)
+    scored_candidates = [
+        {"method": method, "bank": bank, "episode_id": row.episode_id, "value": score}
+        for method, own in candidate_scores.items()
+        for bank, scores in own.items()
+        for row, score in zip(banks[bank], scores, strict=False)
+    ]
+    if scored_candidates:
+        write_table(output / CANDIDATE_SCORES_FILE, scored_candidates, ("method", "bank", "episode_id", "value"))
     # Only now: nothing above has read, or could read, how any candidate ended.
     outcomes = read_outcomes(
         inputs.get("sealed", inputs["banks"]) / SEALED_FILE, [row.episode_id for rows in banks.values() for row in rows]
@@ -118,8 +137,10 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
     for bank, rows in banks.items():
         choosers = {name: best_of(scores.get(bank)) for name, scores in scored.items() if scores}
         choices += shortcut_choices(config, bank, rows, choosers)
+    for name, scores in ({name: {bank: own[name] for bank, own in rules.items()} for name in RULES} | scored).items():
+        candidate_scores[f"{SHORTCUT}{name}"] = {bank: [*own] for bank, own in scores.items() if own is not None}
     left_out = {"with fewer candidates than the smallest budget": found - kept}
-    counts = write_results(config, selector.name, banks, choices, outcomes, output)
+    counts = write_results(config, selector.name, banks, choices, candidate_scores, outcomes, output)
     return {"found": found, "kept": kept, "left_out": left_out, **counts}
 
 
@@ -183,9 +204,14 @@ def best_of(scores: np.ndarray | None) -> Chooser:
     return lambda shown: shown[0] if scores is None else shown[int(np.argmax(scores[list(shown)]))]
 
 
-def rule_choosers(facts: BankFacts) -> dict[str, Chooser]:
-    """Shortcuts without labels."""
-    return {"medoid": medoid(facts)} | {name: best_of(rule(facts)) for name, rule in RULES.items()}
+def rule_scores(facts: BankFacts) -> dict[str, np.ndarray | None]:
+    """Scores of a bank's candidates by the rules; None where a rule does not see what it needs."""
+    return {name: rule(facts) for name, rule in RULES.items()}
+
+
+def rule_choosers(facts: BankFacts, scores: Mapping[str, np.ndarray | None]) -> dict[str, Chooser]:
+    """Shortcuts without labels, with their `rule_scores`."""
+    return {"medoid": medoid(facts)} | {name: best_of(own) for name, own in scores.items()}
 
 
 def tree_scores_by_shortcut(
@@ -269,11 +295,24 @@ def read_outcomes(path: Path, episode_ids: Sequence[str]) -> dict[str, bool]:
     return {name: table[name] == "success" for name in episode_ids}
 
 
+def area_under_curve(scores: Sequence[float], ends: Sequence[bool]) -> float | None:
+    """Share of the pairs of a success and a failure in which the success has the higher score; ties count half (ROC curve).
+
+    None when all candidates ended alike.
+    """
+    values, succeeded = np.asarray(scores), np.asarray(ends)
+    wins, losses = values[succeeded, None], values[~succeeded]
+    if not wins.size or not losses.size:
+        return None
+    return float(np.mean((wins > losses) + 0.5 * (wins == losses)))
+
+
 def write_results(
     config: PlanningConfig,
     selector: str,
     banks: Mapping[str, Sequence[EpisodeRow]],
     choices: Sequence[Mapping[str, Any]],
+    candidate_scores: Mapping[str, Mapping[str, Sequence[float]]],
     outcomes: Mapping[str, bool],
     output: Path,
 ) -> dict[str, Any]:
@@ -281,7 +320,7 @@ def write_results(
 
     Direct execution of a policy takes one candidate blindly: its expected success in a bank is the mean over the bank's candidates, the
     same reference for every budget. ``over_shortcut`` of a method is its gain over the shortcut that succeeds most often at this budget,
-    bank by bank.
+    bank by bank. ``areas`` are means over banks of the `area_under_curve` of the candidates that the largest budget shows, in recorded order.
     """
     ends = {bank: [outcomes[row.episode_id] for row in rows] for bank, rows in banks.items()}
     direct = {bank: float(np.mean(own)) for bank, own in ends.items()}
@@ -328,6 +367,23 @@ def write_results(
                 found[banks[bank][0].task_family][budget][bank] = value
         return {family: {str(n): result(n, own) for n, own in by_budget.items()} for family, by_budget in found.items()}
 
+    shown = {choice["bank"]: choice["budget"] for choice in sorted(choices, key=lambda choice: choice["budget"])}
+    areas: dict[str, dict[str, Any]] = {"methods": {}, "shortcuts": {}}
+
+    def areas_of(scored: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+        """Mean area under the curve within the banks: of all tasks, and of each task family."""
+        found: dict[str, list[float]] = defaultdict(list)
+        for bank in sorted(scored.keys() & shown.keys()):
+            area = area_under_curve(scored[bank][: shown[bank]], ends[bank][: shown[bank]])
+            if area is not None:
+                found["all"].append(area)
+                found[banks[bank][0].task_family].append(area)
+        return {group: interval(areas) for group, areas in found.items()}
+
+    for name, own in sorted(candidate_scores.items()):
+        kind = "shortcuts" if name.startswith(SHORTCUT) else "methods"
+        areas[kind][name.removeprefix(SHORTCUT)] = areas_of(own)
+
     methods = {
         name: {
             "budgets": {str(n): result(n, own) for n, own in by_budget.items()},
@@ -349,6 +405,7 @@ def write_results(
         "shortcuts": {
             name: {str(n): interval(own.values()) for n, own in by_budget.items()} for name, by_budget in rules.items()
         },
+        "areas": areas,
         "interval": "95 % bootstrap over banks",
     }
     write_json_atomic(output / SUMMARY_FILE, summary)
