@@ -35,6 +35,7 @@ from worldline_core.evaluation.planning.evaluate_planning import (
 )
 from worldline_core.evaluation.policy.evaluate_policy import choose_trajectories, evaluate_policy
 from worldline_core.evaluation.policy.judge import SCHEMAS, MotionEvidence, Reconciliation
+from worldline_core.evaluation.scores import SCORES_FILE
 from worldline_core.evaluation.video import episode_measurement
 from worldline_core.evaluation.video import evaluate_video as evaluate_video_module
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
@@ -294,6 +295,8 @@ def test_planning_chooses_by_predicted_videos(planned):
     # The fifth candidate alone succeeds, and alone looks like it; in a copied first frame all look the same.
     areas = summary["areas"]["methods"]
     assert {name: areas[name]["all"]["mean"] for name in areas} == {"true": 1.0, "good": 1.0, "copy": 0.5}
+    of_banks = [row for row in pq.read_table(output / SCORES_FILE).to_pylist() if row["metric"] == "area"]
+    assert {(row["method"], row["value"]) for row in of_banks} >= {("true", 1.0), ("good", 1.0), ("copy", 0.5)}
     scored = pq.read_table(output / CANDIDATE_SCORES_FILE).to_pylist()
     of_good = {row["episode_id"]: row["value"] for row in scored if row["method"] == "good"}
     assert len(of_good) == 6

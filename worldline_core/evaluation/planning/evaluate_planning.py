@@ -74,8 +74,8 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
     """Choose in every bank, for every method and budget; then open the labels.
 
     Inputs: banks, rollouts.<method>; tracks, segmenter and judge where the selector uses them.
-    Output: choices.parquet, candidate_scores.parquet (where the selector scores videos one by one), scores.parquet (metric
-    ``success@N``), summary.json. Shortcuts are methods ``shortcut_<name>``.
+    Output: choices.parquet, candidate_scores.parquet (where the selector scores videos one by one), scores.parquet (metrics
+    ``success@N`` and ``area``), summary.json. Shortcuts are methods ``shortcut_<name>``.
     """
     episodes = EpisodeSet.open(inputs["banks"])
     rollouts = open_rollouts(inputs)
@@ -307,6 +307,18 @@ def area_under_curve(scores: Sequence[float], ends: Sequence[bool]) -> float | N
     return float(np.mean((wins > losses) + 0.5 * (wins == losses)))
 
 
+def areas_within_banks(
+    scores: Mapping[str, Sequence[float]], ends: Mapping[str, Sequence[bool]], shown: Mapping[str, int]
+) -> dict[str, float]:
+    """The `area_under_curve` of the first ``shown`` candidates of each bank in which both outcomes occur."""
+    areas = {
+        bank: area_under_curve(own[: shown[bank]], ends[bank][: shown[bank]])
+        for bank, own in sorted(scores.items())
+        if bank in shown
+    }
+    return {bank: area for bank, area in areas.items() if area is not None}
+
+
 def write_results(
     config: PlanningConfig,
     selector: str,
@@ -335,7 +347,6 @@ def write_results(
         row, metric = banks[bank][0], f"success@{budget}"
         about = row.embodiment, row.split, "", choice["run"], metric, value, row.scene, row.task_family
         scores.append(Score(method, bank, *about))
-    write_scores(output, scores)
     means = {
         name: {
             n: {bank: float(np.mean(runs)) for bank, runs in sorted(own.items())}
@@ -369,20 +380,17 @@ def write_results(
 
     shown = {choice["bank"]: choice["budget"] for choice in sorted(choices, key=lambda choice: choice["budget"])}
     areas: dict[str, dict[str, Any]] = {"methods": {}, "shortcuts": {}}
-
-    def areas_of(scored: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-        """Mean area under the curve within the banks: of all tasks, and of each task family."""
-        found: dict[str, list[float]] = defaultdict(list)
-        for bank in sorted(scored.keys() & shown.keys()):
-            area = area_under_curve(scored[bank][: shown[bank]], ends[bank][: shown[bank]])
-            if area is not None:
-                found["all"].append(area)
-                found[banks[bank][0].task_family].append(area)
-        return {group: interval(areas) for group, areas in found.items()}
-
-    for name, own in sorted(candidate_scores.items()):
+    for name, scored in sorted(candidate_scores.items()):
+        groups: dict[str, list[float]] = defaultdict(list)
+        for bank, area in areas_within_banks(scored, ends, shown).items():
+            row = banks[bank][0]
+            about = row.embodiment, row.split, "", 0, "area", area, row.scene, row.task_family
+            scores.append(Score(name, bank, *about))
+            groups["all"].append(area)
+            groups[row.task_family].append(area)
         kind = "shortcuts" if name.startswith(SHORTCUT) else "methods"
-        areas[kind][name.removeprefix(SHORTCUT)] = areas_of(own)
+        areas[kind][name.removeprefix(SHORTCUT)] = {group: interval(own) for group, own in groups.items()}
+    write_scores(output, scores)
 
     methods = {
         name: {
