@@ -34,7 +34,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.evaluation.planning.bracket import planning_indices
 from worldline_core.evaluation.policy.judge import establishes_success, route
 from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, facts, measure
-from worldline_core.evaluation.scores import bootstrap_mean
+from worldline_core.evaluation.scores import area_under_curve, bootstrap_mean
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.evaluation.segmenters.segmenter import MaskStream, Segmenter
 from worldline_core.geometry.embodiment import load_embodiment
@@ -48,14 +48,6 @@ from worldline_core.rollout.worldline import WorldLine
 IMAGE = (64, 96)
 SHIFT = 5.0
 """Shift of the model's noise levels towards noise."""
-
-
-def area(scores: np.ndarray, success: np.ndarray) -> float:
-    """Share of pairs (success, failure) in which the success has the higher score; ties count half."""
-    wins, losses = scores[success], scores[~success]
-    if not len(wins) or not len(losses):
-        return float("nan")
-    return float((wins[:, None] > losses).mean() + 0.5 * (wins[:, None] == losses).mean())
 
 
 @dataclass(frozen=True)
@@ -178,12 +170,12 @@ def main() -> None:
     for task, rows in sorted(judged.items()):
         values, done, success = (np.array(column) for column in list(zip(*rows, strict=True))[:3])
         banks = np.array([str(bank) for *_, bank in rows])
-        within = [area(values[banks == bank], success[banks == bank]) for bank in np.unique(banks)]
+        within = [area_under_curve(values[banks == bank], success[banks == bank]) for bank in np.unique(banks)]
         within = [value for value in within if not np.isnan(value)]
         table[task] = {
             "episodes": len(rows),
             "successes": round(float(success.mean()), 3),
-            "area": round(area(values, success), 3),
+            "area": round(area_under_curve(values, success), 3),
             "area_within_banks": asdict(bootstrap_mean(within, seed=42)) if within else None,
             "rules_right": round(float((done == success).mean()), 3),
             "failures_called_done": round(float(done[~success].mean()), 3) if not success.all() else None,

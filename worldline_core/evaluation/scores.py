@@ -19,6 +19,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.stats import rankdata
 
 from worldline_core.errors import DataError
 from worldline_core.store.artifact_files import digest_value
@@ -168,6 +170,17 @@ def kept_part(path: Path, make: Callable[[], Any]) -> Any:
     if not path.exists():
         write_json_atomic(path, make())
     return json.loads(path.read_text())
+
+
+def area_under_curve(scores: ArrayLike, successes: ArrayLike) -> float:
+    """Area under the ROC curve: share of the pairs of a success and a failure in which the success scores higher, ties half.
+
+    NaN when all are successes or none is.
+    """
+    won = np.asarray(successes, dtype=bool)
+    wins = int(won.sum())
+    pairs = wins * (len(won) - wins)
+    return float((rankdata(scores)[won].sum() - wins * (wins + 1) / 2) / pairs) if pairs else np.nan
 
 
 def summarise(scores: Sequence[Score], *, resamples: int, seed: int, by_view: bool = False) -> dict[str, Any]:

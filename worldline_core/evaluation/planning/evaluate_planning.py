@@ -41,6 +41,7 @@ from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
     TRUE_METHOD,
     Score,
+    area_under_curve,
     bootstrap_mean,
     kept_part,
     part_file,
@@ -295,18 +296,6 @@ def read_outcomes(path: Path, episode_ids: Sequence[str]) -> dict[str, bool]:
     return {name: table[name] == "success" for name in episode_ids}
 
 
-def area_under_curve(scores: Sequence[float], ends: Sequence[bool]) -> float | None:
-    """Share of the pairs of a success and a failure in which the success has the higher score; ties count half (ROC curve).
-
-    None when all candidates ended alike.
-    """
-    values, succeeded = np.asarray(scores), np.asarray(ends)
-    wins, losses = values[succeeded, None], values[~succeeded]
-    if not wins.size or not losses.size:
-        return None
-    return float(np.mean((wins > losses) + 0.5 * (wins == losses)))
-
-
 def areas_within_banks(
     scores: Mapping[str, Sequence[float]], ends: Mapping[str, Sequence[bool]], shown: Mapping[str, int]
 ) -> dict[str, float]:
@@ -316,7 +305,7 @@ def areas_within_banks(
         for bank, own in sorted(scores.items())
         if bank in shown
     }
-    return {bank: area for bank, area in areas.items() if area is not None}
+    return {bank: area for bank, area in areas.items() if not np.isnan(area)}
 
 
 def write_results(

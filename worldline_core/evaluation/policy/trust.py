@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
-from scipy.stats import rankdata
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import HEAD_VIEW, ActionTracks, EpisodeTracks
@@ -29,7 +28,7 @@ from worldline_core.data.episodes.episode import TRAINING_SPLITS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import TrustConfig
-from worldline_core.evaluation.scores import DECISIONS_FILE, SUMMARY_FILE, TRUE_METHOD, write_table
+from worldline_core.evaluation.scores import DECISIONS_FILE, SUMMARY_FILE, TRUE_METHOD, area_under_curve, write_table
 from worldline_core.store.artifact_files import read_json, read_rows
 from worldline_core.store.atomic import write_json_atomic
 
@@ -279,19 +278,13 @@ def _reliability(rows: Sequence[Mapping[str, Any]], resamples: int, seed: int) -
     def share(values: np.ndarray, chosen: np.ndarray) -> dict[str, float | None]:
         return interval(lambda i: values[i][chosen[i]].mean() if chosen[i].any() else np.nan)
 
-    def auroc(i: np.ndarray) -> float:
-        """Chance that a wrong verdict has less trust than a right one; ties count half (Mann and Whitney's U)."""
-        wrong = int((~right[i]).sum())
-        pairs = wrong * (len(i) - wrong)
-        return (rankdata(-trust[i])[~right[i]].sum() - wrong * (wrong + 1) / 2) / pairs if pairs else np.nan
-
     bins = np.searchsorted(np.unique(np.quantile(trust, np.linspace(0, 1, 11)[1:-1])), trust, side="right")
     return {
         "verdicts": len(rows),
         "error": share(~right, everything >= 0),
         "error_of_marked": share(~right, marked),
         "error_of_others": share(~right, ~marked),
-        "auroc": interval(auroc),
+        "auroc": interval(lambda i: area_under_curve(trust[i], right[i])),
         "calibration_error": interval(lambda i: float(np.abs(np.bincount(bins[i], (trust - right)[i])).sum() / len(i))),
         "reliability": [
             {"trust": float(trust[bins == b].mean()), "count": int((bins == b).sum()), **share(right, bins == b)}
