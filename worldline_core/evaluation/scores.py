@@ -20,7 +20,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.stats import rankdata
 
 from worldline_core.errors import DataError
 from worldline_core.store.artifact_files import digest_value
@@ -180,7 +179,9 @@ def area_under_curve(scores: ArrayLike, successes: ArrayLike) -> float:
     won = np.asarray(successes, dtype=bool)
     wins = int(won.sum())
     pairs = wins * (len(won) - wins)
-    return float((rankdata(scores)[won].sum() - wins * (wins + 1) / 2) / pairs) if pairs else np.nan
+    _, place, equal = np.unique(np.asarray(scores), return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(equal) - (equal - 1) / 2)[place]
+    return float((ranks[won].sum() - wins * (wins + 1) / 2) / pairs) if pairs else np.nan
 
 
 def summarise(scores: Sequence[Score], *, resamples: int, seed: int, by_view: bool = False) -> dict[str, Any]:
